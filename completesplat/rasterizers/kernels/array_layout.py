@@ -3,7 +3,9 @@
 prepared   [17 lane] float32: values that do not depend on the view; padded to a multiple of 16 with Gaussians that are
            not drawn
 records    [gaussian 16] float32: the visible Gaussians of one view, packed front to back, one cache line each
-gradients  [gaussian 16] float32: sums over the pixels of one view, at the Gaussian's row in the scene
+gradients  [row 16] float32: sums over the pixels of one band of a view, for each Gaussian that reaches one of them;
+           row 0 is zero
+places     [lane] int32: the row of each Gaussian of the scene in `gradients`; 0 if it reaches no pixel
 camera     [20] float64
 
 With d = pixel - centre, the exponent of a Gaussian is sigma = ln(2) * (u^2 + v^2), where u = U * (d_x - SHEAR * d_y)
@@ -33,7 +35,7 @@ SUM_COLOR = 0  # 3 columns; sums of weight times the gradient of a colour channe
 SUM_DEPTH = 3
 SUM_S = 4  # s is -dL/dsigma at a pixel
 SUM_SU, SUM_SV, SUM_SUU, SUM_SUV, SUM_SVV = 5, 6, 7, 8, 9
-REACHED = 10  # 1 if the Gaussian reaches any pixel; if 0, the other columns are undefined
+REACHED = 10  # 1 except in row 0
 GRADIENT_WIDTH = 16
 
 # camera

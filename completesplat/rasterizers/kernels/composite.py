@@ -65,7 +65,8 @@ def composite(
     max_alpha: float, log2_min_alpha: float, min_transmittance: float,
     state: Array, open_words: Array, spans: Array,
     color: Array, depth: Array, alpha: Array,
-    grad_color: Array | None, grad_depth: Array | None, grad_alpha: Array | None, gradients: Array | None,
+    grad_color: Array | None, grad_depth: Array | None, grad_alpha: Array | None,
+    gradients: Array | None, places: Array | None,
 ) -> None:  # fmt: skip
     """Draw the block rows first_row..end_row - 1 of one view, or sum every Gaussian's gradients over them.
 
@@ -78,7 +79,7 @@ def composite(
         spans: scratch [2 * row + 32] int32.
         color, depth, alpha: the whole images [3 height width], [height width] twice; the band is written or read.
         grad_color, grad_depth, grad_alpha: gradients of the loss with respect to these images; None to draw.
-        gradients: [gaussian 16], see `array_layout`; rows of Gaussians that are not visible are not written.
+        gradients, places: [gaussian + 1 16] and [lane], see `array_layout`.
     """
     height, width = alpha.shape
     columns = (width + BLOCK - 1) // BLOCK
@@ -86,16 +87,18 @@ def composite(
     begin(first_row, end_row, columns, height, width, state)
     if gradients is not None:
         flat_gradients = gradients.reshape(-1)
+        store(flat_gradients, 0, splat(ZERO))
+        places[:] = 0
+        written = 0
         read_images(first_row, end_row, columns, state, color, depth, alpha, grad_color, grad_depth, grad_alpha)
     blocks_left = open_all_blocks(open_words, end_row - first_row, columns)
     for j in range(count):
         rows = integers[j, layout.ROWS]
         top, bottom = max(rows & 0xFFFF, first_row), min(rows >> 16, end_row - 1)
-        index = np.int64(integers[j, layout.INDEX])
-        if bottom < top or blocks_left == 0:
-            if gradients is not None:
-                gradients[index, layout.REACHED] = ZERO
+        if bottom < top:
             continue
+        if blocks_left == 0:
+            break
         row_spans(records, j, log2_min_alpha, top, bottom, width, spans)
         red, green, blue = records[j, layout.RED], records[j, layout.GREEN], records[j, layout.BLUE]
         z = records[j, layout.DEPTH]
@@ -146,15 +149,12 @@ def composite(
                     if not any_lane(behind > ZERO):
                         close_block(open_words, row - first_row, column)
                         blocks_left -= 1
-        if gradients is not None:
-            if reached:
-                moments = (sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv)
-                sums = lane_sums((sum_red, sum_green, sum_blue, sum_z) + moments)  # noqa: RUF005
-                store(flat_gradients, index * layout.GRADIENT_WIDTH, sums + reached_flag())
-            else:
-                gradients[index, layout.REACHED] = ZERO
-        elif blocks_left == 0:
-            break
+        if gradients is not None and reached:
+            moments = (sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv)
+            sums = lane_sums((sum_red, sum_green, sum_blue, sum_z) + moments)  # noqa: RUF005
+            written += 1
+            store(flat_gradients, written * layout.GRADIENT_WIDTH, sums + reached_flag())
+            places[integers[j, layout.INDEX]] = written
     if gradients is None:
         write_images(first_row, end_row, columns, state, color, depth, alpha)
 

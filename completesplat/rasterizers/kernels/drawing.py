@@ -136,6 +136,13 @@ class Images(NamedTuple):
         return self.color[batch, view], self.depth[batch, view, 0], self.alpha[batch, view, 0]
 
 
+class Sums(NamedTuple):
+    """Gradients [batch view band row 16] and places [batch view band lane] of all bands, see `array_layout`."""
+
+    gradients: np.ndarray
+    places: np.ndarray
+
+
 class Drawing:
     """Batch of scenes in all views, drawn once, with a backward pass if `keep`.
 
@@ -161,11 +168,10 @@ class Drawing:
             np.float32(constants.min_transmittance),
         )
         self.buffers = Buffers()
-        lanes = -(-self.count // LANES) * LANES
-        self.prepared = self.buffers.empty((self.scenes, layout.PREPARED_WIDTH, lanes))
+        self.lanes = -(-self.count // LANES) * LANES
+        self.prepared = self.buffers.empty((self.scenes, layout.PREPARED_WIDTH, self.lanes))
         self.held = self.scenes * self.views if keep else min(self.scenes * self.views, VIEWS_AT_ONCE)
         self.records = self.buffers.empty((self.held, self.count, layout.RECORD_WIDTH))
-        self.visible = self.buffers.empty((self.held, lanes))
         self.visible_counts = np.zeros(self.held, np.int64)
         rows = -(-self.height // layout.BLOCK)
         count = min(rows, -(-FEWEST_TASKS // max(1, self.scenes * self.views)))
@@ -190,7 +196,10 @@ class Drawing:
         """
         buffers = Buffers()
         bands, views = len(self.bands), self.scenes * self.views
-        sums = buffers.empty((self.scenes, self.views, bands, self.count, layout.GRADIENT_WIDTH))
+        sums = Sums(
+            buffers.empty((self.scenes, self.views, bands, self.count + 1, layout.GRADIENT_WIDTH)),
+            buffers.empty((self.scenes, self.views, bands, self.lanes), np.int32),
+        )
         parallel(partial(self._composite_backward, images, gradients, sums), views * bands)
         result = Parameters(*(np.empty_like(x) for x in self.parameters))
         chunks = -(-self.count // CHUNK)
@@ -213,17 +222,18 @@ class Drawing:
         self.visible_counts[slot] = project(
             self.prepared[scene], self.cameras[scene, camera], self.height, self.width,
             float(self.constants.blur), float(self.constants.near_plane),
-            unsorted, keys, order, self.records[slot], self.visible[slot],
+            unsorted, keys, order, self.records[slot],
         )  # fmt: skip
 
     def _composite(self, images: Images, start: int, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
-        self._run(slot, band, (*images.view(*divmod(start + slot, self.views)), None, None, None, None))
+        self._run(slot, band, (*images.view(*divmod(start + slot, self.views)), None, None, None, None, None))
 
-    def _composite_backward(self, images: Images, gradients: Images, sums: np.ndarray, task: int) -> None:
+    def _composite_backward(self, images: Images, gradients: Images, sums: Sums, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
         scene, view = divmod(slot, self.views)
-        self._run(slot, band, (*images.view(scene, view), *gradients.view(scene, view), sums[scene, view, band]))
+        arrays = (*images.view(scene, view), *gradients.view(scene, view))
+        self._run(slot, band, (*arrays, *(x[scene, view, band] for x in sums)))
 
     def _run(self, slot: int, band: int, arrays: tuple[np.ndarray | None, ...]) -> None:
         buffers = Buffers()
@@ -235,18 +245,17 @@ class Drawing:
         count = self.visible_counts[slot]
         composite(self.records[slot], count, first, end, *self.thresholds, state, open_words, spans, *arrays)
 
-    def _project_backward(self, result: Parameters, sums: np.ndarray, task: int) -> None:
+    def _project_backward(self, result: Parameters, sums: Sums, task: int) -> None:
         scene, chunk = divmod(task, -(-self.count // CHUNK))
-        visible = self.visible[scene * self.views : (scene + 1) * self.views]
         project_backward(
             *(x[scene] for x in self.parameters[1:4]), self.prepared[scene], self.cameras[scene],
-            float(self.constants.blur), visible, sums[scene], chunk * CHUNK, min((chunk + 1) * CHUNK, self.count),
-            *(x[scene] for x in result),
+            float(self.constants.blur), *(x[scene] for x in sums),
+            chunk * CHUNK, min((chunk + 1) * CHUNK, self.count), *(x[scene] for x in result),
         )  # fmt: skip
 
-    def _camera_backward(self, grad_cameras: np.ndarray, sums: np.ndarray, task: int) -> None:
+    def _camera_backward(self, grad_cameras: np.ndarray, sums: Sums, task: int) -> None:
         scene, view = divmod(task, self.views)
         camera_backward(
             self.prepared[scene], self.cameras[scene, view],
-            float(self.constants.blur), self.visible[task], sums[scene, view], grad_cameras[scene, view],
+            float(self.constants.blur), *(x[scene, view] for x in sums), grad_cameras[scene, view],
         )  # fmt: skip

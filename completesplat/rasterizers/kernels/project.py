@@ -42,7 +42,6 @@ from completesplat.rasterizers.kernels.simd import (
     columns,
     gather,
     in_every_lane,
-    keep,
     keep_each,
     load,
     narrow,
@@ -60,7 +59,6 @@ from completesplat.rasterizers.kernels.simd import (
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
 
 HALF = np.float64(0.5)
-VISIBLE = np.float32(1)
 LARGEST_FLOAT32 = np.float32(np.finfo(np.float32).max)
 RADIX_BITS = 11
 BUCKETS = 1 << RADIX_BITS
@@ -123,7 +121,7 @@ def scaled_columns(m, a):
 @kernel
 def project(
     prepared: Array, camera: Array, height: int, width: int, blur: float, near_plane: float,
-    unsorted: Array, keys: Array, order: Array, records: Array, visible: Array,
+    unsorted: Array, keys: Array, order: Array, records: Array,
 ) -> int:  # fmt: skip
     """Project, cull and sort the Gaussians of one scene for one camera.
 
@@ -131,7 +129,6 @@ def project(
         unsorted: scratch [gaussian + 1 16] float32.
         keys, order: scratch [2 gaussian + 1], int64 and int32.
         records: receives the visible Gaussians, front to back.
-        visible: [lane] float32, receives 1 for these, 0 for the others.
 
     Returns:
         The number of visible Gaussians.
@@ -146,7 +143,6 @@ def project(
         x, y, z = camera_point(camera, rotation, widen(mean))
         inside = (reach > ZERO) & (z > near_plane) & (z <= LARGEST_FLOAT32)
         if not any_lane(inside):
-            store(visible, start, splat(ZERO))
             continue
         inverse_z = ONE / z
         slope_x, slope_y = x * inverse_z, y * inverse_z
@@ -160,7 +156,6 @@ def project(
         top, bottom = max(center_y - extent_y + HALF, 0.0), min(center_y + extent_y - HALF, height - ONE)
         inside = inside & all_within((center_x, center_y, xx, yy), LARGEST_PROJECTION) & (top < bottom + ONE)
         inside = inside & (center_x + extent_x >= HALF) & (center_x - extent_x <= width - HALF)
-        store(visible, start, keep(inside, splat(VISIBLE)))
         inverse_yy = ONE / yy
         inverse_u = square_root(TWO * LN2 * determinant * inverse_yy)
         # In the order of the records' columns.
@@ -240,19 +235,18 @@ def append(builder, mask, vectors, rows, vector, numbers, count):
 @kernel
 def project_backward(
     quaternions: Array, scales: Array, opacities: Array, prepared: Array, cameras: Array, blur: float,
-    visible: Array, gradients: Array, first: int, last: int,
+    gradients: Array, places: Array, first: int, last: int,
     grad_means: Array, grad_quaternions: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
 ) -> None:  # fmt: skip
     """Apply the chain rule through the projection to the Gaussians [first, last) of one scene, summed over views.
 
     Args:
         cameras: [view 20] float64.
-        visible: [view lane] float32, 1 or 0.
-        gradients: [view band gaussian 16], written by `composite` for the visible Gaussians.
+        gradients, places: [view band row 16] and [view band lane], written by `composite`.
         first: a multiple of 16.
     """
     for start in range(first, last, LANES):
-        sums = sum_views(prepared, cameras, blur, visible, gradients, start, last)
+        sums = sum_views(prepared, cameras, blur, gradients, places, start)
         reached = sums[REACHED] > ZERO
         quaternion, scale = lane_shapes(quaternions, scales, start, last)
         opacity = gather_one(opacities, 1, 0, start, last)
@@ -268,11 +262,11 @@ def project_backward(
 
 
 @helper
-def sum_views(prepared, cameras, blur, visible, gradients, start, last):
+def sum_views(prepared, cameras, blur, gradients, places, start):
     mean, root = lane_gaussians(prepared, start)
     results = no_totals()
     for view in range(cameras.shape[0]):
-        sums = lane_sums_of_view(visible[view], gradients[view], start, last)
+        sums = lane_sums_of_view(gradients[view], places[view], start)
         mask = sums[layout.REACHED] > ZERO
         if not any_lane(mask):
             continue

@@ -15,12 +15,11 @@ from completesplat.rasterizers.kernels.simd import (
     any_lane,
     choose,
     columns,
+    gathered_rows,
     keep,
     keep_each,
-    load,
     square_root,
     store,
-    transposed_rows,
     zeros,
 )  # fmt: skip
 
@@ -141,18 +140,15 @@ def lane_gaussians(prepared, start):
 
 
 @helper
-def lane_sums_of_view(visible, gradients, start, last):
+def lane_sums_of_view(gradients, places, start):
     """Return the columns of these Gaussians' gradients in one view, summed over bands; REACHED counts the bands.
 
     Args:
-        visible: [lane] float32, 1 or 0.
-        gradients: [band gaussian 16]; rows of invisible Gaussians hold arbitrary values.
+        gradients, places: [band row 16] and [band lane].
     """
-    in_view = load(visible, start) > ZERO
     sums = no_sums()
     for band in range(gradients.shape[0]):
-        parts = transposed_rows(gradients[band].reshape(-1), layout.GRADIENT_WIDTH, start, last)[:COLUMNS]
-        sums = add_each(sums, keep_each(in_view & (parts[layout.REACHED] > ZERO), parts))
+        sums = add_each(sums, gathered_rows(gradients[band].reshape(-1), places[band], start)[:COLUMNS])
     return sums
 
 
@@ -255,22 +251,20 @@ def point_gradient(
 
 @kernel
 def camera_backward(
-    prepared: Array, camera: Array, blur: float, visible: Array, gradients: Array, grad_camera: Array
+    prepared: Array, camera: Array, blur: float, gradients: Array, places: Array, grad_camera: Array
 ) -> None:
     """Apply the chain rule from one view's Gaussians to its camera.
 
     Args:
         camera: [20] float64.
-        visible: [lane] float32, 1 or 0.
-        gradients: [band gaussian 16], written by `composite` for the visible Gaussians.
+        gradients, places: [band row 16] and [band lane], written by `composite`.
         grad_camera: [16] float64, receives the gradients of the first 16 columns of `camera`.
     """
     grad_camera[:] = 0
-    count = gradients.shape[1]
     rotation = nine(camera, layout.ROTATION)
     totals = np.empty(LANES, np.float32)
-    for start in range(0, count, LANES):
-        sums = lane_sums_of_view(visible, gradients, start, count)
+    for start in range(0, prepared.shape[1], LANES):
+        sums = lane_sums_of_view(gradients, places, start)
         mask = sums[layout.REACHED] > ZERO
         if not any_lane(mask):
             continue

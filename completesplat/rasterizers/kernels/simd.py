@@ -333,10 +333,14 @@ def store_columns(builder, array, stride, start, vectors):
 
 
 @vector_function(_vectors(LANES))
-def transposed_rows(builder, array, stride, start, last):
-    """Return the same as `gather(16)` from column 0 on, by loads of whole rows."""
-    rows = _rows(builder, stride, start, last)
-    return transposed(builder, [builder.load(address(builder, array, first, VECTOR_IR), align=4) for first in rows])
+def gathered_rows(builder, array, places, start):
+    """Return the 16 columns of rows of 16 of a flat array: those of the numbers places[start], ..., [start + 15]."""
+    rows = []
+    for lane in range(LANES):
+        entry = builder.gep(places, [builder.add(start, ir.Constant(I64, lane))], inbounds=True)
+        first = builder.mul(builder.sext(builder.load(entry), I64), ir.Constant(I64, LANES))
+        rows.append(builder.load(address(builder, array, first, VECTOR_IR), align=4))
+    return transposed(builder, rows)
 
 
 def transposed(builder, matrix):
