@@ -136,6 +136,8 @@ class CaptureDataModule(SceneDataModule):
         **settings: of `SceneDataModule`.
     """
 
+    splits_share_sequences = True
+
     def __init__(
         self,
         root: str,

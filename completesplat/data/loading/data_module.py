@@ -57,6 +57,9 @@ class SceneDataModule(LightningDataModule):
         allow_changed: a resumed run may continue with training data that have changed.
     """
 
+    splits_share_sequences = False
+    """Whether splits have the same sequences on purpose, because they divide the frames of each."""
+
     def __init__(
         self,
         root: str,

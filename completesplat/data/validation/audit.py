@@ -70,11 +70,14 @@ class Findings:
         write_text(path, json.dumps(self.json(), indent=2, allow_nan=False) + "\n")
 
 
-def check(sources: Sources, workers: int | None = None, progress: bool = True) -> Findings:
+def check(
+    sources: Sources, workers: int | None = None, progress: bool = True, splits_share_sequences: bool = False
+) -> Findings:
     """Read every sequence and every image once, even if several splits share them.
 
     A sequence without errors that is not usable is refused for too few frames. `workers` are processes (None: one for
-    each core); with several, the sources (by split) must be picklable.
+    each core); with several, the sources (by split) must be picklable. Shared sequences are reported unless the splits
+    share them on purpose (`SceneDataModule.splits_share_sequences`).
     """
     refused = [error for source in sources.values() for error in _before_reading(source)]
     sequences, batches = list[_Sequence](), _batches(sources)
@@ -96,7 +99,7 @@ def check(sources: Sources, workers: int | None = None, progress: bool = True) -
             split: _numbers([sequence.usable & sequence.frames.get(split, set()) for sequence in sequences])
             for split in sources
         },
-        shared=shared_names({split: source.names for split, source in sources.items()}),
+        shared={} if splits_share_sequences else shared_names({split: sources[split].names for split in sources}),
     )
 
 
