@@ -14,6 +14,7 @@ from jaxtyping import Float
 from lightning import LightningDataModule
 from torch import Tensor
 
+from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augment
 from completesplat.data.loading.distributed import batch_per_process, processes
 from completesplat.data.loading.latent_cache import CachedTrainingScenes, LatentCache
@@ -146,6 +147,14 @@ class SceneDataModule(LightningDataModule):
         """Return whether all evaluation scenes have the same number of targets."""
         return scenes.stackable()
 
+    def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
+        """Return all test scenes, each with up to `views` views that show the modes best and evenly spread targets.
+
+        Raises:
+            CompleteSplatError: the alternatives for what the reference image hides are not known.
+        """
+        raise CompleteSplatError("evaluation=hidden_modes needs data whose hidden parts are known: toy objects")
+
     def setup(self, stage: str | None = None) -> None:
         """List the sequences (images are read later).
 
@@ -187,7 +196,7 @@ class SceneDataModule(LightningDataModule):
             logger.info("%s: %d sequences%s", split, len(source.names), left_out)
             if source.refused:
                 logger.warning("%d annotations cannot be used; the first: %s", len(source.refused), source.refused[0])
-            self._stores[split] = SceneStore(used, used.names, self.mask_threshold, self.cache, self.background)
+            self._stores[split] = SceneStore(used, self.mask_threshold, self.cache, self.background)
         return self._stores[split]
 
     @cached_property

@@ -18,14 +18,7 @@ from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import Choice, SceneStore, TrainingScenes
 from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, json_text, read_as
 from completesplat.data.sequences import SequenceSource
-from completesplat.data.validation import (
-    ChangedFile,
-    MissingFile,
-    UnreadableFile,
-    at,
-    inside,
-    require_file,
-)
+from completesplat.data.validation import ChangedFile, MissingFile, UnreadableFile, at, inside, require_file
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import write_text, writing
 from completesplat.scene import CachedScene
@@ -223,13 +216,8 @@ class LatentCache:
 
     def must_belong_to(self, source: SequenceSource, settings: dict[str, Scalar]) -> None:
         """Refuse a store that was made with other settings or from another data set."""
-        differing = differences(self.origin.settings, settings)
-        if differing:
+        if differing := differences(self.origin.settings, settings):
             raise DataError(f"encoded with {differing}: set these as they were, or encode again", str(self.folder))
-        self.must_be_of(source)
-
-    def must_be_of(self, source: SequenceSource) -> None:
-        """Refuse a store that was made from another data set."""
         if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
             raise DataError("made from other data than the training set now: encode it again", str(self.folder))
 
