@@ -28,12 +28,12 @@ from completesplat.data.loading.latent_cache import (
     LatentCache,
     LatentCacheManifest,
     Origin,
-    is_latent_cache,
     row_checksums,
     write_manifest,
 )
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.loading.view_selection import spread_around
+from completesplat.data.packed.manifest import MANIFEST
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
@@ -151,7 +151,7 @@ def encode_training_set(
     views = views if autoreconstructor.sees_views else 0
     source = _packed(data)
     origin = _origin(autoreconstructor, data, conditioning, frames, views, precision)
-    if is_latent_cache(out):
+    if (out / MANIFEST).is_file():
         if (store := LatentCache(out)).origin != origin:
             raise DataError("already holds another store: choose another folder, or remove this one", str(out))
         logger.info("%s already holds these encodings", out)

@@ -82,11 +82,6 @@ class LatentCacheManifest:
     sha256: str = NO_SUM
 
 
-def is_latent_cache(root: Path) -> bool:
-    """Return whether a folder holds a finished store."""
-    return (root / MANIFEST).is_file()
-
-
 def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
     """Write the manifest, which marks the store as finished."""
     text = json_text(manifest, HEADER)
@@ -178,7 +173,7 @@ class LatentCache:
     """
 
     def __init__(self, folder: Path) -> None:
-        if not is_latent_cache(folder):
+        if not (folder / MANIFEST).is_file():
             raise MissingFile("no finished latent cache: completesplat data latents makes one", str(folder))
         self.folder = folder
         self.manifest = read_as(LatentCacheManifest, folder / MANIFEST, HEADER, "encode the images again")

@@ -45,7 +45,7 @@ class Clip:
     key: str
     source: Path
     cameras: Cameras
-    images: Sequence[Path] | Sequence[UInt8[Tensor, "_"]]
+    images: Sequence[Path] | Sequence[UInt8[Tensor, " _"]]
 
     def read(self, frame: int, square: Square, size: int) -> UInt8[Tensor, "3 {size} {size}"]:
         """Return the square part of a frame's image, resized to `size`."""
@@ -59,7 +59,7 @@ def make_clip(
     source: Path,
     timestamps: Sequence[int],
     rows: Float[Tensor, "view 18"],
-    images: Sequence[Path] | Sequence[UInt8[Tensor, "_"]],
+    images: Sequence[Path] | Sequence[UInt8[Tensor, " _"]],
 ) -> Clip:
     """Return the clip of stored rows and images; the first image determines the size. Errors as in `clip_cameras`."""
     with at(frame=0):

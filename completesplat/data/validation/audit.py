@@ -1,7 +1,7 @@
 """Check of a whole data set: numbers of usable sequences and frames, and reasons for those that are not usable."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -79,7 +79,11 @@ def check(
     each core); with several, the sources (by split) must be picklable. Shared sequences are reported unless the splits
     share them on purpose (`SceneDataModule.splits_share_sequences`).
     """
-    refused = [error for source in sources.values() for error in _before_reading(source)]
+    refused: list[DataError] = []
+    for source in sources.values():
+        refused += source.refused
+        refused += [LeftOut(reason, sequence=name) for reason, names in source.left_out.items() for name in names]
+        refused += source.verify()
     sequences, batches = list[_Sequence](), _batches(sources)
     with Progress(disable=not progress) as bar:
         task = bar.add_task("reading sequences", total=sum(map(len, batches)))
@@ -130,13 +134,6 @@ class _Sequence:
     frames: dict[str, set[int]] = field(default_factory=dict)
     usable: set[int] = field(default_factory=set)
     refused: list[DataError] = field(default_factory=list)
-
-
-def _before_reading(source: SequenceSource) -> Iterator[DataError]:
-    yield from source.refused
-    for reason, names in source.left_out.items():
-        yield from (LeftOut(reason, sequence=name) for name in names)
-    yield from source.verify()
 
 
 def _batches(sources: Sources) -> list[_Batch]:
