@@ -125,6 +125,11 @@ class Table:
     remarks: list[str] = field(default_factory=list)
     notes: Notes = field(default_factory=Notes)
 
+    @property
+    def published(self) -> bool:
+        """Whether the table has the paper's figures only."""
+        return all(row.source == "paper" for row in self.rows)
+
     def groups(self) -> list[tuple[str, int]]:
         """Return the group headings and the number of columns of each; empty if there are none."""
         spans = [(name, len(list(members))) for name, members in groupby(heading.group for heading in self.headings)]

@@ -34,8 +34,9 @@ def grid(table: str, last_heading: str) -> tuple[list[str], list[list[Cell]]] | 
     rows = _spread([[_span(cell) for cell in line] for line in lines])
     for index, row in enumerate(rows):
         if any(last_heading in cell.text for cell in row):
-            levels = zip(*rows[: index + 1], strict=False)
-            headings = [" ".join(dict.fromkeys(cell.text for cell in column if cell.text != BLANK)) for column in levels]
+            columns = zip(*rows[: index + 1], strict=False)
+            texts = ([cell.text for cell in column if cell.text != BLANK] for column in columns)
+            headings = [" ".join(dict.fromkeys(levels)) for levels in texts]
             return headings, rows[index + 1 :]
     return None
 
