@@ -14,18 +14,15 @@ from hydra.utils import instantiate
 from rich.console import Console
 from torch.utils.flop_counter import FlopCounterMode
 
-from completesplat.benchmarks.measuring import WARM_UP, Row, Work, device_name, milliseconds, print_results
+from completesplat.benchmarks.measuring import WARM_UP, Row, Work, milliseconds, report
 from completesplat.benchmarks.training_step import Training
 from completesplat.commands import quieten
-from completesplat.commands.protocol import write_json
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.writing import prepare
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras, pinhole
-from completesplat.results.machine import machine
-from completesplat.results.tables import Column, table
 from completesplat.scene import CachedScene, SceneBatch
 from completesplat.settings.schema import Positive
 from completesplat.training.encoding import encode_training_set
@@ -34,15 +31,6 @@ from completesplat.training.latent_diffusion import LatentDiffusion
 GUIDANCE_WEIGHT = 0.5  # from the paper's settings for diverse samples
 MANY_STEPS = 50  # the paper's
 CACHED = "cached_vs_on_the_fly"
-COMPARED: list[Column] = [
-    ("a", "a", ""),
-    ("b", "b", ""),
-    ("a\nms", "a_ms", ",.1f"),
-    ("b\nms", "b_ms", ",.1f"),
-    ("times\nfaster", "ratio", ",.2f"),
-    ("a\nTFLOP", "a_tflop", ",.4f"),
-    ("b\nTFLOP", "b_tflop", ",.4f"),
-]
 
 
 @dataclass(frozen=True)
@@ -84,21 +72,17 @@ def run(
         module: LatentDiffusion = instantiate(model, _convert_="all").to(chosen)
         loaded: SceneDataModule = make_data()
         batch = loaded.batch_size
-        # The latents are cached when their comparison is measured.
-        makers: dict[str, Callable[[], Comparison]] = {
-            CACHED: lambda: cached_vs_on_the_fly(module, precision, make_data, Path(folder) / "latents")
-        }
-        for name, comparison in sampling_comparisons(module.completesplat, few, samples, steps, batch).items():
-            makers[name] = partial(lambda comparison: comparison, comparison)
+        sampling = sampling_comparisons(module.completesplat, few, samples, steps, batch)
         with Console(stderr=True).status("building") as status:
-            for name in chosen_of(makers, only):
+            for name in chosen_of([CACHED, *sampling], only):
                 status.update(f"timing {name}")
-                rows.append({"name": name} | measured(makers[name](), repeats, chosen))
+                comparison = sampling.get(name)
+                if comparison is None:
+                    comparison = cached_vs_on_the_fly(module, precision, make_data, Path(folder) / "latents")
+                rows.append({"name": name} | measured(comparison, repeats))
     workload = {"device": chosen.type, "precision": precision, "image_size": loaded.image_size, "batch": batch}
-    described = machine()
-    write_json(out / "diffusion.json", {"machine": described, "workload": workload, "rows": rows})
     title = f"{loaded.image_size} x {loaded.image_size} pixels, batch {batch}, training in {precision}"
-    print_results(described, device_name(described, chosen.type), [table(title, COMPARED, rows)])
+    report(out / "diffusion.json", {"workload": workload, "rows": rows}, {title: rows}, chosen.type)
 
 
 def chosen_of(names: Collection[str], only: Sequence[str] | None) -> list[str]:
@@ -113,7 +97,7 @@ def chosen_of(names: Collection[str], only: Sequence[str] | None) -> list[str]:
     return [name for name in names if only is None or name in only]
 
 
-def measured(comparison: Comparison, repeats: int, device: torch.device) -> Row:
+def measured(comparison: Comparison, repeats: int) -> Row:
     """Return medians in ms of both ways, which take turns, the speed-up of `a`, and TFLOP per call.
 
     The first two calls of each way are not timed. FLOPs are those that torch counts (products, convolutions).
@@ -126,7 +110,7 @@ def measured(comparison: Comparison, repeats: int, device: torch.device) -> Row:
         tflop[f"{key}_tflop"] = counter.get_total_flops() / 1e12
     for _ in range(WARM_UP + repeats):
         for key, work in works.items():
-            times[key].append(milliseconds(work, device))
+            times[key].append(milliseconds(work))
     a, b = (statistics.median(times[key][WARM_UP:]) for key in works)
     return {"a": comparison.a[0], "b": comparison.b[0], "a_ms": a, "b_ms": b, "ratio": b / a, **tflop}
 
@@ -152,7 +136,6 @@ def cached_vs_on_the_fly(
         progress=False,
     )
     parts.set_latent_moments(store.mean, store.std)
-    parts.train()
     fill_cache(images)
     cached, fly = batches(data(latent_cache=str(folder))), batches(images)
     return Comparison(

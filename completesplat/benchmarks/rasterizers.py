@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, TypedDict
 from hydra.utils import instantiate
 from rich.console import Console
 
-from completesplat.benchmarks.measuring import Row, device_name, print_results
+from completesplat.benchmarks.measuring import Row, report
 from completesplat.benchmarks.training_step import share
 from completesplat.benchmarks.workloads import (
     OPACITIES,
@@ -21,13 +21,10 @@ from completesplat.benchmarks.workloads import (
     splatter_scene,
 )
 from completesplat.commands import quieten
-from completesplat.commands.protocol import write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
-from completesplat.results.machine import machine
-from completesplat.results.tables import Column, table
 from completesplat.settings.schema import Positive
 
 # `gsplat_torch` is a baseline for this comparison; training cannot choose it.
@@ -38,27 +35,6 @@ CLASSES = {
     "cuda": "completesplat.rasterizers.cuda.CudaRasterizer",
 }
 LONGEST_SECONDS = 4.0  # a backend that has run this long on a workload does not repeat it
-SPEED: list[Column] = [
-    ("backend", "backend", ""),
-    ("size", "size", ""),
-    ("Gaussians", "gaussians", ","),
-    ("views", "views", ""),
-    ("opacity", "opacity", ""),
-    ("forward\nms", "forward_ms", ",.1f"),
-    ("with backward\nms", "forward_backward_ms", ",.1f"),
-    ("times\ntiled", "times_tiled", ",.1f"),
-    ("peak\nMB", "peak_mb", ",.0f"),
-]
-STEP: list[Column] = [
-    ("backend", "backend", ""),
-    ("size", "size", ""),
-    ("batch", "batch", ""),
-    ("views", "views", ""),
-    ("step\nms", "step_ms", ",.0f"),
-    ("rasterizer\nms", "rasterizer_ms", ",.1f"),
-    ("share", "share", ".1%"),
-]
-
 Tick = Callable[[str], None]
 
 
@@ -112,11 +88,9 @@ def run(
             for backend in [backend for backend in working if backend.name in training_step["backends"]]:
                 tick(f"a training step with {backend.name}")
                 steps.append(share(backend, model, size, batch, targets, training_step["precision"]))
-    hardware = machine()
-    results = {"machine": hardware, "not_measured": absent, "rows": rows}
-    write_json(out / "rasterizers.json", results | ({"training_step": steps} if training_step else {}))
-    tables = [table("Speed", SPEED, rows), *([table("Share of a training step", STEP, steps)] if steps else [])]
-    print_results(hardware, device_name(hardware), tables, absent)
+    results = {"not_measured": absent, "rows": rows} | ({"training_step": steps} if training_step else {})
+    tables = {"Speed": rows} | ({"Share of a training step": steps} if steps else {})
+    report(out / "rasterizers.json", results, tables)
 
 
 def working_backends(names: Sequence[str], constants: RenderingConstants) -> tuple[list[Backend], dict[str, str]]:

@@ -31,6 +31,7 @@ from completesplat.results.tables import (
     BLANK,
     LEGEND,
     SECOND,
+    UNMARKED,
     Cell,
     Heading,
     Notes,
@@ -110,9 +111,9 @@ def published() -> list[PublishedTable]:
 def parse(cell: str) -> Cell:
     """Convert `17.93 best` to the text `17.93` with the mark `best`; dagger and star become signs behind the text."""
     words = cell.split()
-    marks = [word for word in words if word in (BEST, SECOND)]
-    text = " ".join(word for word in words if word not in (*marks, *SIGNS)) or BLANK
-    return Cell(" ".join([text, *(SIGNS[word] for word in words if word in SIGNS)]), *marks)
+    text = " ".join(word for word in words if word not in (BEST, SECOND, *SIGNS)) or BLANK
+    signs = [SIGNS[word] for word in words if word in SIGNS]
+    return Cell(" ".join([text, *signs]), next((word for word in words if word in (BEST, SECOND)), UNMARKED))
 
 
 def _source(table: PublishedTable) -> str:

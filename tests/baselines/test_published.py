@@ -11,8 +11,7 @@ import pytest
 import torch
 from published_weights import LARGE, shapes, write_published
 
-from completesplat.baselines.splatter_image.directional import DirectionalRasterizer
-from completesplat.baselines.splatter_image.model import PublishedSplatterImage
+from completesplat.baselines.splatter_image.model import DirectionalRasterizer, PublishedSplatterImage
 from completesplat.baselines.splatter_image.network import SongUNet
 from completesplat.errors import WeightsError
 from completesplat.geometry.cameras import Cameras, pinhole

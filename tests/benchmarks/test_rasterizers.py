@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 from support import compose_config, strict_json
 
-from completesplat.benchmarks import measuring, rasterizers, training_step, workloads
+from completesplat.benchmarks import rasterizers, training_step, workloads
 from completesplat.benchmarks.rasterizers import (
     CLASSES,
     LONGEST_SECONDS,
@@ -19,6 +19,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rendering, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.training import stage
 
 TILED = "completesplat.rasterizers.tiled.TiledRasterizer"
 
@@ -61,7 +62,7 @@ class Clock:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 0.0
         self.turns: list[str] = []
-        for module in (rasterizers, measuring):
+        for module in (rasterizers, stage):
             monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: self.now))
 
     def backend(self, name: str, *seconds: float) -> Backend:

@@ -8,8 +8,7 @@ from PIL import Image
 from published_weights import write_published
 from support import SMALL, compose_config, strict_json
 
-from completesplat.baselines.splatter_image.directional import DirectionalRasterizer
-from completesplat.baselines.splatter_image.model import PublishedOneAnswer
+from completesplat.baselines.splatter_image.model import DirectionalRasterizer, PublishedOneAnswer
 from completesplat.commands.trained import Trained
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply

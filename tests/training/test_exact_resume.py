@@ -108,7 +108,7 @@ def results(run) -> dict:
 def test_drawing_images_and_samples_does_not_change_training(settings, whole, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for stage, drawn in {"var": ["images"], "diffusion": ["images", "samples"]}.items():
-        kept = [setting for setting in settings[stage] if not setting.startswith(("callbacks.pic", "callbacks.sam"))]
+        kept = [setting for setting in settings[stage] if not setting.startswith(("callbacks.im", "callbacks.sam"))]
         off = [f"callbacks.{name}=null" for name in drawn]
         assert call(monkeypatch, *kept, *off, f"out={tmp_path / stage}") == 0
         expected, found = (weights(run) for run in (whole(stage), tmp_path / stage))
