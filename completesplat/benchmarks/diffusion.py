@@ -2,7 +2,6 @@
 
 import statistics
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -33,12 +32,8 @@ MANY_STEPS = 50  # the paper's
 CACHED = "cached_vs_on_the_fly"
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Two ways of doing the same work, each with a label for tables; the first one should be faster."""
-
-    a: tuple[str, Work]
-    b: tuple[str, Work]
+Comparison = tuple[tuple[str, Work], tuple[str, Work]]
+"""Two ways of doing the same work, each with a label for tables; the first one should be faster."""
 
 
 def run(
@@ -102,7 +97,8 @@ def measured(comparison: Comparison, repeats: int) -> Row:
 
     The first two calls of each way are not timed. FLOPs are those that torch counts (products, convolutions).
     """
-    works = {"a": comparison.a[1], "b": comparison.b[1]}
+    (first, one), (second, other) = comparison
+    works = {"a": one, "b": other}
     tflop, times = {}, {key: list[float]() for key in works}
     for key, work in works.items():
         with FlopCounterMode(display=False) as counter:
@@ -112,7 +108,7 @@ def measured(comparison: Comparison, repeats: int) -> Row:
         for key, work in works.items():
             times[key].append(milliseconds(work))
     a, b = (statistics.median(times[key][WARM_UP:]) for key in works)
-    return {"a": comparison.a[0], "b": comparison.b[0], "a_ms": a, "b_ms": b, "ratio": b / a, **tflop}
+    return {"a": first, "b": second, "a_ms": a, "b_ms": b, "ratio": b / a, **tflop}
 
 
 def cached_vs_on_the_fly(
@@ -138,7 +134,7 @@ def cached_vs_on_the_fly(
     parts.set_latent_moments(store.mean, store.std)
     fill_cache(images)
     cached, fly = batches(data(latent_cache=str(folder))), batches(images)
-    return Comparison(
+    return (
         ("step from the latent cache", lambda: training.step(next(cached))),
         ("encoding on the fly", lambda: training.step(next(fly))),
     )
@@ -179,13 +175,15 @@ def sampling_comparisons(
     several = partial(_draw, model, usual, 1, steps=steps, samples=samples)
     draw = partial(_draw, model, usual, batch)
     return {
-        f"batch_vs_one_by_one_k{samples}": Comparison(
-            (f"{samples} samples at a time", several), ("one by one", partial(several, batch=1))
+        f"batch_vs_one_by_one_k{samples}": (
+            (f"{samples} samples at a time", several),
+            ("one by one", partial(several, batch=1)),
         ),
-        "unguided_vs_guided": Comparison(
-            ("w = 0", draw), (f"w = {GUIDANCE_WEIGHT}", partial(draw, guidance_weight=GUIDANCE_WEIGHT))
+        "unguided_vs_guided": (
+            ("w = 0", draw),
+            (f"w = {GUIDANCE_WEIGHT}", partial(draw, guidance_weight=GUIDANCE_WEIGHT)),
         ),
-        f"few_steps_vs_{MANY_STEPS}": Comparison(
+        f"few_steps_vs_{MANY_STEPS}": (
             (_label(quick, quick.steps), partial(_draw, model, quick, batch)),
             (_label(usual, MANY_STEPS), partial(draw, steps=MANY_STEPS)),
         ),

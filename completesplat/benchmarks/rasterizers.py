@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from itertools import product
 from pathlib import Path
-from typing import Literal, NamedTuple, TypedDict
+from typing import Any, Literal, TypedDict
 
 from hydra.utils import instantiate
 from rich.console import Console
@@ -46,14 +46,6 @@ class StepSettings(TypedDict):
     batch: Positive
     targets: Positive
     precision: str
-
-
-class Figures(NamedTuple):
-    """Median times of the forward pass and of both passes in ms, and the memory that a first rendering adds."""
-
-    forward_ms: float
-    forward_backward_ms: float
-    peak_mb: float | None
 
 
 def run(
@@ -127,16 +119,16 @@ def speed_rows(
         workload: Row = {"size": size, "gaussians": gaussians.count, "views": number, "opacity": opacity}
         results = side_by_side(backends, gaussians, cameras, repeats)
         for name, figures in results.items():
-            rows.append({"backend": name} | workload | figures._asdict())
+            rows.append({"backend": name} | workload | figures)
             if "tiled" in results:
-                rows[-1]["times_tiled"] = figures.forward_backward_ms / results["tiled"].forward_backward_ms
+                rows[-1]["times_tiled"] = figures["forward_backward_ms"] / results["tiled"]["forward_backward_ms"]
     return rows
 
 
 def side_by_side(
     backends: Sequence[Backend], gaussians: Gaussians, cameras: Cameras, repeats: int
-) -> dict[str, Figures]:
-    """Time the backends in turn, and return the figures of each.
+) -> dict[str, dict[str, Any]]:
+    """Time the backends in turn; return median ms of the forward pass and of both passes, and the peak memory in MB.
 
     The memory is that of the first rendering with its backward pass, whose time counts only if there is no other.
     """
@@ -155,8 +147,8 @@ def side_by_side(
     for _, backend in product(range(repeats), backends):
         if spent[backend.name] <= LONGEST_SECONDS:
             render(backend)
-    results = {}
+    results: dict[str, dict[str, Any]] = {}
     for name, pairs in times.items():
         forward, both = (statistics.median(column) for column in zip(*(pairs[1:] or pairs), strict=True))
-        results[name] = Figures(forward, both, peaks[name])
+        results[name] = {"forward_ms": forward, "forward_backward_ms": both, "peak_mb": peaks[name]}
     return results

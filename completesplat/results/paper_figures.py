@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict, cast
+from typing import Any, cast
 
 from omegaconf import OmegaConf
 
@@ -60,17 +60,13 @@ class PrintedColumn:
     data_set: str = ""
 
 
-class Requirements(TypedDict):
-    """Values that a run by one of our protocols must have; without `scenes`, it has all scenes of the list."""
-
-    scenes: NotRequired[list[int]]
-    resolution: int
-    protocol_views: str
-
-
 @dataclass(frozen=True)
 class PublishedTable:
-    """Table of the paper and the protocol of its figures; the head of `figures.yaml` explains each entry."""
+    """Table of the paper and the protocol of its figures; the head of `figures.yaml` explains each entry.
+
+    `evaluations` are the `resolution`, `protocol_views` and numbers of `scenes` that a run by one of our protocols must
+    have; without `scenes`, it has all scenes of the list.
+    """
 
     name: str
     place: str
@@ -78,7 +74,7 @@ class PublishedTable:
     title: str
     region: str
     view: str
-    evaluations: Mapping[str, Requirements]
+    evaluations: Mapping[str, Mapping[str, Any]]
     says: list[str]
     columns: list[PrintedColumn]
     rows: list[list[Cell]]

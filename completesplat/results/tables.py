@@ -180,9 +180,9 @@ def records_table(title: str, records: Sequence[Mapping[str, object]]) -> Table:
 
 def _written(value: object) -> str:
     """Return a value as text: nothing for None, and four digits of floats, or all those before the point."""
-    if isinstance(value, float):
-        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
-    return "" if value is None else str(value)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return "" if value is None else str(value)
+    return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1000 else f"{value:,.0f}"
 
 
 def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
