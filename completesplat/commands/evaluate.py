@@ -22,9 +22,9 @@ from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, evaluation_table, show, table
 from completesplat.settings.schema import Natural, Positive, Range
+from completesplat.training.loggers import wandb_runs
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
-from completesplat.training.wandb import wandb_runs
 
 
 def scored_data(run_config: DictConfig, evaluation: Mapping[str, Any]) -> SceneDataModule:

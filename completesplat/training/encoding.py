@@ -59,15 +59,13 @@ def fingerprint(module: nn.Module) -> str:
     return digest.hexdigest()
 
 
-def posterior_fingerprint(autoreconstructor: VariationalAutoReconstructor) -> str:
-    """Return the fingerprint of all weights that latents depend on."""
+def fingerprints(
+    autoreconstructor: VariationalAutoReconstructor, conditioning: nn.Module | None
+) -> tuple[str, str | None]:
+    """Return fingerprints of all weights that latents depend on, and of a frozen conditioning (else None)."""
     encoder, views = autoreconstructor.encoder, autoreconstructor.view_encoder
-    return fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
-
-
-def features_fingerprint(conditioning: nn.Module | None) -> str | None:
-    """Return the fingerprint of a frozen conditioning, whose features are stored; else None."""
-    return fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
+    latents = fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
+    return latents, fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
 
 
 def check_cache(store: LatentCache, autoreconstructor: VariationalAutoReconstructor, conditioning: nn.Module) -> None:
@@ -76,9 +74,10 @@ def check_cache(store: LatentCache, autoreconstructor: VariationalAutoReconstruc
     Args:
         conditioning: needs its stored features if it is frozen, else stored images.
     """
-    if store.origin.encoder != posterior_fingerprint(autoreconstructor):
+    latents, features = fingerprints(autoreconstructor, conditioning)
+    if store.origin.encoder != latents:
         raise WeightsError(f"{store.folder}: made with another autoreconstructor; encode the training set again")
-    if store.origin.conditioning != features_fingerprint(conditioning):
+    if store.origin.conditioning != features:
         content = "images" if store.origin.conditioning is None else "features of another conditioning"
         advice = "encode the training set again with this run's conditioning"
         raise WeightsError(f"{store.folder}: holds {content}; {advice}")
@@ -270,8 +269,7 @@ def _origin(
     if conditioning is not None and not conditioning.frozen:
         raise CompleteSplatError("a conditioning that is trained needs images, not features: leave conditioning out")
     return Origin(
-        posterior_fingerprint(autoreconstructor),
-        features_fingerprint(conditioning),
+        *fingerprints(autoreconstructor, conditioning),
         data.source("train").fingerprint(),
         data.packed_settings(),
         data.image_size,
