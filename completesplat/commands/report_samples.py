@@ -1,7 +1,7 @@
 """`completesplat report`: studies of a trained model's samples.
 
-Each study raises the errors of `Trained.open`, `first_scenes`, the functions of its module in `completesplat.studies`
-and, if it draws samples, `diffusion_of`.
+Each study raises the errors of `Trained.open`, `diffusion_of`, `first_scenes` and the functions of its module in
+`completesplat.studies`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,25 +25,18 @@ from completesplat.settings.schema import Entries, Positive, Range, Share
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies import samplers as samplers_study
-from completesplat.studies import stage1 as stage1_study
 from completesplat.studies.samples import SampleRenderer, first_scenes
-from completesplat.training.stage import Stage
 
 Weights = Annotated[Sequence[Share], Entries(1)]
 
 
 class Run(TypedDict):
-    """A run (`Trained`), and the number of its first test scenes."""
+    """A run of stage 2 (`Trained`), the number of its first test scenes, and the number of samples of each."""
 
     ckpt: str
     overrides: Sequence[str]
     trust: bool
     scenes: Positive
-
-
-class SampledRun(Run):
-    """A run of stage 2, and the number of samples for each scene."""
-
     seed: int
     samples: Annotated[int, Range(2)]
 
@@ -54,7 +47,7 @@ def samplers(
     skip_weight: Share,
     guidance_weight: Share,
     out: Path,
-    **run: Unpack[SampledRun],
+    **run: Unpack[Run],
 ) -> None:
     """Write `samplers.json` and `samplers.png`; print the table and the fewest steps that are enough.
 
@@ -66,7 +59,7 @@ def samplers(
     for name in steps:
         if name not in samplers:
             raise CompleteSplatError(f"steps.{name}: no such sampler; there are {', '.join(samplers)}")
-    renderer, scenes, settings = _open_sampled(run)
+    renderer, scenes, settings = _open(run)
     weights = {"skip_weight": skip_weight, "guidance_weight": guidance_weight}
     with _status() as tick:
         rows = samplers_study.rows(renderer, samplers, steps, scenes, weights, tick)
@@ -93,14 +86,14 @@ def controls(
     near_degrees: float,
     shown: int,
     out: Path,
-    **run: Unpack[SampledRun],
+    **run: Unpack[Run],
 ) -> None:
     """Write `controls.json`, `controls.png` and `controls_grid.png`, and print the table.
 
     All pairs of the weights and the paper's three are measured; `conf/report_task/controls.yaml` explains the settings.
     """
     weights = controls_study.grid(skip_weights, guidance_weights)
-    renderer, scenes, settings = _open_sampled(run)
+    renderer, scenes, settings = _open(run)
     with _status() as tick:
         rows = controls_study.rows(renderer, weights, scenes, near_degrees, tick)
         tick("the grid")
@@ -113,22 +106,6 @@ def controls(
     show(records_table("Faithfulness (PSNR, dB) and diversity", rows))
 
 
-def masked(
-    boxes: Sequence[Sequence[float]], views: int, guidance_weight: Share, out: Path, **run: Unpack[SampledRun]
-) -> None:
-    """Write `masked.png`: inputs with boxes over them, and several completions of each.
-
-    Boxes are [x0, y0, x1, y1] in fractions of the image (`check_box`); see `conf/report_task/masked.yaml` for the rest.
-    """
-    for box in boxes:
-        controls_study.check_box(box)
-    renderer, scenes, _ = _open_sampled(run)
-    with _status() as tick:
-        tick("completions")
-        rows = controls_study.masked_strips(renderer, scenes, boxes, views, guidance_weight)
-    _write_sheet(rows, out / "masked.png", "Completions of partly hidden inputs, without skips")
-
-
 def depth(
     skip_weight: Share,
     guidance_weight: Share,
@@ -136,11 +113,11 @@ def depth(
     shown: Positive,
     far_degrees: Annotated[float, Range(0, 180)],
     out: Path,
-    **run: Unpack[SampledRun],
+    **run: Unpack[Run],
 ) -> None:
     """Write `depth.json` and `depth.png`, and print the table; `conf/report_task/depth.yaml` explains the settings."""
     weights = controls_study.grid([skip_weight], [guidance_weight])
-    renderer, scenes, settings = _open_sampled(run)
+    renderer, scenes, settings = _open(run)
     with _status() as tick:
         rows = depth_study.rows(renderer, weights, scenes, far_degrees, tick)
         tick("the figure")
@@ -152,36 +129,15 @@ def depth(
     show(records_table("Deviation of depth over samples, scene units", rows))
 
 
-def views(counts: Annotated[Sequence[Positive], Entries(1)], out: Path, **run: Unpack[Run]) -> None:
-    """Write `views.json` and `views.png`, and print the table; `conf/report_task/views.yaml` explains the settings."""
-    module, scenes = _open(run)
-    with _status() as tick:
-        rows = stage1_study.rows_of_views(module, counts, scenes, tick)
-    write_json(out / "views.json", {"settings": {"scenes": run["scenes"]}, "rows": rows})
-    stage1_study.plot_views(rows, out / "views.png", f"{run['scenes']} scenes, posterior's mean")
-    show(records_table("PSNR (dB) of other views by the number of views", rows))
+def _open(run: Run) -> tuple[SampleRenderer, list[SceneBatch], dict[str, float]]:
+    """Return the renderer of a run's samples, its first test scenes, and the settings to write beside the results.
 
-
-def layers(out: Path, **run: Unpack[Run]) -> None:
-    """Write `layers.json`, and print the table; `conf/report_task/layers.yaml` explains the settings."""
-    module, scenes = _open(run)
-    with _status() as tick:
-        rows = stage1_study.rows_of_layers(module, scenes, tick)
-    write_json(out / "layers.json", {"settings": {"scenes": run["scenes"]}, "rows": rows})
-    show(records_table("Layers on the object, behind the front (scene units)", rows))
-
-
-def _open(run: Run) -> tuple[Stage, list[SceneBatch]]:
-    """Return a run's module and its first test scenes, on a GPU if there is one."""
+    Renderer and scenes are on a GPU if there is one.
+    """
     quieten()
-    module, data = Trained(run["ckpt"], run["overrides"], run["trust"]).open()
-    module.to("cuda" if torch.cuda.is_available() else "cpu").eval()
-    return module, [scene.to(module.device) for scene in first_scenes(data, run["scenes"])]
-
-
-def _open_sampled(run: SampledRun) -> tuple[SampleRenderer, list[SceneBatch], dict[str, float]]:
-    """Return the renderer of a run's samples, its first test scenes, and the settings to write beside the results."""
-    stage, scenes = _open(run)
+    stage, data = Trained(run["ckpt"], run["overrides"], run["trust"]).open()
+    stage.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
     settings: dict[str, float] = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
     model = diffusion_of(stage)
     return SampleRenderer(model, stage.rasterizer, stage.background, run["samples"], run["seed"]), scenes, settings

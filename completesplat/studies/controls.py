@@ -1,16 +1,12 @@
-"""Effects of the controls of sampling: skip and guidance weight, and boxes that hide a part of the image."""
+"""Effects of the controls of sampling: skip and guidance weight."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from itertools import cycle, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from completesplat.errors import CompleteSplatError
 from completesplat.export.images import SheetCell, strip
 from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import diversity
@@ -113,45 +109,3 @@ def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> 
             panel.grid(alpha=0.3)
             panel.margins(0.12)
         figure.axes[0].legend(title="along a curve: guidance weight")
-
-
-def check_box(box: Sequence[float]) -> None:
-    """Check that a box in shares of an image is valid, has pixels and lies inside the image."""
-    if len(box) != 4 or not (0 <= box[0] < box[2] <= 1 and 0 <= box[1] < box[3] <= 1):
-        raise CompleteSplatError(f"boxes: {list(box)} is no [x0,y0,x1,y1] with 0 <= x0 < x1 <= 1 and so on")
-
-
-def box_visibility(box: Sequence[float], size: int) -> Float[Tensor, "1 size size"]:
-    """Return 1 outside of a box [x0 y0 x1 y1] in shares of the square, 0 in the pixels that it touches."""
-    left, upper, right, lower = box
-    visible = torch.ones(1, size, size)
-    rows, columns = (slice(math.floor(a * size), math.ceil(b * size)) for a, b in ((upper, lower), (left, right)))
-    visible[:, rows, columns] = 0
-    return visible
-
-
-def masked_strips(
-    renderer: SampleRenderer,
-    scenes: Sequence[SceneBatch],
-    boxes: Sequence[Sequence[float]],
-    views: int,
-    guidance_weight: float,
-) -> list[list[SheetCell | None]]:
-    """Return rows for each scene: the truth, then its completions without skips.
-
-    The columns are the input (complete for the truth), the reference view, and other views evenly spread over the
-    targets. The scenes use the boxes in turn.
-    """
-    rows: list[list[SheetCell | None]] = []
-    for scene, box in zip(scenes, cycle(boxes), strict=False):
-        visible = box_visibility(box, scene.reference.images.shape[-1]).to(scene.reference.images)
-        images = renderer(scene, visible=visible[None], guidance_weight=guidance_weight)
-        count = images.shape[1] - 1
-        shown = [0, *(1 + i * count // views for i in range(min(views, count)))]
-        true = scene.all_views().images[0]
-        rows.append([SheetCell(true[0], scene.names[0]), *strip(true[shown], "truth: reference view, others")])
-        for sample, drawn in enumerate(images):
-            # Grey, because the image itself may be black.
-            seen = SheetCell(true[0] * visible + 0.5 * (1 - visible), "what is seen") if sample == 0 else None
-            rows.append([seen, *strip(drawn[shown], f"sample {sample}")])
-    return rows

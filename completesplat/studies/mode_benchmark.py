@@ -25,7 +25,6 @@ from completesplat.metrics.mode_coverage import (
 )
 from completesplat.metrics.proper_scores import energy_score
 from completesplat.scene import SceneBatch
-from completesplat.studies.samples import autoreconstructor_of
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.stage import Stage
 
@@ -51,8 +50,9 @@ def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
         gaussians = module.reconstruct(scene, seed=seed, samples=samples, batch=batch)
         return torch.cat([_render(module, gaussians[i : i + batch], scene) for i in range(0, samples, batch)])
 
-    network = autoreconstructor_of(module)
-    if network is None:
+    frozen = module.completesplat.autoreconstructor if isinstance(module, LatentDiffusion) else None
+    network = frozen or getattr(module, "model", None)
+    if not isinstance(network, VariationalAutoReconstructor):
         return {"model": model}
     ladder = _Ladder(module, network, samples, batch)
     methods: dict[str, Predictor] = {

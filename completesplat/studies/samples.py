@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import DataError
 from completesplat.gaussians import Gaussians
@@ -18,9 +17,7 @@ from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.images import PSNR_LIMIT
 from completesplat.rasterizers import Rasterizer, Rendering
-from completesplat.scene import SceneBatch, Views
-from completesplat.training.latent_diffusion import LatentDiffusion
-from completesplat.training.stage import Stage
+from completesplat.scene import SceneBatch
 
 
 @dataclass(frozen=True)
@@ -58,23 +55,6 @@ class SampleRenderer:
         """Render the samples of one scene in the reference view and all targets."""
         cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(self.samples, *tensor.shape[1:]))
         return self.rasterizer(gaussians, cameras)
-
-
-def autoreconstructor_of(module: Stage) -> VariationalAutoReconstructor | None:
-    """Return the variational autoreconstructor of either stage; None for another model."""
-    if isinstance(module, LatentDiffusion):
-        network: object = module.completesplat.autoreconstructor
-    else:
-        network = getattr(module, "model", None)
-    return network if isinstance(network, VariationalAutoReconstructor) else None
-
-
-def reconstructed(network: VariationalAutoReconstructor, scene: SceneBatch, views: Views | None) -> Gaussians:
-    """Return the Gaussians of the posterior's mode, from the reference image and some views of a scene."""
-    posterior, features = network.posterior(scene.reference.images, views, scene.depth_range)
-    splatter_image = network.reconstructor(posterior.mode(), features)
-    gaussians: Gaussians = splatter_image.gaussians(scene.reference.cameras, scene.depth_range)
-    return gaussians
 
 
 def first_scenes(data: SceneDataModule, count: int) -> list[SceneBatch]:

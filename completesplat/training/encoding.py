@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Shaped
+from rich.filesize import decimal
 from rich.progress import track
 from torch import nn
 
@@ -26,14 +28,13 @@ from completesplat.data.loading.latent_cache import (
     LatentCache,
     LatentCacheManifest,
     Origin,
-    is_latent_cache,
     row_checksums,
     write_manifest,
 )
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.loading.view_selection import spread_around
+from completesplat.data.packed.manifest import MANIFEST
 from completesplat.data.packed.source import PackedSource
-from completesplat.data.packed.writing import require_space
 from completesplat.data.sequences import PosedSequence, spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import SceneBatch
@@ -149,7 +150,7 @@ def encode_training_set(
     views = views if autoreconstructor.sees_views else 0
     source = _packed(data)
     origin = _origin(autoreconstructor, data, conditioning, frames, views, precision)
-    if is_latent_cache(out):
+    if (out / MANIFEST).is_file():
         if (store := LatentCache(out)).origin != origin:
             raise DataError("already holds another store: choose another folder, or remove this one", str(out))
         logger.info("%s already holds these encodings", out)
@@ -159,7 +160,7 @@ def encode_training_set(
     encode = partial(
         encoded, autoreconstructor=frozen, conditioning=features, precision=PRECISIONS[precision], device=device
     )
-    load = partial(_loaded, SceneStore(source, source.names, cache=False), views)
+    load = partial(_loaded, SceneStore(source), views)
     blank = encode(stack([load(next(_references(source, 1, [], False)))]))
     _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
     sequences: list[CachedSequence] = []
@@ -230,7 +231,11 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
     most = [len(shard.sequences) * (frames or shard.frames) for shard in source.shards]
     total = sum(min(shard.frames, limit) for shard, limit in zip(source.shards, most, strict=True))
     contents = f"{total:,} frames of {len(source.names):,} sequences"
-    require_space(total * bytes_per_frame, contents, out, "; frames=N takes fewer frames of a sequence")
+    size, free = total * bytes_per_frame, shutil.disk_usage(out).free
+    needed = f"about {decimal(size)} for {contents}; {decimal(free)} are free"
+    if size > free:
+        raise DataError(f"not enough space: {needed}; frames=N takes fewer frames of a sequence", str(out))
+    logger.info(needed)
 
 
 def _write_store(

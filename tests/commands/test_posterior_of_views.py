@@ -89,31 +89,6 @@ def test_several_images_with_their_cameras_give_one_scene(runs, command, tmp_pat
     assert np.abs(predict(1, 2, 3) - first).max() > 1e-3
 
 
-def test_psnr_is_reported_by_the_number_of_views(runs, command, tmp_path):
-    ckpt = f"ckpt={runs / 'var/checkpoints/last.ckpt'}"
-    overrides = "overrides=['data.evaluation_targets=7']"
-    given = ["report", "views", ckpt, overrides, "scenes=1"]
-    done = command(*given, "counts=[1,2,4]", f"out={tmp_path / 'out'}")
-    assert done.status == 0, done.err
-    rows = strict_json(tmp_path / "out/views.json")["rows"]
-    assert [row["views"] for row in rows] == [1, 2, 4]
-    # Scored on the same targets: what differs is what the posterior saw.
-    assert len({row["psnr"] for row in rows}) == 3
-    assert (tmp_path / "out/views.png").stat().st_size > 5000
-    assert "5 views, and half of the targets are 4" in refused("report", "report_task=views", *given[2:], "counts=[5]")
-
-
-def test_layers_are_reported_beside_the_true_back(runs, command, tmp_path):
-    ckpt = f"ckpt={runs / 'diffusion/checkpoints/last.ckpt'}"
-    done = command("report", "layers", ckpt, "scenes=1", f"out={tmp_path / 'out'}")
-    assert done.status == 0, done.err
-    back, first, second = strict_json(tmp_path / "out/layers.json")["rows"]
-    assert 0.1 < back["behind"] < 2
-    for layer in (first, second):
-        assert layer["ratio"] == pytest.approx(layer["behind"] / back["behind"], rel=1e-5)
-        assert 0 <= layer["on_back"] <= 1
-
-
 def test_images_that_cannot_be_taken_together_are_refused(runs, tiny_weights, tmp_path):
     write_capture(tmp_path, 6)
     pictures = f"image=[{tmp_path / 'frame0.png'},{tmp_path / 'frame1.png'}]"

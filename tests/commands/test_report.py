@@ -17,7 +17,7 @@ def report(command, pipeline, tmp_path):
         given = [f"ckpt={pipeline.diffusion / 'checkpoints/last.ckpt'}", "scenes=1", "samples=2", *settings]
         finished = command("report", task, *given, f"out={tmp_path / 'out'}")
         assert finished.status == 0, finished.err
-        return finished.out, strict_json(tmp_path / f"out/{task}.json") if task != "masked" else None
+        return finished.out, strict_json(tmp_path / f"out/{task}.json")
 
     return run
 
@@ -70,13 +70,6 @@ def test_controls_hold_the_papers_settings(report, tmp_path):
     assert "Faithfulness" in message
 
 
-def test_completions_of_masked_inputs_are_drawn(report, tmp_path):
-    report("masked", "views=2")
-    height, width = imageio.imread(tmp_path / "out/masked.png").shape[:2]
-    assert height > 3 * 144  # the truth and two samples
-    assert width > 4 * 128
-
-
 def test_depth_is_measured_with_the_papers_settings_and_one_is_drawn(report, tmp_path):
     message, results = report("depth", "far_degrees=45")
     assert weights_of(results["rows"]) == [(0, 0.5, True), (0.5, 0.5, True), (1, 0.2, True)]
@@ -92,7 +85,6 @@ def test_depth_is_measured_with_the_papers_settings_and_one_is_drawn(report, tmp
         ("samplers", "samples=1", "samples=1: must be at least 2"),
         ("samplers", "+steps.nonsense=[5]", "steps.nonsense: no such sampler"),
         ("controls", "guidance_weights=0.5", "guidance_weights=0.5: must be a list, such as guidance_weights=[0.5]"),
-        ("masked", "boxes=[[0,0,0,1]]", "is no [x0,y0,x1,y1]"),
         ("samplers", "seed=0", "nowhere.ckpt: no such checkpoint"),
     ],
 )

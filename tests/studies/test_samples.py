@@ -11,7 +11,7 @@ from support import tiny_generator
 from completesplat.data.images.photograph import Photograph
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.metrics.images import PSNR_LIMIT, psnr
-from completesplat.studies.controls import PAPER, box_visibility, grid, plot_controls
+from completesplat.studies.controls import PAPER, grid, plot_controls
 from completesplat.studies.samplers import SamplerRow, denoiser_calls, fewest, plot_samplers
 from completesplat.studies.samples import near, object_psnr
 
@@ -64,12 +64,6 @@ def test_each_sampler_has_its_line(tmp_path):
     plot_samplers([*rows, SamplerRow("dpm", 5, 5, **measures)], tmp_path / "samplers.png", "title")
     image = read(tmp_path / "samplers.png")
     assert [shows(image, color) for color in ((31, 119, 180), (255, 127, 14), (44, 160, 44))] == [True, True, False]
-
-
-def test_a_box_hides_the_pixels_that_it_touches():
-    expected = torch.ones(1, 8, 8)
-    expected[:, 2:5, 4:8] = 0
-    assert torch.equal(box_visibility([0.5, 0.25, 1, 0.6], 8), expected)
 
 
 def row(calls: int, psnr: float, agreement: float = 30.0) -> SamplerRow:
