@@ -80,7 +80,7 @@ FOREIGN = [
     {"_target_": "torch.optim.adam.torch.load", "f": "PAYLOAD", "weights_only": False},
     {"_target_": "torch.optim.Adam.__init__.__globals__"},
     {"_target_": "completesplat.commands.launch", "verb": "test", "arguments": []},
-    {"_target_": "completesplat.losses.mse.torch.load", "f": "PAYLOAD", "weights_only": False},
+    {"_target_": "completesplat.losses.terms.torch.load", "f": "PAYLOAD", "weights_only": False},
     {"_target_": "missing_module.Thing"},
     {"_target_": ""},
     {"_target_": ["os.system"]},
