@@ -195,7 +195,7 @@ def test_what_is_no_configuration_is_refused(run, text):
         configuration(run)
 
 
-@pytest.mark.parametrize("verb", ["test", "report samplers", "data latents"])
+@pytest.mark.parametrize("verb", ["test", "report controls", "data latents"])
 def test_no_verb_runs_what_a_run_names(command, run, elsewhere, monkeypatch, tmp_path, verb):
     monkeypatch.chdir(elsewhere)  # `command` works in the folder that holds the run
     torch.save(Payload(tmp_path / "sprung"), tmp_path / "payload")
