@@ -1,39 +1,37 @@
-"""`completesplat bench paper`: our durations beside those that the paper states for an A100."""
+"""`completesplat bench paper` and `cost`: our durations beside the paper's on an A100, and those of whole trainings."""
 
 import gc
+import json
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, TypedDict
 
 import torch
 from hydra.utils import instantiate
 from rich.console import Console
 from torch import Tensor, nn
 
-from completesplat.benchmarks.measuring import WARM_UP, Row, Work, device_name, milliseconds, print_results
+from completesplat.benchmarks.measuring import WARM_UP, Row, Work, milliseconds, report
 from completesplat.benchmarks.training_step import Training, autocast
 from completesplat.commands import quieten
-from completesplat.commands.protocol import write_json
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit
-from completesplat.results.machine import machine
-from completesplat.results.tables import Column, table
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Positive
+from completesplat.settings.schema import Entries, Positive
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stage import Stage
 
 VIEWS = 100
 MEGABYTE = 1e6
+DAY_MS = 24 * 3600 * 1000
 
 
 class Figure(NamedTuple):
@@ -55,15 +53,6 @@ FIGURES = {
 # The paper's durations are shown beside ours only for the same work.
 PAPERS_WORK = {"image_size": 128, "batch": 32, "samples": 20, "steps": 50}
 PAPERS_CHANNELS = {"encoder": [128, 256, 512, 512], "denoiser": [320, 640, 1280, 1280]}
-COLUMNS: list[Column] = [
-    ("", "text", ""),
-    ("", "way", ""),
-    ("ms", "ms", ",.1f"),
-    ("paper, A100\nms", "paper_ms", ",.1f"),
-    ("aim\nms", "aim_ms", ",.0f"),
-    ("memory\nMB", "memory_mb", ",.0f"),
-    ("", "not_measured", ""),
-]
 
 
 @dataclass(frozen=True)
@@ -127,12 +116,11 @@ def run(
             del module
     work = {"image_size": loaded.image_size, "batch": loaded.batch_size, "samples": samples, "steps": steps}
     if is_as_in_the_paper(work, channels):
-        rows = [{"paper_ms": figure.paper_ms, "aim_ms": figure.aim_ms} | row for figure, row in _with_figures(rows)]
-    hardware, workload = machine(), {"device": device, **work, "repeats": repeats}
-    write_json(out / "paper.json", {"machine": hardware, "workload": workload, "rows": rows})
+        rows = [row | {"paper_ms": figure.paper_ms, "aim_ms": figure.aim_ms} for figure, row in _with_figures(rows)]
+    results = {"workload": {"device": device, **work, "repeats": repeats}, "rows": rows}
     title = "{image_size} x {image_size} pixels, {samples} samples in {steps} steps, training batches of {batch}"
-    printed = table(title.format(**work), COLUMNS, [row | {"text": figure.text} for figure, row in _with_figures(rows)])
-    print_results(hardware, device_name(hardware, device), [printed])
+    named = [row | {"name": figure.text} for figure, row in _with_figures(rows)]
+    report(out / "paper.json", results, {title.format(**work): named}, device)
 
 
 def _with_figures(rows: Sequence[Row]) -> list[tuple[Figure, Row]]:
@@ -168,7 +156,7 @@ def measured(work: Work, repeats: int, device: torch.device) -> Row:
             work()
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)
-        times = [milliseconds(work, device) for _ in range(repeats)]
+        times = [milliseconds(work) for _ in range(repeats)]
     except (RuntimeError, AssertionError) as error:  # torch's compiler raises both kinds, too
         first = (str(error).strip().splitlines() or [""])[0]
         return {"not_measured": f"{type(error).__name__}: {first}"}
@@ -203,50 +191,58 @@ def networks(module: Stage) -> list[nn.Module]:
 
 def works_of(module: Stage, scenes: SceneBatch, precision: str, samples: int) -> dict[str, Work]:
     """Return the work of a stage by name; inference uses the first scene, training uses all."""
-    step = _step(module, scenes, precision)
-    if isinstance(module, LatentDiffusion):
-        draw = partial(_draw, module, scenes[:1], precision)
-        return {"sample": partial(draw, 1), "samples": partial(draw, samples), "stage2_step": step}
-    scene = scenes[:1]
+    step = partial(Training(module, precision).step, scenes)
 
     @torch.no_grad()
-    def reconstruct() -> Gaussians:
+    def draw(samples: int = 1) -> Gaussians:
         with autocast(module.device, precision):
-            return module.eval().reconstruct(scene, seed=0)
+            return module.eval().draw(scenes[:1], [0], samples)
 
-    gaussians = reconstruct().map(Tensor.float)
-    cameras = orbit_cameras(scene.reference.cameras[0], gaussians)
+    if isinstance(module, LatentDiffusion):
+        return {"sample": draw, "samples": partial(draw, samples), "stage2_step": step}
+    gaussians, camera = draw().map(Tensor.float), scenes.reference.cameras[0]
+    pivot = gaussians.means[0].mean(0)
+    cameras = orbit(camera, pivot, pivot.new_tensor([0.0, -1.0, 0.0]), VIEWS).map(lambda tensor: tensor[None])
 
     @torch.no_grad()
     def render() -> Tensor:
         return module.rasterizer(gaussians, cameras).color
 
-    return {"reconstruct": reconstruct, "render": render, "stage1_step": step}
+    return {"reconstruct": draw, "render": render, "stage1_step": step}
 
 
-def _draw(module: LatentDiffusion, scene: SceneBatch, precision: str, samples: int) -> Gaussians:
-    with autocast(module.device, precision):
-        reference = scene.reference
-        model = module.completesplat.eval()
-        return model.generate(reference.images, reference.cameras, scene.depth_range, samples=samples)
+class WholeTraining(TypedDict):
+    """A training: the measured step that it repeats, and its number of steps."""
+
+    step: Literal["stage1_step", "stage2_step"]
+    steps: Positive
 
 
-def orbit_cameras(camera: Cameras, gaussians: Gaussians) -> Cameras:
-    """Return cameras around the scene, [1, VIEWS]."""
-    pivot = gaussians.means[0].mean(0)
-    up = pivot.new_tensor([0.0, -1.0, 0.0])
-    return orbit(camera, pivot, up, VIEWS).map(lambda tensor: tensor[None])
+def cost(
+    measured: str, trainings: Mapping[str, WholeTraining], gpus: Annotated[Sequence[Positive], Entries(1)], out: Path
+) -> None:
+    """Write `cost.json`, and print the days that each training takes on each number of GPUs, by measured steps.
 
-
-def _step(module: Stage, scenes: SceneBatch, precision: str) -> Work:
-    """Return the work of an optimizer step; in stage 2 this includes encoding the scenes."""
-
-    @cache
-    def training() -> Training:  # made late, because its optimizer needs memory
-        return Training(module, precision)
-
-    def step() -> None:
-        module.train()
-        training().step(scenes)
-
-    return step
+    Raises:
+        CompleteSplatError: `measured` is not a result of `bench paper`, or has no training steps.
+    """
+    try:
+        results = json.loads(Path(measured).read_text())
+        machine, work, steps = results["machine"], results["workload"], results["rows"]
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise CompleteSplatError(f"measured={measured}: no result of bench paper ({error!r})") from error
+    rows: list[Row] = [
+        {"training": name, "steps": training["steps"], "way": step["way"], "ms": step["ms"]}
+        | {key: step[key] for key in ("memory_mb",) if key in step}
+        | {f"days_{count}": training["steps"] * step["ms"] / count / DAY_MS for count in gpus}
+        for name, training in trainings.items()
+        for step in steps
+        if step["name"] == training["step"] and "ms" in step
+    ]
+    if not rows:
+        raise CompleteSplatError(f"{measured} has no training steps: bench paper measures them with training=true")
+    title = f"{work['image_size']} x {work['image_size']} pixels, {work['batch']} scenes a step, on {work['device']}"
+    costs = {"machine": machine, "workload": work, "rows": rows}
+    report(out / "cost.json", costs, {title: rows}, work["device"])
+    print("At least this long: GPUs divide the scenes of a step without loss; reading data, validation and")
+    print("checkpoints are not counted.")

@@ -95,9 +95,9 @@ class Trained:
         """Return a stage around the model of `weights`; its loss and optimizer are never used."""
         from torch.optim import Adam
 
-        from completesplat.baselines.splatter_image.directional import DirectionalRasterizer
+        from completesplat.baselines.splatter_image.model import DirectionalRasterizer
         from completesplat.losses import WeightedSum
-        from completesplat.losses.mse import MeanSquaredError
+        from completesplat.losses.terms import MeanSquaredError
         from completesplat.training.latent_diffusion import LatentDiffusion
         from completesplat.training.optimization import constant
         from completesplat.training.reconstruction import ReconstructionModule

@@ -1,4 +1,4 @@
-"""Structural similarity."""
+"""Structural similarity (SSIM)."""
 
 from functools import cache
 
@@ -6,18 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.losses.weighted_sum import Prediction
-from completesplat.scene import Views
-
 # Wang et al. 2004, Section III.B and III.C: window of 11 pixels, sigma 1.5, K1 = 0.01, K2 = 0.03, for values in [0, 1].
 RADIUS, SIGMA, C1, C2 = 5, 1.5, 0.01**2, 0.03**2
-
-
-class StructuralDissimilarity:
-    """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term, which may also mean half of it)."""
-
-    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
-        return 1 - structural_similarity(prediction.images.flatten(0, 1), truth.images.flatten(0, 1)).mean()
 
 
 def structural_similarity(

@@ -14,8 +14,7 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import Choice, EvaluationScenes
 from completesplat.data.loading.view_selection import GrowingGap, evaluation_views_within, nearby_views
 from completesplat.data.packed.manifest import Scalar
-from completesplat.data.realestate10k.chunks import ChunkedClips
-from completesplat.data.realestate10k.clips import Clip, TextClips
+from completesplat.data.realestate10k.clips import ChunkedClips, Clip, TextClips
 from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource, split_by_hash
 from completesplat.data.validation import BadAnnotation, at, require_file
@@ -24,8 +23,6 @@ from completesplat.geometry.cameras import crop_resize
 from completesplat.settings.schema import Natural, OneOf, Positive, Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
-
-CROPS = ("center", "principal")
 
 Clips = TextClips | ChunkedClips
 
@@ -72,7 +69,7 @@ class RE10KSource(SequenceSource):
     def read(self, name: str) -> PosedSequence:
         """Read one clip's cameras; its images are read by `PosedSequence.read`."""
         clip, framing = self._clips.clip(name), self.framing
-        count = len(clip.timestamps)
+        count = len(clip.images)
         squares = [_square(clip, framing.crop, frame) for frame in range(count)]
         if len(set(squares)) == 1:
             cameras = crop_resize(clip.cameras, *squares[0], framing.image_size)
@@ -99,8 +96,8 @@ def _read(clip: Clip, squares: list[Square], size: int, index: int) -> MaskedIma
 class RE10KDataModule(SceneDataModule):
     """Scenes of room tours.
 
-    `root` is prepared, or has folders `train` and `test` with text files and frames as published (`realestate10k_text`)
-    or with pixelSplat's chunks (`realestate10k_chunks`). Training draws a random reference and random targets near it.
+    `root` is prepared, or has folders `train` and `test` with text files and frames as published or with
+    pixelSplat's chunks. Training draws a random reference and random targets near it.
     Clips are checked when they are read. Each loading process has at most two chunks in memory.
 
     Args:
@@ -128,7 +125,7 @@ class RE10KDataModule(SceneDataModule):
         evaluation_gap: Positive | None = None,
         evaluation_index: str | None = None,
         scene_list: str | None = None,
-        crop: Annotated[str, OneOf(CROPS)] = "center",
+        crop: Annotated[str, OneOf(("center", "principal"))] = "center",
         near: float = 0.7,
         far: float = 10.0,
         scale: float = 1.0,
