@@ -6,6 +6,8 @@ from pathlib import Path
 import torch
 from omegaconf import OmegaConf
 
+from completesplat.baselines.splatter_image.network import SongUNet
+
 # configs/default_config.yaml and configs/dataset/*.yaml of szymanowiczs/splatter-image, with small networks.
 DATA = {
     "hydrants": {"znear": -2.0, "zfar": 2.0, "white_background": False, "origin_distances": True},
@@ -27,56 +29,11 @@ def config(name: str, size: int = 16, network: dict = SMALL) -> dict:
 
 
 def shapes(size: int, network: dict) -> dict[str, list[int]]:
-    """Names and sizes of upstream's tensors, counted anew."""
-    found: dict[str, list[int]] = {}
-    width, blocks = network["base_dim"], network["num_blocks"]
-
-    def conv(name: str, inputs: int, outputs: int, kernel: int, resampled: bool = False) -> None:
-        found[f"{name}.weight"], found[f"{name}.bias"] = [outputs, inputs, kernel, kernel], [outputs]
-        if resampled:
-            found[f"{name}.resample_filter"] = [1, 1, 2, 2]
-
-    def norm(name: str, channels: int) -> None:
-        found[f"{name}.weight"] = found[f"{name}.bias"] = [channels]
-
-    def block(name: str, inputs: int, outputs: int, resampled: bool = False, attends: bool = False) -> None:
-        norm(f"{name}.norm0", inputs)
-        conv(f"{name}.conv0", inputs, outputs, 3, resampled)
-        norm(f"{name}.norm1", outputs)
-        conv(f"{name}.conv1", outputs, outputs, 3)
-        if inputs != outputs or resampled:
-            conv(f"{name}.skip", inputs, outputs, 1, resampled)
-        if attends:
-            norm(f"{name}.norm2", outputs)
-            conv(f"{name}.qkv", outputs, 3 * outputs, 1)
-            conv(f"{name}.proj", outputs, outputs, 1)
-
-    net = "network_with_offset.encoder"
-    sizes = [size, size // 2, size // 4, size // 8]
-    widths, attending = [width, *[2 * width] * 3], [one in network["attention_resolutions"] for one in sizes]
-    conv(f"{net}.enc.{size}x{size}_conv", 3, width, 3)
-    channels, kept = width, [width]
-    for one, outer, attends in zip(sizes, widths, attending, strict=True):
-        if one < size:
-            block(f"{net}.enc.{one}x{one}_down", channels, channels, resampled=True)
-            kept.append(channels)
-        for index in range(blocks):
-            block(f"{net}.enc.{one}x{one}_block{index}", channels, outer, attends=attends)
-            channels = outer
-            kept.append(outer)
-    for one, outer, attends in reversed(list(zip(sizes, widths, attending, strict=True))):
-        if one == sizes[-1]:
-            block(f"{net}.dec.{one}x{one}_in0", channels, channels, attends=True)
-            block(f"{net}.dec.{one}x{one}_in1", channels, channels)
-        else:
-            block(f"{net}.dec.{one}x{one}_up", channels, channels, resampled=True)
-        for index in range(blocks + 1):
-            attended = attends and index == blocks
-            block(f"{net}.dec.{one}x{one}_block{index}", channels + kept.pop(), outer, attends=attended)
-            channels = outer
-    norm(f"{net}.dec.{size}x{size}_aux_norm", width)
-    conv(f"{net}.dec.{size}x{size}_aux_conv", width, 24, 3)
-    conv("network_with_offset.out", 24, 24, 1)
+    """Names and sizes of all tensors in a file of weights; `test_published` compares them with upstream's."""
+    with torch.device("meta"):
+        net = SongUNet(size, 3, 24, network["base_dim"], network["num_blocks"], network["attention_resolutions"])
+    found = {f"network_with_offset.encoder.{name}": list(value.shape) for name, value in net.state_dict().items()}
+    found |= {"network_with_offset.out.weight": [24, 24, 1, 1], "network_with_offset.out.bias": [24]}
     found["ray_dirs"] = [1, 3, size, size]
     return found | {key: [1, 3, 3] for key in ("v_to_sh_transform", "sh_to_v_transform")}
 

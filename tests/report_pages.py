@@ -27,7 +27,7 @@ def write_results(root: Path) -> None:
     _write(run / "metrics.json", {"protocol": PROTOCOL, "model": {"full": {"novel": {"psnr": 21.125}}}})
     (run / "config.yaml").write_text(f"seed: 0 # {HOSTILE}\n")
     for step in range(5):
-        picture(run / f"pictures/step_00000{step}.png", 40 * step)
+        picture(run / f"images/step_00000{step}.png", 40 * step)
     modes = {"coverage": 0.875, "total_variation": 0.5, "sharpness": 1.0, "rejected": 0.25, "scenes": 2, "samples": 4}
     _write(root / "modes/hidden_modes.json", {"model": modes})
     _write(root / "modes/protocol.json", PROTOCOL)

@@ -176,7 +176,7 @@ def line(finished) -> str:
 
 
 FIT = [*SMALL, "experiment=toy_var", "test=false", "trainer.max_steps=4", "trainer.log_every_n_steps=1"]
-FIT += ["callbacks.pictures=null", "callbacks.checkpoint.every_n_train_steps=2"]
+FIT += ["callbacks.images=null", "callbacks.checkpoint.every_n_train_steps=2"]
 
 
 def test_training_stops_where_its_checkpoint_does_not_fit(command, pipeline, tmp_path):

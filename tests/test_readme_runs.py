@@ -18,7 +18,7 @@ from written_commands import CARDS, DOCUMENTS, arguments_of, block_commands
 BRIEF = {
     "data toy": ["scenes=20", "frames=4", "size=32", "workers=1"],
     "data prepare data=toy_objects": ["data.image_size=32", "workers=1"],
-    "fit": [*SMALL, "test=false", "data.scenes=20", "callbacks.pictures=null"],
+    "fit": [*SMALL, "test=false", "data.scenes=20", "callbacks.images=null"],
     "predict": ["frames=2", "steps=2"],
     "test": ["trainer.accelerator=cpu"],
     **{f"report {study}": ["scenes=1", "samples=2"] for study in ("samplers", "controls", "depth")},

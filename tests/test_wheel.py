@@ -45,7 +45,7 @@ def test_the_installed_wheel_predicts_sweeps_and_writes_a_page_from_an_empty_fol
     run("predict", f"image={picture}", "samples=1", "steps=2", "frames=2", "out=SCENES")
     scenes = tmp_path / "SCENES" / picture.stem
     assert {path.name for path in scenes.iterdir()} == {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json"}
-    brief = [f"data.root={toy_root}", *SMALL, "callbacks.pictures=null", "test=false"]
+    brief = [f"data.root={toy_root}", *SMALL, "callbacks.images=null", "test=false"]
     run("fit", "-m", "experiment=toy_var", *brief, "seed=0,1", "out=SWEEP")
     assert [strict_json(tmp_path / f"SWEEP/seed-{seed}/metrics.json")["steps"] for seed in (0, 1)] == [2, 2]
     run("report", "html", "runs=.", "out=PAGE")

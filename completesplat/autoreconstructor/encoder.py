@@ -20,6 +20,14 @@ def recompute(block: nn.Module, *inputs: Tensor | None) -> Tensor:
     return output
 
 
+@torch.no_grad()
+def zeroed(layer: nn.Module) -> nn.Module:
+    """Set all weights of a layer to zero, and return it."""
+    for parameter in layer.parameters():
+        parameter.zero_()
+    return layer
+
+
 def vae_encoder(
     inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, norm_groups: int
 ) -> vae.Encoder:

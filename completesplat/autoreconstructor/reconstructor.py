@@ -7,7 +7,7 @@ from diffusers.models.autoencoders import vae
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from completesplat.autoreconstructor.encoder import recompute
+from completesplat.autoreconstructor.encoder import recompute, zeroed
 from completesplat.settings.schema import Few, Levels, Width, Widths
 from completesplat.splatter_image import Parameterization, SplatterImage, from_channels, initialize_head
 
@@ -52,7 +52,8 @@ class Reconstructor(nn.Module):
         initialize_head(self.network.conv_out, parameterization)
         # The input of the up block at level l's resolution has the channels of the next coarser level.
         inputs = {level: channels[min(level + 1, len(channels) - 1)] for level in skip_levels}
-        self.skips = nn.ModuleDict({str(level): _zero_conv(channels[level], inputs[level]) for level in skip_levels})
+        convolutions = {str(level): zeroed(nn.Conv2d(channels[level], inputs[level], 1)) for level in skip_levels}
+        self.skips = nn.ModuleDict(convolutions)
         self.gradient_checkpointing = False
 
     @property
@@ -81,10 +82,3 @@ class Reconstructor(nn.Module):
             hidden = run(block, hidden)
         output = network.conv_out(network.conv_act(network.conv_norm_out(hidden)))
         return from_channels(output.float(), self.parameterization)
-
-
-def _zero_conv(inputs: int, outputs: int) -> nn.Conv2d:
-    conv = nn.Conv2d(inputs, outputs, 1)
-    nn.init.zeros_(conv.weight)
-    nn.init.zeros_(conv.bias)  # type: ignore[arg-type]
-    return conv

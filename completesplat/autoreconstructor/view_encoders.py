@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from completesplat.autoreconstructor.encoder import vae_encoder
+from completesplat.autoreconstructor.encoder import vae_encoder, zeroed
 from completesplat.geometry.cameras import pixel_centers, project, rays_through
 from completesplat.scene import Views
 from completesplat.settings.schema import Few, Range, Width, Widths
@@ -43,7 +43,7 @@ class PlaneSweep(nn.Module):
         self.planes = planes
         inputs = 3 + planes * 2 * 4
         self.network = vae_encoder(inputs, 2 * latent_channels, channels[1:], layers_per_block, norm_groups)
-        _zero(self.network.conv_out)
+        zeroed(self.network.conv_out)
 
     def forward(
         self, views: Views, depth_range: Float[Tensor, "batch 2"]
@@ -89,9 +89,3 @@ def sweep(
     sides = [(values * (sign * SHARPNESS * cosine + hidden).softmax(1)).sum(1) for sign in (1, -1)]
     features = torch.stack(sides, -2) * seen.any(1)[..., None]
     return features.view(batch, planes, height // 2, width // 2, 2, 4).permute(0, 1, 4, 5, 2, 3)
-
-
-@torch.no_grad()
-def _zero(layer: nn.Module) -> None:
-    for parameter in layer.parameters():
-        parameter.zero_()

@@ -5,7 +5,6 @@ of the pixels empty.
 """
 
 import math
-from typing import NamedTuple
 
 import torch
 from einops import rearrange
@@ -23,17 +22,10 @@ CERTAINTY = 1e-6
 """Smallest distance of shares and opacities from 0 and 1, where their logits are infinite."""
 
 
-class Projection(NamedTuple):
-    """Splatter Image, and a mask of its pixels without a Gaussian in any layer."""
-
-    splatter_image: SplatterImage
-    empty: Bool[Tensor, "batch height width"]
-
-
 def project_to_splatter_image(
     gaussians: Gaussians, cameras: Cameras, depth_range: Float[Tensor, "batch 2"], parameterization: Parameterization
-) -> Projection:
-    """Return the Splatter Image of a set of Gaussians, as far as its pixels have room for them.
+) -> tuple[SplatterImage, Bool[Tensor, "batch height width"]]:
+    """Return the Splatter Image of a set of Gaussians, and a mask of its pixels without a Gaussian in any layer.
 
     Each pixel takes its most opaque Gaussians, the most opaque one in the first layer. Gaussians behind the camera,
     outside its image, or with an opacity below 1/255 (never drawn) are dropped. The offset represents what ray and
@@ -69,7 +61,7 @@ def project_to_splatter_image(
         placed(gaussians.quaternions, 0.0),
         placed((gaussians.colors - 0.5) / SH_C0, 0.0),
     ]
-    return Projection(SplatterImage(torch.cat(parts, dim=2), parameterization), ~filled.any(dim=1).squeeze(1))
+    return SplatterImage(torch.cat(parts, dim=2), parameterization), ~filled.any(dim=1).squeeze(1)
 
 
 def occupied(image: SplatterImage) -> Bool[Tensor, "batch layer height width"]:

@@ -5,10 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, TypedDict
 
-from completesplat.benchmarks.measuring import Row, device_name, print_results
-from completesplat.commands.protocol import write_json
+from completesplat.benchmarks.measuring import Row, report
 from completesplat.errors import CompleteSplatError
-from completesplat.results.tables import Column, table
 from completesplat.settings.schema import Entries, Positive
 
 DAY_MS = 24 * 3600 * 1000
@@ -44,11 +42,8 @@ def run(
     ]
     if not rows:
         raise CompleteSplatError(f"{measured} has no training steps: bench paper measures them with training=true")
-    write_json(out / "cost.json", {"machine": machine, "workload": work, "rows": rows})
-    columns: list[Column] = [("training", "training", ""), ("steps", "steps", ",d"), ("", "way", "")]
-    columns += [("ms a step", "ms", ",.0f"), ("memory\nMB", "memory_mb", ",.0f")]
-    columns += [(f"days on {count}", f"days_{count}", ",.1f") for count in gpus]
     title = f"{work['image_size']} x {work['image_size']} pixels, {work['batch']} scenes a step, on {work['device']}"
-    print_results(machine, device_name(machine, work["device"]), [table(title, columns, rows)])
+    costs = {"machine": machine, "workload": work, "rows": rows}
+    report(out / "cost.json", costs, {title: rows}, work["device"])
     print("At least this long: GPUs divide the scenes of a step without loss; reading data, validation and")
     print("checkpoints are not counted.")

@@ -11,24 +11,12 @@ from typing import Annotated, Literal, NamedTuple, TypedDict
 
 from rich.console import Console
 
-from completesplat.benchmarks.measuring import Row, print_results
-from completesplat.commands.protocol import write_json
+from completesplat.benchmarks.measuring import Row, report
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.loader import SceneLoader
 from completesplat.data.packed.rows import CODECS
 from completesplat.data.packed.writing import prepare
-from completesplat.results.machine import machine
-from completesplat.results.tables import Column, table
 from completesplat.settings.schema import Entries, Natural, OneOf, Positive
-
-READING: list[Column] = [
-    ("form", "form", ""),
-    ("workers", "workers", "d"),
-    ("batches\nper s", "batches_per_second", ",.1f"),
-    ("scenes\nper s", "scenes_per_second", ",.0f"),
-    ("images\nper s", "images_per_second", ",.0f"),
-    ("times\nthe first", "times_first", ",.1f"),
-]
 
 MakeData = Callable[..., SceneDataModule]  # takes the settings that are still open (root, workers)
 
@@ -90,11 +78,8 @@ def run(
                     results[key] = rows(makers, workers, repeats, lambda text: status.update(f"reading {text}"))
     finally:
         logger.setLevel(level)
-    described = machine()
-    write_json(out / "data.json", {"machine": described, **results})
     titles = {"rows": "Training batches", "clips": "Training batches of clips"}
-    tables = [table(title, READING, results[key]) for key, title in titles.items() if key in results]
-    print_results(described, f"{described['processor']}, {described['cores']} cores", tables)
+    report(out / "data.json", results, {titles[key]: taken for key, taken in results.items()})
 
 
 def _objects(settings: Objects, codecs: Sequence[str], folder: Path) -> dict[str, MakeData]:

@@ -2,7 +2,6 @@
 
 import statistics
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -14,18 +13,15 @@ from hydra.utils import instantiate
 from rich.console import Console
 from torch.utils.flop_counter import FlopCounterMode
 
-from completesplat.benchmarks.measuring import WARM_UP, Row, Work, device_name, milliseconds, print_results
+from completesplat.benchmarks.measuring import WARM_UP, Row, Work, milliseconds, report
 from completesplat.benchmarks.training_step import Training
 from completesplat.commands import quieten
-from completesplat.commands.protocol import write_json
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.writing import prepare
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras, pinhole
-from completesplat.results.machine import machine
-from completesplat.results.tables import Column, table
 from completesplat.scene import CachedScene, SceneBatch
 from completesplat.settings.schema import Positive
 from completesplat.training.encoding import encode_training_set
@@ -34,23 +30,10 @@ from completesplat.training.latent_diffusion import LatentDiffusion
 GUIDANCE_WEIGHT = 0.5  # from the paper's settings for diverse samples
 MANY_STEPS = 50  # the paper's
 CACHED = "cached_vs_on_the_fly"
-COMPARED: list[Column] = [
-    ("a", "a", ""),
-    ("b", "b", ""),
-    ("a\nms", "a_ms", ",.1f"),
-    ("b\nms", "b_ms", ",.1f"),
-    ("times\nfaster", "ratio", ",.2f"),
-    ("a\nTFLOP", "a_tflop", ",.4f"),
-    ("b\nTFLOP", "b_tflop", ",.4f"),
-]
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Two ways of doing the same work, each with a label for tables; the first one should be faster."""
-
-    a: tuple[str, Work]
-    b: tuple[str, Work]
+Comparison = tuple[tuple[str, Work], tuple[str, Work]]
+"""Two ways of doing the same work, each with a label for tables; the first one should be faster."""
 
 
 def run(
@@ -84,21 +67,17 @@ def run(
         module: LatentDiffusion = instantiate(model, _convert_="all").to(chosen)
         loaded: SceneDataModule = make_data()
         batch = loaded.batch_size
-        # The latents are cached when their comparison is measured.
-        makers: dict[str, Callable[[], Comparison]] = {
-            CACHED: lambda: cached_vs_on_the_fly(module, precision, make_data, Path(folder) / "latents")
-        }
-        for name, comparison in sampling_comparisons(module.completesplat, few, samples, steps, batch).items():
-            makers[name] = partial(lambda comparison: comparison, comparison)
+        sampling = sampling_comparisons(module.completesplat, few, samples, steps, batch)
         with Console(stderr=True).status("building") as status:
-            for name in chosen_of(makers, only):
+            for name in chosen_of([CACHED, *sampling], only):
                 status.update(f"timing {name}")
-                rows.append({"name": name} | measured(makers[name](), repeats, chosen))
+                comparison = sampling.get(name)
+                if comparison is None:
+                    comparison = cached_vs_on_the_fly(module, precision, make_data, Path(folder) / "latents")
+                rows.append({"name": name} | measured(comparison, repeats))
     workload = {"device": chosen.type, "precision": precision, "image_size": loaded.image_size, "batch": batch}
-    described = machine()
-    write_json(out / "diffusion.json", {"machine": described, "workload": workload, "rows": rows})
     title = f"{loaded.image_size} x {loaded.image_size} pixels, batch {batch}, training in {precision}"
-    print_results(described, device_name(described, chosen.type), [table(title, COMPARED, rows)])
+    report(out / "diffusion.json", {"workload": workload, "rows": rows}, {title: rows}, chosen.type)
 
 
 def chosen_of(names: Collection[str], only: Sequence[str] | None) -> list[str]:
@@ -113,12 +92,13 @@ def chosen_of(names: Collection[str], only: Sequence[str] | None) -> list[str]:
     return [name for name in names if only is None or name in only]
 
 
-def measured(comparison: Comparison, repeats: int, device: torch.device) -> Row:
+def measured(comparison: Comparison, repeats: int) -> Row:
     """Return medians in ms of both ways, which take turns, the speed-up of `a`, and TFLOP per call.
 
     The first two calls of each way are not timed. FLOPs are those that torch counts (products, convolutions).
     """
-    works = {"a": comparison.a[1], "b": comparison.b[1]}
+    (first, one), (second, other) = comparison
+    works = {"a": one, "b": other}
     tflop, times = {}, {key: list[float]() for key in works}
     for key, work in works.items():
         with FlopCounterMode(display=False) as counter:
@@ -126,9 +106,9 @@ def measured(comparison: Comparison, repeats: int, device: torch.device) -> Row:
         tflop[f"{key}_tflop"] = counter.get_total_flops() / 1e12
     for _ in range(WARM_UP + repeats):
         for key, work in works.items():
-            times[key].append(milliseconds(work, device))
+            times[key].append(milliseconds(work))
     a, b = (statistics.median(times[key][WARM_UP:]) for key in works)
-    return {"a": comparison.a[0], "b": comparison.b[0], "a_ms": a, "b_ms": b, "ratio": b / a, **tflop}
+    return {"a": first, "b": second, "a_ms": a, "b_ms": b, "ratio": b / a, **tflop}
 
 
 def cached_vs_on_the_fly(
@@ -152,10 +132,9 @@ def cached_vs_on_the_fly(
         progress=False,
     )
     parts.set_latent_moments(store.mean, store.std)
-    parts.train()
     fill_cache(images)
     cached, fly = batches(data(latent_cache=str(folder))), batches(images)
-    return Comparison(
+    return (
         ("step from the latent cache", lambda: training.step(next(cached))),
         ("encoding on the fly", lambda: training.step(next(fly))),
     )
@@ -196,13 +175,15 @@ def sampling_comparisons(
     several = partial(_draw, model, usual, 1, steps=steps, samples=samples)
     draw = partial(_draw, model, usual, batch)
     return {
-        f"batch_vs_one_by_one_k{samples}": Comparison(
-            (f"{samples} samples at a time", several), ("one by one", partial(several, batch=1))
+        f"batch_vs_one_by_one_k{samples}": (
+            (f"{samples} samples at a time", several),
+            ("one by one", partial(several, batch=1)),
         ),
-        "unguided_vs_guided": Comparison(
-            ("w = 0", draw), (f"w = {GUIDANCE_WEIGHT}", partial(draw, guidance_weight=GUIDANCE_WEIGHT))
+        "unguided_vs_guided": (
+            ("w = 0", draw),
+            (f"w = {GUIDANCE_WEIGHT}", partial(draw, guidance_weight=GUIDANCE_WEIGHT)),
         ),
-        f"few_steps_vs_{MANY_STEPS}": Comparison(
+        f"few_steps_vs_{MANY_STEPS}": (
             (_label(quick, quick.steps), partial(_draw, model, quick, batch)),
             (_label(usual, MANY_STEPS), partial(draw, steps=MANY_STEPS)),
         ),

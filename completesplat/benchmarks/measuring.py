@@ -1,45 +1,41 @@
-"""Timing of work on a device, and printing of the results: parts of all benchmarks."""
+"""Timing of work, and output of the results: parts of all benchmarks."""
 
-import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
-import torch
-from rich.console import Console
-
-from completesplat.results.tables import Table
+from completesplat.commands.protocol import write_json
+from completesplat.results.machine import machine
+from completesplat.results.tables import records_table, show
+from completesplat.training.stage import now
 
 Work = Callable[[], object]
 Row = dict[str, object]  # of a table; its values can be written as JSON
 WARM_UP = 2  # untimed calls
 
 
-def finished(device: torch.device) -> float:
-    """Wait until the device has finished its work, and return the time in seconds."""
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter()
-
-
-def milliseconds(work: Work, device: torch.device) -> float:
-    """Return the time of one call, until the device has finished it."""
-    start = finished(device)
+def milliseconds(work: Work) -> float:
+    """Return the time of one call, until the GPU, if there is one, has finished it."""
+    start = now()
     work()
-    return (finished(device) - start) * 1e3
+    return (now() - start) * 1e3
 
 
-def device_name(machine: Mapping[str, object], device: object = "cpu") -> str:
-    """Return the name of the GPU ("cuda"), or that of the processor with its number of threads."""
-    return str(machine["gpu"]) if device == "cuda" else f"{machine['processor']}, {machine['threads']} threads"
-
-
-def print_results(
-    machine: Mapping[str, object], device: str, tables: Iterable[Table], not_measured: Mapping[str, str] | None = None
+def report(
+    path: Path, results: Mapping[str, object], tables: Mapping[str, Sequence[Row]], device: object = "cpu"
 ) -> None:
-    """Print a line about the machine and the device, the tables, and reasons for parts that were not measured."""
-    # No markup, because a reason may contain brackets, as in `pip install "completesplat[cuda]"`.
-    console = Console(width=None if Console().is_terminal else 140, markup=False)
-    console.print(f"{device}, torch {machine['torch']}, {machine['date']}")
-    for table in tables:
-        console.print(table)
-    for name, reason in (not_measured or {}).items():
-        console.print(f"{name}: not measured, because {reason}")
+    """Write results to a JSON file; print where they were measured, tables, and why others were not measured.
+
+    Args:
+        results: content of the file, with the reasons in `not_measured`, by name; by default it is from this machine.
+        tables: rows by title.
+        device: "cuda", or anything else for the processor.
+    """
+    here: dict[str, Any] = {"machine": machine(), "not_measured": {}, **results}
+    hardware = here["machine"]
+    write_json(path, {"machine": hardware, **results})
+    name = hardware["gpu"] if device == "cuda" else f"{hardware['processor']}, {hardware['threads']} threads"
+    print(f"{name}, torch {hardware['torch']}, {hardware['date']}")
+    show(*(records_table(title, rows) for title, rows in tables.items()), width=140)
+    for part, reason in here["not_measured"].items():
+        print(f"{part}: not measured, because {reason}")

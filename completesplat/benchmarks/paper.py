@@ -5,7 +5,7 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple
@@ -15,17 +15,13 @@ from hydra.utils import instantiate
 from rich.console import Console
 from torch import Tensor, nn
 
-from completesplat.benchmarks.measuring import WARM_UP, Row, Work, device_name, milliseconds, print_results
+from completesplat.benchmarks.measuring import WARM_UP, Row, Work, milliseconds, report
 from completesplat.benchmarks.training_step import Training, autocast
 from completesplat.commands import quieten
-from completesplat.commands.protocol import write_json
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit
-from completesplat.results.machine import machine
-from completesplat.results.tables import Column, table
 from completesplat.scene import SceneBatch
 from completesplat.settings.schema import Positive
 from completesplat.training.latent_diffusion import LatentDiffusion
@@ -55,15 +51,6 @@ FIGURES = {
 # The paper's durations are shown beside ours only for the same work.
 PAPERS_WORK = {"image_size": 128, "batch": 32, "samples": 20, "steps": 50}
 PAPERS_CHANNELS = {"encoder": [128, 256, 512, 512], "denoiser": [320, 640, 1280, 1280]}
-COLUMNS: list[Column] = [
-    ("", "text", ""),
-    ("", "way", ""),
-    ("ms", "ms", ",.1f"),
-    ("paper, A100\nms", "paper_ms", ",.1f"),
-    ("aim\nms", "aim_ms", ",.0f"),
-    ("memory\nMB", "memory_mb", ",.0f"),
-    ("", "not_measured", ""),
-]
 
 
 @dataclass(frozen=True)
@@ -127,12 +114,11 @@ def run(
             del module
     work = {"image_size": loaded.image_size, "batch": loaded.batch_size, "samples": samples, "steps": steps}
     if is_as_in_the_paper(work, channels):
-        rows = [{"paper_ms": figure.paper_ms, "aim_ms": figure.aim_ms} | row for figure, row in _with_figures(rows)]
-    hardware, workload = machine(), {"device": device, **work, "repeats": repeats}
-    write_json(out / "paper.json", {"machine": hardware, "workload": workload, "rows": rows})
+        rows = [row | {"paper_ms": figure.paper_ms, "aim_ms": figure.aim_ms} for figure, row in _with_figures(rows)]
+    results = {"workload": {"device": device, **work, "repeats": repeats}, "rows": rows}
     title = "{image_size} x {image_size} pixels, {samples} samples in {steps} steps, training batches of {batch}"
-    printed = table(title.format(**work), COLUMNS, [row | {"text": figure.text} for figure, row in _with_figures(rows)])
-    print_results(hardware, device_name(hardware, device), [printed])
+    named = [row | {"name": figure.text} for figure, row in _with_figures(rows)]
+    report(out / "paper.json", results, {title.format(**work): named}, device)
 
 
 def _with_figures(rows: Sequence[Row]) -> list[tuple[Figure, Row]]:
@@ -168,7 +154,7 @@ def measured(work: Work, repeats: int, device: torch.device) -> Row:
             work()
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)
-        times = [milliseconds(work, device) for _ in range(repeats)]
+        times = [milliseconds(work) for _ in range(repeats)]
     except (RuntimeError, AssertionError) as error:  # torch's compiler raises both kinds, too
         first = (str(error).strip().splitlines() or [""])[0]
         return {"not_measured": f"{type(error).__name__}: {first}"}
@@ -203,50 +189,21 @@ def networks(module: Stage) -> list[nn.Module]:
 
 def works_of(module: Stage, scenes: SceneBatch, precision: str, samples: int) -> dict[str, Work]:
     """Return the work of a stage by name; inference uses the first scene, training uses all."""
-    step = _step(module, scenes, precision)
-    if isinstance(module, LatentDiffusion):
-        draw = partial(_draw, module, scenes[:1], precision)
-        return {"sample": partial(draw, 1), "samples": partial(draw, samples), "stage2_step": step}
-    scene = scenes[:1]
+    step = partial(Training(module, precision).step, scenes)
 
     @torch.no_grad()
-    def reconstruct() -> Gaussians:
+    def draw(samples: int = 1) -> Gaussians:
         with autocast(module.device, precision):
-            return module.eval().reconstruct(scene, seed=0)
+            return module.eval().draw(scenes[:1], [0], samples)
 
-    gaussians = reconstruct().map(Tensor.float)
-    cameras = orbit_cameras(scene.reference.cameras[0], gaussians)
+    if isinstance(module, LatentDiffusion):
+        return {"sample": draw, "samples": partial(draw, samples), "stage2_step": step}
+    gaussians, camera = draw().map(Tensor.float), scenes.reference.cameras[0]
+    pivot = gaussians.means[0].mean(0)
+    cameras = orbit(camera, pivot, pivot.new_tensor([0.0, -1.0, 0.0]), VIEWS).map(lambda tensor: tensor[None])
 
     @torch.no_grad()
     def render() -> Tensor:
         return module.rasterizer(gaussians, cameras).color
 
-    return {"reconstruct": reconstruct, "render": render, "stage1_step": step}
-
-
-def _draw(module: LatentDiffusion, scene: SceneBatch, precision: str, samples: int) -> Gaussians:
-    with autocast(module.device, precision):
-        reference = scene.reference
-        model = module.completesplat.eval()
-        return model.generate(reference.images, reference.cameras, scene.depth_range, samples=samples)
-
-
-def orbit_cameras(camera: Cameras, gaussians: Gaussians) -> Cameras:
-    """Return cameras around the scene, [1, VIEWS]."""
-    pivot = gaussians.means[0].mean(0)
-    up = pivot.new_tensor([0.0, -1.0, 0.0])
-    return orbit(camera, pivot, up, VIEWS).map(lambda tensor: tensor[None])
-
-
-def _step(module: Stage, scenes: SceneBatch, precision: str) -> Work:
-    """Return the work of an optimizer step; in stage 2 this includes encoding the scenes."""
-
-    @cache
-    def training() -> Training:  # made late, because its optimizer needs memory
-        return Training(module, precision)
-
-    def step() -> None:
-        module.train()
-        training().step(scenes)
-
-    return step
+    return {"reconstruct": draw, "render": render, "stage1_step": step}

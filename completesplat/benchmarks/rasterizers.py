@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from itertools import product
 from pathlib import Path
-from typing import Literal, NamedTuple, TypedDict
+from typing import Any, Literal, TypedDict
 
 from hydra.utils import instantiate
 from rich.console import Console
 
-from completesplat.benchmarks.measuring import Row, device_name, print_results
+from completesplat.benchmarks.measuring import Row, report
 from completesplat.benchmarks.training_step import share
 from completesplat.benchmarks.workloads import (
     OPACITIES,
@@ -21,13 +21,10 @@ from completesplat.benchmarks.workloads import (
     splatter_scene,
 )
 from completesplat.commands import quieten
-from completesplat.commands.protocol import write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
-from completesplat.results.machine import machine
-from completesplat.results.tables import Column, table
 from completesplat.settings.schema import Positive
 
 # `gsplat_torch` is a baseline for this comparison; training cannot choose it.
@@ -38,27 +35,6 @@ CLASSES = {
     "cuda": "completesplat.rasterizers.cuda.CudaRasterizer",
 }
 LONGEST_SECONDS = 4.0  # a backend that has run this long on a workload does not repeat it
-SPEED: list[Column] = [
-    ("backend", "backend", ""),
-    ("size", "size", ""),
-    ("Gaussians", "gaussians", ","),
-    ("views", "views", ""),
-    ("opacity", "opacity", ""),
-    ("forward\nms", "forward_ms", ",.1f"),
-    ("with backward\nms", "forward_backward_ms", ",.1f"),
-    ("times\ntiled", "times_tiled", ",.1f"),
-    ("peak\nMB", "peak_mb", ",.0f"),
-]
-STEP: list[Column] = [
-    ("backend", "backend", ""),
-    ("size", "size", ""),
-    ("batch", "batch", ""),
-    ("views", "views", ""),
-    ("step\nms", "step_ms", ",.0f"),
-    ("rasterizer\nms", "rasterizer_ms", ",.1f"),
-    ("share", "share", ".1%"),
-]
-
 Tick = Callable[[str], None]
 
 
@@ -70,14 +46,6 @@ class StepSettings(TypedDict):
     batch: Positive
     targets: Positive
     precision: str
-
-
-class Figures(NamedTuple):
-    """Median times of the forward pass and of both passes in ms, and the memory that a first rendering adds."""
-
-    forward_ms: float
-    forward_backward_ms: float
-    peak_mb: float | None
 
 
 def run(
@@ -112,11 +80,9 @@ def run(
             for backend in [backend for backend in working if backend.name in training_step["backends"]]:
                 tick(f"a training step with {backend.name}")
                 steps.append(share(backend, model, size, batch, targets, training_step["precision"]))
-    hardware = machine()
-    results = {"machine": hardware, "not_measured": absent, "rows": rows}
-    write_json(out / "rasterizers.json", results | ({"training_step": steps} if training_step else {}))
-    tables = [table("Speed", SPEED, rows), *([table("Share of a training step", STEP, steps)] if steps else [])]
-    print_results(hardware, device_name(hardware), tables, absent)
+    results = {"not_measured": absent, "rows": rows} | ({"training_step": steps} if training_step else {})
+    tables = {"Speed": rows} | ({"Share of a training step": steps} if steps else {})
+    report(out / "rasterizers.json", results, tables)
 
 
 def working_backends(names: Sequence[str], constants: RenderingConstants) -> tuple[list[Backend], dict[str, str]]:
@@ -153,16 +119,16 @@ def speed_rows(
         workload: Row = {"size": size, "gaussians": gaussians.count, "views": number, "opacity": opacity}
         results = side_by_side(backends, gaussians, cameras, repeats)
         for name, figures in results.items():
-            rows.append({"backend": name} | workload | figures._asdict())
+            rows.append({"backend": name} | workload | figures)
             if "tiled" in results:
-                rows[-1]["times_tiled"] = figures.forward_backward_ms / results["tiled"].forward_backward_ms
+                rows[-1]["times_tiled"] = figures["forward_backward_ms"] / results["tiled"]["forward_backward_ms"]
     return rows
 
 
 def side_by_side(
     backends: Sequence[Backend], gaussians: Gaussians, cameras: Cameras, repeats: int
-) -> dict[str, Figures]:
-    """Time the backends in turn, and return the figures of each.
+) -> dict[str, dict[str, Any]]:
+    """Time the backends in turn; return median ms of the forward pass and of both passes, and the peak memory in MB.
 
     The memory is that of the first rendering with its backward pass, whose time counts only if there is no other.
     """
@@ -181,8 +147,8 @@ def side_by_side(
     for _, backend in product(range(repeats), backends):
         if spent[backend.name] <= LONGEST_SECONDS:
             render(backend)
-    results = {}
+    results: dict[str, dict[str, Any]] = {}
     for name, pairs in times.items():
         forward, both = (statistics.median(column) for column in zip(*(pairs[1:] or pairs), strict=True))
-        results[name] = Figures(forward, both, peaks[name])
+        results[name] = {"forward_ms": forward, "forward_backward_ms": both, "peak_mb": peaks[name]}
     return results

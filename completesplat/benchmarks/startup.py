@@ -15,11 +15,9 @@ from typing import NamedTuple
 from PIL import Image
 from rich.console import Console
 
-from completesplat.benchmarks.measuring import Row, print_results
-from completesplat.commands.protocol import git_commit, write_json
+from completesplat.benchmarks.measuring import Row, report
+from completesplat.commands.protocol import git_commit
 from completesplat.errors import CompleteSplatError
-from completesplat.results.machine import machine
-from completesplat.results.tables import Column, table
 from completesplat.settings.schema import Positive
 
 TORCH, PREDICT, AGAIN, VIEW = "import torch", "predict", "predict once more", "view, until its page is there"
@@ -39,8 +37,6 @@ print(json.dumps([time.process_time() - start[0], time.perf_counter() - start[1]
 """
 # The working folder may hold another version of the package.
 SETTINGS = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
-PROCESSES: list[Column] = [("", "what", ""), ("CPU time\ns", "cpu_seconds", ".2f"), ("wall\ns", "wall_seconds", ".2f")]
-PROCESSES += [("times\nimport torch", "times_torch", ".1f")]
 
 
 class Seconds(NamedTuple):
@@ -72,10 +68,8 @@ def run(weights: str, repeats: Positive, out: Path) -> None:
         {"what": name, "cpu_seconds": x.cpu, "wall_seconds": x.wall, "times_torch": x.cpu / times[TORCH].cpu}
         for name, x in times.items()
     ]
-    described = machine()
-    write_json(out / "startup.json", {"machine": described, "commit": git_commit(), "rows": rows})
-    title = "One sample, without a video, from a cold start"
-    print_results(described, described["processor"], [table(title, PROCESSES, rows)])
+    title = "One sample, without a video, from a cold start, in one thread"
+    report(out / "startup.json", {"commit": git_commit(), "rows": rows}, {title: rows})
     starting = (times[PREDICT].cpu - times[AGAIN].cpu) / times[TORCH].cpu
     print(f"predict without what it takes once more: {starting:.1f} times import torch, in CPU time")
 

@@ -2,10 +2,12 @@
 
 import statistics
 from collections.abc import Mapping
+from functools import cached_property
 
 import torch
 from hydra.utils import instantiate
 from torch import Tensor
+from torch.optim import Optimizer
 
 from completesplat.benchmarks.measuring import Row, milliseconds
 from completesplat.benchmarks.workloads import DISTANCE, Backend, orbit, rendering_milliseconds
@@ -27,15 +29,19 @@ class Training:
     """
 
     def __init__(self, module: Stage, precision: str) -> None:
-        self.module = module.train()
+        self.module = module
         self.precision = precision
         for logs in ("log_loss", "log_step"):  # there is no trainer to log with
             setattr(module, logs, lambda *_, **__: None)
-        self.optimizer = module.optimizer([p for p in module.parameters() if p.requires_grad])
+
+    @cached_property
+    def optimizer(self) -> Optimizer:
+        """Return the optimizer, which takes memory from the first step on."""
+        return self.module.optimizer([p for p in self.module.parameters() if p.requires_grad])
 
     def step(self, batch: SceneBatch | CachedScene) -> None:
         """Do one optimizer step on a batch of scenes or of their latents."""
-        module = self.module
+        module = self.module.train()
         with autocast(module.device, self.precision):
             loss: Tensor = module.training_step(batch.to(module.device), 0)  # type: ignore[assignment]
         self.optimizer.zero_grad()
@@ -69,7 +75,7 @@ def share(backend: Backend, model: Mapping[str, object], size: int, batch: int, 
     scenes = synthetic_batch(size, batch, targets)
     training = Training(instantiate(model, rasterizer=rasterizer, _convert_="all"), precision)
     untimed, timed = SLOW.get(backend.name, (UNTIMED_STEPS, TIMED_STEPS))
-    steps = [milliseconds(lambda: training.step(scenes), torch.device("cpu")) for _ in range(untimed + timed)]
+    steps = [milliseconds(lambda: training.step(scenes)) for _ in range(untimed + timed)]
     step = statistics.median(steps[untimed:])
     rendering = statistics.median(rendering_milliseconds(backend.rasterizer, *inputs[0])[1] for _ in range(timed))
     return {

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from completesplat.benchmarks.measuring import finished
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, pixel_centers, unproject
 from completesplat.rasterizers import Rasterizer
 from completesplat.rasterizers.kernels.drawing import release
+from completesplat.training.stage import now
 
 DISTANCE = 2.2  # from the cameras to the object's centre, world units
 FOV_DEGREES = 49.0
@@ -85,13 +85,13 @@ def orbit(size: int, views: int) -> Cameras:
 
 def rendering_milliseconds(rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> tuple[float, float]:
     """Return the times of the forward pass, and of both passes with gradients to all parameters of the Gaussians."""
-    gaussians, device = gaussians.map(lambda tensor: tensor.detach().requires_grad_()), gaussians.means.device
+    gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     ones = [_ones(cameras, channels) for channels in (3, 1, 1)]
-    start = finished(device)
+    start = now()
     rendering = rasterizer(gaussians, cameras)
-    middle = finished(device)
+    middle = now()
     torch.autograd.backward([rendering.color, rendering.depth, rendering.alpha], ones)
-    return (middle - start) * 1e3, (finished(device) - start) * 1e3
+    return (middle - start) * 1e3, (now() - start) * 1e3
 
 
 def _ones(cameras: Cameras, channels: int) -> Tensor:

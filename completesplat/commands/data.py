@@ -22,7 +22,7 @@ def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> Non
     from completesplat.data.validation import audit
 
     try:
-        findings = audit.check(_sources(data, splits), workers)
+        findings = audit.check(_sources(data, splits), workers, splits_share_sequences=data.splits_share_sequences)
     except DataError as error:  # concerns the data set as a whole
         findings = audit.Findings(0, 0, [error], {}, {})
     findings.write(out / "check.json")

@@ -17,15 +17,14 @@ from completesplat.commands import quieten
 from completesplat.commands.jobs import CONFIG, METRICS
 from completesplat.commands.protocol import drawing, protocol, provenance, write_json
 from completesplat.commands.trained import Trained
-from completesplat.data.hidden_modes import hidden_modes
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, evaluation_table, show, table
 from completesplat.settings.schema import Natural, Positive, Range
+from completesplat.training.loggers import wandb_runs
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
-from completesplat.training.wandb import wandb_runs
 
 
 def scored_data(run_config: DictConfig, evaluation: Mapping[str, Any]) -> SceneDataModule:
@@ -151,7 +150,7 @@ def run_hidden_modes(
     device = torch.device("cuda" if trainer["accelerator"] != "cpu" and torch.cuda.is_available() else "cpu")
     module.to(device).eval()
     samples = evaluation["samples"]
-    scenes, skipped = usable(hidden_modes(data, evaluation["views"], evaluation["spread_views"]), evaluation["scenes"])
+    scenes, skipped = usable(data.hidden_modes(evaluation["views"], evaluation["spread_views"]), evaluation["scenes"])
     progress = partial(track, description="Hidden modes", console=Console(stderr=True))
     measured = measure(
         predictors(module, samples, evaluation["batch"]),

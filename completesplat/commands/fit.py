@@ -21,9 +21,9 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.results.tables import evaluation_table, show
 from completesplat.settings.checks import check_image_size, check_optimizer, check_verb
 from completesplat.training.checkpoints import newest_whole
+from completesplat.training.loggers import wandb_runs
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
-from completesplat.training.wandb import wandb_runs
 from completesplat.weights import RUN_WEIGHTS
 from completesplat.weights.checkpoint_reading import check_whole
 

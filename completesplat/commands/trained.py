@@ -95,7 +95,7 @@ class Trained:
         """Return a stage around the model of `weights`; its loss and optimizer are never used."""
         from torch.optim import Adam
 
-        from completesplat.baselines.splatter_image.directional import DirectionalRasterizer
+        from completesplat.baselines.splatter_image.model import DirectionalRasterizer
         from completesplat.losses import WeightedSum
         from completesplat.losses.mse import MeanSquaredError
         from completesplat.training.latent_diffusion import LatentDiffusion

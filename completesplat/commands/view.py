@@ -143,9 +143,9 @@ def newest_scenes(run: Path) -> tuple[Sequence[Any], Sequence[float]]:
 
     folder = run / NEWEST
     if not folder.parent.is_dir():
-        raise CompleteSplatError(f"watch={run}: no {folder.parent.name}/ here, which fit fills (callbacks.pictures)")
+        raise CompleteSplatError(f"watch={run}: no {folder.parent.name}/ here, which fit fills (callbacks.images)")
     if not (folder / NEWEST_FILE).is_file():
-        print(f"{run}: no scenes yet; waiting for them (every callbacks.pictures.every_n_steps steps)", flush=True)
+        print(f"{run}: no scenes yet; waiting for them (every callbacks.images.every_n_steps steps)", flush=True)
     while not (folder / NEWEST_FILE).is_file():
         time.sleep(PAUSE)
     _, samples, up = read_newest(folder)

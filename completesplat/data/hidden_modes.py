@@ -6,7 +6,6 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from completesplat.errors import CompleteSplatError
 from completesplat.scene import SceneBatch
 from completesplat.tensors import TensorDataclass
 
@@ -48,18 +47,3 @@ class HiddenModeScenes(Protocol):
             DataError: it is unreadable, its reference view distinguishes the modes, or no view shows them well.
             CompleteSplatError: the files were not made by the data set.
         """
-
-
-@runtime_checkable
-class KnowsHiddenModes(Protocol):
-    """Data module that knows the alternatives for what the reference image hides."""
-
-    def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
-        """Return all test scenes, each with up to `views` views that show the modes best and evenly spread targets."""
-
-
-def hidden_modes(data: object, views: int, spread_views: int) -> HiddenModeScenes:
-    """Return `data.hidden_modes(views, spread_views)`, after a check that the data module has this method."""
-    if not isinstance(data, KnowsHiddenModes):
-        raise CompleteSplatError("evaluation=hidden_modes needs data whose hidden parts are known: toy objects")
-    return data.hidden_modes(views, spread_views)

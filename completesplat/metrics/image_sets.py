@@ -86,16 +86,12 @@ class Inception:
         self.network, self.subset_size = network.eval(), subset_size
 
     @torch.no_grad()
-    def features(self, images: Images) -> Float[Tensor, "image feature"]:
+    def describe(self, images: Images) -> Descriptors:
         """Return features (2048 of NVlabs' network) of sRGB images with values in [0, 1], rounded to 8 bits."""
         pixels = (255 * images.clamp(0, 1)).round().to(torch.uint8)
         with torch.autocast(images.device.type, enabled=False):
             features: Tensor = self.network.to(images.device)(pixels, return_features=True).float()
         return features
-
-    def describe(self, images: Images) -> Descriptors:
-        """See `SetMetric`."""
-        return self.features(images)
 
     def distances(self, true: Descriptors, predicted: Descriptors) -> dict[str, float]:
         """See `SetMetric`."""

@@ -28,9 +28,9 @@ UNCHANGED, QUALITY = 300_000, 85
 """Bytes up to which a PNG of at most that width is not encoded again; and quality of JPEG."""
 SIDE, LONGEST = 256, 60_000
 """Pixels of a frame's longer side; and of the widest strip of frames (JPEG's limit is 65,535)."""
-IMAGES = {"": "*.png", "pictures": "step_*.png", "samples": "*.png"}  # subfolders of a run, and the images in each
+IMAGES = {"": "*.png", "images": "step_*.png", "samples": "*.png"}  # subfolders of a run, and the images in each
 CAPTIONS = {
-    "pictures": ": fixed scenes while training: input, target, render, error, depth, opacity, each layer",
+    "images": ": fixed scenes while training: input, target, render, error, depth, opacity, each layer",
     "samples": ": samples of fixed scenes while training",
 }
 MOST_CHARACTERS = 20_000  # characters of a config that are shown
@@ -47,7 +47,7 @@ class Limits(TypedDict):
     samples: Positive
     predictions: Positive
     runs: Positive
-    pictures: Positive
+    images: Positive
     megabytes: Annotated[float, Range(1)]
 
 
@@ -218,9 +218,7 @@ def page(folder: Path, out: Path, most: Limits, made: Mapping[str, str]) -> tupl
         tables[run.folder] = [*tables.get(run.folder, []), *mode_tables([run])]
     listed, selected = predicted[: most["predictions"]], tested[: most["runs"]]
     predictions = [_prediction_section(path, _name(path, folder), most, images) for path in listed]
-    runs = [
-        _run_section(path, _name(path, folder), tables.get(path, []), most["pictures"], images) for path in selected
-    ]
+    runs = [_run_section(path, _name(path, folder), tables.get(path, []), most["images"], images) for path in selected]
     here = Path(__file__).parent
     environment = Environment(loader=FileSystemLoader(here), autoescape=True, undefined=StrictUndefined)
     environment.trim_blocks = environment.lstrip_blocks = True

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict, cast
+from typing import Any, cast
 
 from omegaconf import OmegaConf
 
@@ -41,7 +41,6 @@ from completesplat.results.tables import (
 
 FILE = Path(__file__).with_name("figures.yaml")
 PAPER = "Liao et al., Complete Gaussian Splats from a Single Image with Denoising Diffusion Models, 3DV 2026"
-MARKS = ("best", "second", "dagger", "star")
 METRICS = ("psnr", "lpips", "fid", "kid")
 
 SIGNS = {"dagger": "†", "star": "★"}
@@ -53,14 +52,6 @@ APART = "Rows of ours are by the protocol in their note, not by the paper's: the
 
 
 @dataclass(frozen=True)
-class PrintedCell:
-    """Cell as printed, with its marks (of `MARKS`)."""
-
-    text: str
-    marks: frozenset[str]
-
-
-@dataclass(frozen=True)
 class PrintedColumn:
     """Column as printed: joined levels of its heading; a key of `LEADING` or `METRICS`; a data set, or the table's."""
 
@@ -69,17 +60,13 @@ class PrintedColumn:
     data_set: str = ""
 
 
-class Requirements(TypedDict):
-    """Values that a run by one of our protocols must have; without `scenes`, it has all scenes of the list."""
-
-    scenes: NotRequired[list[int]]
-    resolution: int
-    protocol_views: str
-
-
 @dataclass(frozen=True)
 class PublishedTable:
-    """Table of the paper and the protocol of its figures; the head of `figures.yaml` explains each entry."""
+    """Table of the paper and the protocol of its figures; the head of `figures.yaml` explains each entry.
+
+    `evaluations` are the `resolution`, `protocol_views` and numbers of `scenes` that a run by one of our protocols must
+    have; without `scenes`, it has all scenes of the list.
+    """
 
     name: str
     place: str
@@ -87,10 +74,10 @@ class PublishedTable:
     title: str
     region: str
     view: str
-    evaluations: Mapping[str, Requirements]
+    evaluations: Mapping[str, Mapping[str, Any]]
     says: list[str]
     columns: list[PrintedColumn]
-    rows: list[list[PrintedCell]]
+    rows: list[list[Cell]]
     legend: Mapping[str, str] = field(default_factory=dict)
     data_set: str = ""
     resolution: str = ""
@@ -117,10 +104,12 @@ def published() -> list[PublishedTable]:
     return tables
 
 
-def parse(cell: str) -> PrintedCell:
-    """Split a cell: `17.93 best` is the text `17.93` with the mark `best`."""
+def parse(cell: str) -> Cell:
+    """Convert `17.93 best` to the text `17.93` with the mark `best`; dagger and star become signs behind the text."""
     words = cell.split()
-    return PrintedCell(" ".join(word for word in words if word not in MARKS), frozenset(words) & set(MARKS))
+    text = " ".join(word for word in words if word not in (BEST, SECOND, *SIGNS)) or BLANK
+    signs = [SIGNS[word] for word in words if word in SIGNS]
+    return Cell(" ".join([text, *signs]), next((word for word in words if word in (BEST, SECOND)), UNMARKED))
 
 
 def _source(table: PublishedTable) -> str:
@@ -137,9 +126,9 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
     keys = [key for key in LEADING if key != "speed" or has_speed]
     headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in table.scored)]
     for row in table.rows:
-        cells = {column.key: printed(cell) for column, cell in zip(table.columns, row, strict=True)}
-        cells = {"resolution": Cell(table.resolution or ABSENT)} | cells
-        scores = [printed(row[number]) for number, _, _ in table.scored]
+        cells = {"resolution": Cell(table.resolution or ABSENT)}
+        cells |= {column.key: cell for column, cell in zip(table.columns, row, strict=True)}
+        scores = [row[number] for number, _, _ in table.scored]
         rows.append(TableRow("paper", [*(cells.get(key, Cell(ABSENT)) for key in keys), *scores]))
     for entry in (entry for entry in entries if belongs(table, entry)):
         leading = entry.leading(notes)
@@ -180,17 +169,10 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
     return (protocol["resolution"], protocol.get("protocol_views")) == (wanted["resolution"], wanted["protocol_views"])
 
 
-def printed(cell: PrintedCell) -> Cell:
-    """Return the cell of a table for a published cell, its marks as signs and as best or second."""
-    signs = "".join(f" {sign}" for mark, sign in SIGNS.items() if mark in cell.marks)
-    mark = next((mark for mark in (BEST, SECOND) if mark in cell.marks), UNMARKED)
-    return Cell((cell.text or BLANK) + signs, mark)
-
-
 def ablations_beside(table: PublishedTable, sweeps: Mapping[str, Sequence[Job]]) -> Table:
     """Return the published rows, followed by means over seeds of sweeps, by name and protocol."""
     notes, names = Notes(), [f"{table.region}_{table.view}_{column.key}" for _, column, _ in table.scored]
-    rows = [TableRow("paper", [printed(cell) for cell in row]) for row in table.rows]
+    rows = [TableRow("paper", row) for row in table.rows]
     for name, jobs in sweeps.items():
         for group in alike((job, job.protocol) for job in jobs):
             settings, protocol = sweep_rows(group), group[0].protocol

@@ -15,6 +15,7 @@ from hydra.types import RunMode
 from completesplat.results.machine import machine
 from completesplat.results.runs import MODEL, SEED, UPPER_BOUND, Job, collect, typed
 from completesplat.results.tables import (
+    EVALUATED_IF_POSSIBLE,
     FORMATS,
     SSIM_NOTE,
     Cell,
@@ -40,7 +41,6 @@ NOTHING = "No job of this sweep has finished."
 PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
 IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
 ALWAYS = ["full_novel_psnr", "full_novel_ssim", "object_novel_psnr", "object_novel_ssim", "full_reference_psnr"]
-WHERE_MEASURED = ["full_novel_lpips", "full_novel_fid", "full_novel_kid"]  # scores in the table of a sweep
 
 
 class SweepSummary(Callback):
@@ -112,12 +112,10 @@ def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> SweepRow:
     means = {name: fmean(each) for name, each in values.items() if len(each) == len(jobs)}
     if predictor != MODEL:
         return SweepRow(label, None, scenes, None, bound, means, {})
-    deviations = {name: _deviation(values[name]) for name in means if len(jobs) > 1}
+    # An infinite PSNR has no deviation.
+    finite = {name: all(map(math.isfinite, values[name])) for name in means if len(jobs) > 1}
+    deviations = {name: stdev(values[name]) if known else math.nan for name, known in finite.items()}
     return SweepRow(label, len(jobs), scenes, _common(job.steps for job in jobs), bound, means, deviations)
-
-
-def _deviation(values: Sequence[float]) -> float:
-    return stdev(values) if all(map(math.isfinite, values)) else math.nan  # an infinite PSNR has none
 
 
 def _common(values: Iterable[int]) -> int | str | None:
@@ -147,7 +145,7 @@ def summarize(*folders: Path) -> tuple[list[SweepRow], Table]:
     """Return rows and table of all jobs in a sweep's folder, or in its parts on several machines, finished or not."""
     jobs = collect(*folders)
     rows = sweep_rows([job for job in jobs if job.finished])
-    names = [*ALWAYS, *(name for name in WHERE_MEASURED if any(name in row.means for row in rows))]
+    names = [*ALWAYS, *(name for name in EVALUATED_IF_POSSIBLE if any(name in row.means for row in rows))]
     body = []
     for row, cells in zip(rows, figures(rows, names), strict=True):
         identity = [Cell("" if value is None else str(value)) for value in (row.label, row.seeds, row.scenes)]

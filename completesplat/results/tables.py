@@ -41,6 +41,7 @@ LABELS = {"full": "all\npixels", "object": "object\npixels"}
 EVALUATED = ["_".join((*place, name)) for place in product(LABELS, ("novel", "reference")) for name in ("psnr", "ssim")]
 EVALUATED_IF_POSSIBLE = [f"full_novel_{name}" for name in ("lpips", "fid", "kid")]
 """Scores in the table of an evaluation, if they were measured."""
+PLAIN = (type(None), str, bool, int, float)  # types of values that a table can show
 CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
 
 
@@ -166,15 +167,22 @@ def table(title: str, columns: Sequence[Column], records: Iterable[Mapping[str, 
 
 
 def records_table(title: str, records: Sequence[Mapping[str, object]]) -> Table:
-    """Return a table of records with the same keys, which are its headings; values that are no text are left out."""
-    kinds: dict[str, set[type]] = {}
-    for record in records:
-        for key, value in record.items():
-            kinds.setdefault(key, set()).add(type(value))
-    plain = {key: types for key, types in kinds.items() if types <= {type(None), str, bool, int, float}}
-    return table(
-        title, [(key.replace("_", "\n"), key, ".4g" if float in types else "") for key, types in plain.items()], records
-    )
+    """Return a table of records with the same keys, which are its headings; lists and mappings are left out."""
+    columns = {key: [record.get(key) for record in records] for record in records for key in record}
+    plain = {key: values for key, values in columns.items() if all(isinstance(value, PLAIN) for value in values)}
+    headings = [
+        Heading(key.replace("_", "\n"), figures=any(isinstance(value, int | float) for value in values))
+        for key, values in plain.items()
+    ]
+    rows = [TableRow("", [Cell(_written(value)) for value in values]) for values in zip(*plain.values(), strict=True)]
+    return Table(title, title, headings, rows)
+
+
+def _written(value: object) -> str:
+    """Return a value as text: nothing for None, and four digits of floats, or all those before the point."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return "" if value is None else str(value)
+    return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1000 else f"{value:,.0f}"
 
 
 def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:

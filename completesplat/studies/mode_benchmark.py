@@ -50,8 +50,8 @@ def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
         gaussians = module.reconstruct(scene, seed=seed, samples=samples, batch=batch)
         return torch.cat([_render(module, gaussians[i : i + batch], scene) for i in range(0, samples, batch)])
 
-    diffusion = isinstance(module, LatentDiffusion)
-    network = module.completesplat.autoreconstructor if diffusion else getattr(module, "model", None)
+    frozen = module.completesplat.autoreconstructor if isinstance(module, LatentDiffusion) else None
+    network = frozen or getattr(module, "model", None)
     if not isinstance(network, VariationalAutoReconstructor):
         return {"model": model}
     ladder = _Ladder(module, network, samples, batch)

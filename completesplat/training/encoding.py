@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Shaped
+from rich.filesize import decimal
 from rich.progress import track
 from torch import nn
 
@@ -26,14 +28,13 @@ from completesplat.data.loading.latent_cache import (
     LatentCache,
     LatentCacheManifest,
     Origin,
-    is_latent_cache,
     row_checksums,
     write_manifest,
 )
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.loading.view_selection import spread_around
+from completesplat.data.packed.manifest import MANIFEST
 from completesplat.data.packed.source import PackedSource
-from completesplat.data.packed.writing import require_space
 from completesplat.data.sequences import PosedSequence, spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import SceneBatch
@@ -58,15 +59,13 @@ def fingerprint(module: nn.Module) -> str:
     return digest.hexdigest()
 
 
-def posterior_fingerprint(autoreconstructor: VariationalAutoReconstructor) -> str:
-    """Return the fingerprint of all weights that latents depend on."""
+def fingerprints(
+    autoreconstructor: VariationalAutoReconstructor, conditioning: nn.Module | None
+) -> tuple[str, str | None]:
+    """Return fingerprints of all weights that latents depend on, and of a frozen conditioning (else None)."""
     encoder, views = autoreconstructor.encoder, autoreconstructor.view_encoder
-    return fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
-
-
-def features_fingerprint(conditioning: nn.Module | None) -> str | None:
-    """Return the fingerprint of a frozen conditioning, whose features are stored; else None."""
-    return fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
+    latents = fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
+    return latents, fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
 
 
 def check_cache(store: LatentCache, autoreconstructor: VariationalAutoReconstructor, conditioning: nn.Module) -> None:
@@ -75,9 +74,10 @@ def check_cache(store: LatentCache, autoreconstructor: VariationalAutoReconstruc
     Args:
         conditioning: needs its stored features if it is frozen, else stored images.
     """
-    if store.origin.encoder != posterior_fingerprint(autoreconstructor):
+    latents, features = fingerprints(autoreconstructor, conditioning)
+    if store.origin.encoder != latents:
         raise WeightsError(f"{store.folder}: made with another autoreconstructor; encode the training set again")
-    if store.origin.conditioning != features_fingerprint(conditioning):
+    if store.origin.conditioning != features:
         content = "images" if store.origin.conditioning is None else "features of another conditioning"
         advice = "encode the training set again with this run's conditioning"
         raise WeightsError(f"{store.folder}: holds {content}; {advice}")
@@ -150,7 +150,7 @@ def encode_training_set(
     views = views if autoreconstructor.sees_views else 0
     source = _packed(data)
     origin = _origin(autoreconstructor, data, conditioning, frames, views, precision)
-    if is_latent_cache(out):
+    if (out / MANIFEST).is_file():
         if (store := LatentCache(out)).origin != origin:
             raise DataError("already holds another store: choose another folder, or remove this one", str(out))
         logger.info("%s already holds these encodings", out)
@@ -160,7 +160,7 @@ def encode_training_set(
     encode = partial(
         encoded, autoreconstructor=frozen, conditioning=features, precision=PRECISIONS[precision], device=device
     )
-    load = partial(_loaded, SceneStore(source, source.names, cache=False), views)
+    load = partial(_loaded, SceneStore(source), views)
     blank = encode(stack([load(next(_references(source, 1, [], False)))]))
     _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
     sequences: list[CachedSequence] = []
@@ -231,7 +231,11 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
     most = [len(shard.sequences) * (frames or shard.frames) for shard in source.shards]
     total = sum(min(shard.frames, limit) for shard, limit in zip(source.shards, most, strict=True))
     contents = f"{total:,} frames of {len(source.names):,} sequences"
-    require_space(total * bytes_per_frame, contents, out, "; frames=N takes fewer frames of a sequence")
+    size, free = total * bytes_per_frame, shutil.disk_usage(out).free
+    needed = f"about {decimal(size)} for {contents}; {decimal(free)} are free"
+    if size > free:
+        raise DataError(f"not enough space: {needed}; frames=N takes fewer frames of a sequence", str(out))
+    logger.info(needed)
 
 
 def _write_store(
@@ -265,8 +269,7 @@ def _origin(
     if conditioning is not None and not conditioning.frozen:
         raise CompleteSplatError("a conditioning that is trained needs images, not features: leave conditioning out")
     return Origin(
-        posterior_fingerprint(autoreconstructor),
-        features_fingerprint(conditioning),
+        *fingerprints(autoreconstructor, conditioning),
         data.source("train").fingerprint(),
         data.packed_settings(),
         data.image_size,

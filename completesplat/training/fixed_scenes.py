@@ -54,8 +54,8 @@ class DrawsFixedScenes(Callback):
         self.views = views
 
     @abstractmethod
-    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> None:
-        """Write and log the model's results for the scenes [view], which are on the CPU."""
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> tuple[Image.Image, dict[str, float]]:
+        """Return an image of the model's results for the scenes [view], which are on the CPU, and figures to log."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.scenes: list[SceneBatch] = []
@@ -82,7 +82,16 @@ class DrawsFixedScenes(Callback):
         with untouched(trainer, module):
             if not self.scenes:
                 self.scenes = fixed_scenes(module.data.val_dataloader(), self.count, self.views)
-            self.draw(trainer, module, self.scenes)
+            sheet, figures = self.draw(trainer, module, self.scenes)
+        write_png(self.folder / f"step_{self.drawn:06}.png", sheet)
+        for logger in trainer.loggers:
+            # Lightning numbers a row by the optimizer steps before it.
+            logger.log_metrics(figures, step=self.drawn - 1)
+            if isinstance(logger, WandbLogger):
+                import wandb
+
+                media: dict[str, Any] = {self.folder.name: wandb.Image(sheet)}
+                logger.log_metrics(media, step=self.drawn - 1)
 
 
 @contextmanager
@@ -113,7 +122,7 @@ def _spread(scene: SceneBatch, views: int) -> list[int]:
     return [i * targets // views for i in range(views)] if targets > views else list(range(targets))
 
 
-class Pictures(DrawsFixedScenes):
+class FixedScenes(DrawsFixedScenes):
     """Callback that draws the first target of each scene and logs figures of its Gaussians; see `DrawsFixedScenes`.
 
     `folder/step_000500.png` has a row for each scene (`scene_panels`); `folder/newest/` holds the scenes
@@ -124,7 +133,8 @@ class Pictures(DrawsFixedScenes):
     def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Natural = 4) -> None:
         super().__init__(folder, every_n_steps, scenes, views=1)
 
-    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> None:
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> tuple[Image.Image, dict[str, float]]:
+        """See `DrawsFixedScenes`."""
         batch = stack(scenes).to(module.device)
         with trainer.precision_plugin.forward_context():
             gaussians = module.reconstruct(batch, seed=0)
@@ -132,10 +142,8 @@ class Pictures(DrawsFixedScenes):
         with torch.autocast(module.device.type, enabled=False):
             panels = scene_panels(module.rasterizer, gaussians, batch, module.background)
         sheet = image_sheet(list(panels), [list(map(SheetCell, row)) for row in zip(*panels.values(), strict=True)])
-        write_png(self.folder / f"step_{trainer.global_step:06}.png", sheet)
         write_newest(self.folder / "newest", trainer.global_step, gaussians, batch, module.up)
-        figures = gaussian_figures(gaussians) | layer_figures(gaussians, batch) | latents
-        log_drawings(trainer, figures, "pictures", sheet)
+        return sheet, gaussian_figures(gaussians) | layer_figures(gaussians, batch) | latents
 
 
 def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBatch, up: Float[Tensor, "3"]) -> None:
@@ -220,18 +228,6 @@ def gaussian_figures(gaussians: Gaussians) -> dict[str, float]:
     }
 
 
-def log_drawings(trainer: Trainer, figures: dict[str, float], name: str, image: Image.Image) -> None:
-    """Log figures to all loggers, and an image to Weights & Biases."""
-    step = trainer.global_step - 1  # Lightning numbers a row by the optimizer steps before it
-    for logger in trainer.loggers:
-        logger.log_metrics(figures, step=step)
-        if isinstance(logger, WandbLogger):
-            import wandb
-
-            media: dict[str, Any] = {name: wandb.Image(image)}
-            logger.log_metrics(media, step=step)
-
-
 class Samples(DrawsFixedScenes):
     """Callback that draws samples of each scene from its reference and target views; see `DrawsFixedScenes`.
 
@@ -254,21 +250,19 @@ class Samples(DrawsFixedScenes):
         super().__init__(folder, every_n_steps, scenes, views)
         self.samples = samples
 
-    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> None:
-        drawings = [self._draw_scene(trainer, module, stack([scene]).to(module.device)) for scene in scenes]
-        sheet = samples_sheet(drawings)
-        write_png(self.folder / f"step_{trainer.global_step:06}.png", sheet)
-        scores = [scene.scores() for scene in drawings]
-        figures = {f"samples/{name}": sum(values[name] for values in scores) / len(scores) for name in scores[0]}
-        log_drawings(trainer, figures, "samples", sheet)
-
-    def _draw_scene(self, trainer: Trainer, module: Stage, scene: SceneBatch) -> "SceneDrawings":
-        views = scene.all_views()
-        with trainer.precision_plugin.forward_context():
-            gaussians = module.draw(scene, [0], self.samples)
-        rendering = module.render_from(gaussians, views.cameras[0])
-        images = rendering.over(module.background).clamp(0, 1)
-        return SceneDrawings(views.images[0], images, rendering.expected_depth()[:1])
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> tuple[Image.Image, dict[str, float]]:
+        """See `DrawsFixedScenes`."""
+        drawings = []
+        for scene in (stack([scene]).to(module.device) for scene in scenes):
+            views = scene.all_views()
+            with trainer.precision_plugin.forward_context():
+                gaussians = module.draw(scene, [0], self.samples)
+            rendering = module.render_from(gaussians, views.cameras[0])
+            images = rendering.over(module.background).clamp(0, 1)
+            drawings.append(SceneDrawings(views.images[0], images, rendering.expected_depth()[:1]))
+        scores = [drawing.scores() for drawing in drawings]
+        means = {f"samples/{name}": sum(values[name] for values in scores) / len(scores) for name in scores[0]}
+        return samples_sheet(drawings), means
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from completesplat.settings.schema import Natural, Positive, Range, Share
+from completesplat.settings.schema import Natural, Range, Share
 
 
 def muon(
@@ -17,8 +17,6 @@ def muon(
     lr: Annotated[float, Range(0)],
     adam_lr: Annotated[float, Range(0)],
     adam_betas: tuple[Share, Share] = (0.9, 0.99),
-    momentum: Share = 0.95,
-    newton_schulz_steps: Positive = 5,
 ) -> Optimizer:
     """Build Muon (Jordan 2024; library pytorch_optimizer) for matrices and kernels, with Adam for biases and norms.
 
@@ -28,7 +26,6 @@ def muon(
     Args:
         lr: learning rate of matrices and kernels; the size of their gradients makes no difference.
         adam_lr, adam_betas: learning rate and betas of biases and norms.
-        newton_schulz_steps: iterations that make an update orthogonal.
     """
     from pytorch_optimizer import Muon  # imports a hundred other modules
 
@@ -36,7 +33,7 @@ def muon(
     matrices = {"params": [p for p in tensors if p.ndim > 1], "lr": lr, "use_muon": True}
     others = {"params": [p for p in tensors if p.ndim < 2], "lr": adam_lr, "betas": adam_betas, "use_muon": False}
     groups = [group for group in (matrices, others) if group["params"]]
-    optimizer: Optimizer = Muon(groups, momentum=momentum, ns_steps=newton_schulz_steps)
+    optimizer: Optimizer = Muon(groups)
     if tensors[0].device.type == "cpu" and not torch.cpu._is_avx512_bf16_supported():
         optimizer._orthogonalize = _orthogonal_in_float32  # type: ignore[attr-defined]
     return optimizer

@@ -41,12 +41,12 @@ CALLS = {"REDUCE", "BUILD", "NEWOBJ", "BINPERSID"}
 LONGEST_NAME = 16
 
 
-class Step(NamedTuple):
+class _Op(NamedTuple):
     """Operation of a pickle, its argument, and the steps whose results it takes (kept for calls and tuples)."""
 
     name: str
     argument: Any = None
-    inputs: tuple["Step", ...] = ()
+    inputs: tuple["_Op", ...] = ()
 
 
 def read_tensor_file(path: Path, mmap: bool = False) -> Any:
@@ -84,9 +84,9 @@ def read_tensor_file(path: Path, mmap: bool = False) -> Any:
 
 def _check_steps(pickle: bytes) -> None:
     """Raise TensorFileError for a pickle with a step that may make more than the file holds."""
-    stack: list[Step] = []
+    stack: list[_Op] = []
     marks: list[int] = []
-    memo: dict[object, Step] = {}
+    memo: dict[object, _Op] = {}
     for opcode, argument, _ in pickletools.genops(pickle):
         name, before = opcode.name, opcode.stack_before
         if name == "MARK":
@@ -96,35 +96,35 @@ def _check_steps(pickle: bytes) -> None:
         elif name.endswith("GET"):
             value = memo[argument]
             is_name = value.name == "GLOBAL" or (value.name in TEXTS and len(value.argument) <= LONGEST_NAME)
-            stack.append(value if is_name else Step(name))
+            stack.append(value if is_name else _Op(name))
         else:
             marked = pickletools.markobject in before
             first = marks.pop() - before.index(pickletools.markobject) if marked else len(stack) - len(before)
-            step = Step(name, argument, tuple(stack[first:]) if name in CALLS | TUPLES else ())
+            step = _Op(name, argument, tuple(stack[first:]) if name in CALLS | TUPLES else ())
             if not _is_plain(step):
                 made = next((value.argument for value in step.inputs if value.name == "GLOBAL"), argument or name)
                 raise TensorFileError(f"made of {shown(made)}, not of tensors alone")
             # Keep the length of a storage, and only the name of any other call.
             length = step.inputs[0].inputs[-1].argument if name == "BINPERSID" else None
-            stack[first:] = [Step(name, length) if name in CALLS else step] * len(opcode.stack_after)
+            stack[first:] = [_Op(name, length) if name in CALLS else step] * len(opcode.stack_after)
 
 
-def _is_plain(step: Step) -> bool:
+def _is_plain(step: _Op) -> bool:
     """Return whether `torch.save` writes this step; with arguments beside it, no large value is repeated."""
     match step:
-        case Step("GLOBAL"):
+        case _Op("GLOBAL"):
             return PLAIN.fullmatch(step.argument) is not None
-        case Step("BUILD", _, (_, state)):
+        case _Op("BUILD", _, (_, state)):
             return state.name in MAPPINGS
         # The archive's reader ignores case, so keys with letters could name one record many times.
-        case Step("BINPERSID", _, (Step("TUPLE", _, (_, Step("GLOBAL"), key, _, length)),)):
+        case _Op("BINPERSID", _, (_Op("TUPLE", _, (_, _Op("GLOBAL"), key, _, length)),)):
             return key.name in TEXTS and re.fullmatch("[0-9]+", key.argument) is not None and length.name in NUMBERS
-        case Step("REDUCE", _, (Step("GLOBAL", function), arguments)) if arguments.name in TUPLES:
+        case _Op("REDUCE", _, (_Op("GLOBAL", function), arguments)) if arguments.name in TUPLES:
             return _is_plain_call(function, arguments.inputs)
     return step.name not in CALLS
 
 
-def _is_plain_call(function: str, arguments: tuple[Step, ...]) -> bool:
+def _is_plain_call(function: str, arguments: tuple[_Op, ...]) -> bool:
     """Return whether a call makes no more than its arguments hold in the file."""
     match function.split()[1], arguments:
         case "OrderedDict", ():
@@ -137,10 +137,15 @@ def _is_plain_call(function: str, arguments: tuple[Step, ...]) -> bool:
             return place.name in TEXTS and all(number.name in NUMBERS for number in index)
         case "encode", (text, codec):
             # Some other codecs double the bytes each time they are called.
-            return text.name in TEXTS and codec == Step(codec.name, "latin1")
+            return text.name in TEXTS and codec == _Op(codec.name, "latin1")
         case "_rebuild_parameter", _:
             return True
-        case "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_tensor_v3", (Step("BINPERSID", length), _, sizes, *_):
+        case "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_tensor_v3", (
+            _Op("BINPERSID", length),
+            _,
+            sizes,
+            *_,
+        ):
             if any(size.name not in NUMBERS for size in sizes.inputs):
                 return False
             if math.prod(size.argument for size in sizes.inputs) > max(length, MOST_REPEATED):

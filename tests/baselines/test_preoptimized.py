@@ -68,7 +68,7 @@ def test_what_the_camera_does_not_see_fills_no_pixel():
     assert empty.all()
     assert (image.gaussians(ONE, RANGE).opacities < 1e-12).all()
     corner = replace(gaussians, opacities=torch.tensor([[0.9, 0.9, 0.9, 0.004]]))
-    assert not project_to_splatter_image(corner, ONE, RANGE, Parameterization()).empty[0, 0, 0]
+    assert not project_to_splatter_image(corner, ONE, RANGE, Parameterization())[1][0, 0, 0]
 
 
 def test_scenes_of_a_batch_stay_apart():

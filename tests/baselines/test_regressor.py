@@ -6,6 +6,7 @@ from hydra.utils import instantiate
 from support import compose_config
 
 from completesplat.baselines.regressor import SplatterImageUNet
+from completesplat.baselines.splatter_image.network import SongUNet
 from completesplat.splatter_image import Parameterization
 
 
@@ -48,44 +49,17 @@ def attention(width: int) -> int:
     return 2 * width + 4 * (width**2 + width)
 
 
-def upstream_count() -> int:
-    """Parameters of EDM's SongUNet as Splatter Image sets it up, counted block by block."""
-
-    def conv(inputs: int, outputs: int, kernel: int = 3) -> int:
-        return inputs * outputs * kernel**2 + outputs
-
-    def block(inputs: int, outputs: int, shortcut: bool = False) -> int:
-        through = 2 * inputs + conv(inputs, outputs) + 2 * outputs + conv(outputs, outputs)
-        return through + (conv(inputs, outputs, 1) if shortcut or inputs != outputs else 0)
-
-    count, width, skips, levels = conv(3, 128), 128, [128], (128, 256, 256, 256)
-    for level, channels in enumerate(levels):
-        if level > 0:
-            count += block(width, width, shortcut=True)
-            skips.append(width)
-        for _ in range(4):
-            count, width = count + block(width, channels), channels
-            skips.append(width)
-    count += 2 * block(width, width)
-    for channels in reversed(levels):
-        for _ in range(5):
-            count, width = count + block(width + skips.pop(), channels), channels
-        if skips:
-            count += block(width, width, shortcut=True)
-    return count + 6 * attention(256) + 2 * width + conv(width, 15) + conv(15, 15, 1)
-
-
 def test_the_full_size_is_upstreams_but_for_the_differences_it_states():
     config = compose_config("fit", "regressor=splatter_image")
     with torch.device("meta"):
         model = instantiate(config.regressor, _convert_="all")
         defaults = SplatterImageUNet(Parameterization(layers=1))
-    count = sum(p.numel() for p in model.parameters())
-    assert count == sum(p.numel() for p in defaults.parameters())
+        upstream = SongUNet(128, 3, 15, width=128, blocks=4, attention_sizes=[16])
+    count, same, upstreams = (sum(p.numel() for p in net.parameters()) for net in (model, defaults, upstream))
+    assert count == same
     time = sum(p.numel() for name, p in model.named_parameters() if "time_emb" in name)
     shortcuts = sum(width * width + width for width in (128, 256, 256, 256, 256, 256))
-    second_convolution = 15 * 15 + 15
-    assert count == upstream_count() + time + 4 * attention(256) - shortcuts - second_convolution
+    assert count == upstreams + time + 4 * attention(256) - shortcuts
 
 
 @pytest.mark.parametrize("ablation", ["m1", "skips_first_two"])

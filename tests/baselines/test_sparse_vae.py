@@ -28,7 +28,7 @@ def sparse_image(seed: int = 0, batch: int = 1) -> SplatterImage:
     gaussians = Gaussians(means, quaternions, 0.01 + 0.2 * scales, 0.1 + 0.8 * opacities[..., 0], colors)
     cameras = Cameras(torch.eye(4).expand(batch, 4, 4), pinhole(60.0, SIZE).expand(batch, 3, 3), (SIZE, SIZE))
     depth_range = torch.tensor([[0.5, 4.0]]).expand(batch, 2)
-    return project_to_splatter_image(gaussians, cameras, depth_range, Parameterization()).splatter_image
+    return project_to_splatter_image(gaussians, cameras, depth_range, Parameterization())[0]
 
 
 def tiny_vae() -> SparseVAE:

@@ -8,22 +8,22 @@ import torch
 from hydra.utils import instantiate
 from support import compose_config, refused, strict_json
 
-from completesplat.benchmarks import diffusion, measuring
+from completesplat.benchmarks import diffusion
 from completesplat.benchmarks.diffusion import (
-    Comparison,
     cached_vs_on_the_fly,
     chosen_of,
     measured,
 )
 from completesplat.benchmarks.measuring import WARM_UP
 from completesplat.errors import CompleteSplatError
+from completesplat.training import stage
 
 CPU = torch.device("cpu")
 
 
 def test_the_ways_take_turns_and_the_medians_of_the_later_calls_count(monkeypatch):
     now, calls = [0.0], []
-    monkeypatch.setattr(measuring, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(stage, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     # Seconds of each call, the first of which counts operations; those of the warm-up are long.
     seconds = {"a": [9.0] * (1 + WARM_UP) + [1.0, 2.0, 6.0], "b": [90.0] * (1 + WARM_UP) + [40.0, 8.0, 1.0]}
 
@@ -31,7 +31,7 @@ def test_the_ways_take_turns_and_the_medians_of_the_later_calls_count(monkeypatc
         calls.append(key)
         now[0] += seconds[key].pop(0)
 
-    row = measured(Comparison(("this", lambda: work("a")), ("that", lambda: work("b"))), 3, CPU)
+    row = measured((("this", lambda: work("a")), ("that", lambda: work("b"))), 3)
     flops = {"a_tflop": 0, "b_tflop": 0}
     assert row == {"a": "this", "b": "that", "a_ms": 2000.0, "b_ms": 8000.0, "ratio": 4.0} | flops
     assert calls == ["a", "b"] * (1 + WARM_UP + 3)
@@ -39,7 +39,7 @@ def test_the_ways_take_turns_and_the_medians_of_the_later_calls_count(monkeypatc
 
 def test_the_operations_of_both_ways_are_counted():
     a, b = torch.ones(20, 30), torch.ones(30, 50)
-    row = measured(Comparison(("once", lambda: a @ b), ("twice", lambda: a @ b @ b.T)), 1, CPU)
+    row = measured((("once", lambda: a @ b), ("twice", lambda: a @ b @ b.T)), 1)
     assert row["a_tflop"] * 1e12 == pytest.approx(2 * 20 * 30 * 50)
     assert row["b_tflop"] == pytest.approx(2 * row["a_tflop"])
 
@@ -83,7 +83,7 @@ def test_the_cache_spares_frozen_networks_and_both_ways_train_the_rest(toy_root,
     networks = {"encoder": parts.autoreconstructor.encoder, "conditioning": parts.conditioning}
     for name, network in (networks | {"denoiser": parts.denoiser}).items():
         network.register_forward_pre_hook(lambda _, inputs, name=name: calls.append((name, len(inputs[0]))))
-    for (_, work), called in ((comparison.a, trained), (comparison.b, ["encoder", "conditioning", "denoiser"])):
+    for (_, work), called in zip(comparison, (trained, ["encoder", "conditioning", "denoiser"]), strict=True):
         before = {name: value.clone() for name, value in parts.named_parameters()}
         calls.clear()
         work()

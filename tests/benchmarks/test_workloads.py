@@ -8,7 +8,7 @@ import pytest
 import torch
 from rasterizer_scenes import render_with_gradients
 
-from completesplat.benchmarks import measuring, workloads
+from completesplat.benchmarks import workloads
 from completesplat.benchmarks.workloads import (
     FOV_DEGREES,
     OPACITIES,
@@ -21,6 +21,7 @@ from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers import Rendering
 from completesplat.rasterizers.kernels import drawing
 from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.training import stage
 
 
 @pytest.mark.parametrize("opacity", OPACITIES)
@@ -63,7 +64,7 @@ def test_gradients_of_all_images_are_taken_for_all_parameters() -> None:
 
 def test_the_first_figure_is_the_forward_pass_and_the_second_both(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(measuring, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(stage, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     def passes(seconds: float) -> None:
         now[0] += seconds

@@ -85,7 +85,7 @@ def test_prepared_data_pass_the_check_until_a_bit_flips_and_are_not_prepared_aga
     assert "changed file" in results["counts"]
 
 
-def test_a_capture_can_be_shown_where_it_is_and_prepared(command, tmp_path):
+def test_a_capture_can_be_shown_where_it_is_and_prepared_and_its_splits_share_sequences_on_purpose(command, tmp_path):
     write_capture(tmp_path / "capture", frames=8)
     settings, store = ["data=capture", "data.image_size=12"], tmp_path / "store"
     given = [*settings, f"data.root={tmp_path / 'capture'}"]
@@ -94,6 +94,10 @@ def test_a_capture_can_be_shown_where_it_is_and_prepared(command, tmp_path):
         out = tmp_path / f"shown/{root.name}"
         assert command("data", "show", *settings, f"data.root={root}", f"out={out}").status == 0
         assert (out / "show.png").is_file()
+        checked = command("data", "check", *settings, f"data.root={root}", "workers=1", f"out={out}")
+        assert "are in both" not in checked.out
+        results = strict_json(out / "check.json")
+        assert (results["shared"], results["usable"]["sequences"]) == ({}, 1)
 
 
 @pytest.mark.parametrize("data", ["toy_objects", "toy_rooms"])

@@ -44,7 +44,7 @@ def said(finished, number):
     return before.partition("the checkpoint is ")[2].partition("; go on")[0], arguments
 
 
-FIT = ["experiment=toy_var", *SMALL, "callbacks.pictures=null", "test=false", "trainer.max_steps=5"]
+FIT = ["experiment=toy_var", *SMALL, "callbacks.images=null", "test=false", "trainer.max_steps=5"]
 
 
 def test_fit_goes_on_with_the_command_that_it_says(command, toy_root, tmp_path, signalled):

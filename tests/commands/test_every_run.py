@@ -20,7 +20,7 @@ from completesplat.export.ply import read_ply
 from completesplat.generator import CompleteSplat, OneAnswer
 from completesplat.weights import CONFIG_FILE, SUMS_FILE
 
-QUICK = [*SMALL, "callbacks.pictures=null"]
+QUICK = [*SMALL, "callbacks.images=null"]
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def test_a_run_of_fitted_scenes_leaves_them_and_says_so_when_a_photograph_is_giv
 @pytest.fixture
 def strangers(pipeline, tmp_path):
     """A copy of stage 1's run without weights."""
-    shutil.copytree(pipeline.var, tmp_path / "run", ignore=shutil.ignore_patterns("weights", "pictures"))
+    shutil.copytree(pipeline.var, tmp_path / "run", ignore=shutil.ignore_patterns("weights", "images"))
     return tmp_path / "run"
 
 

@@ -65,7 +65,7 @@ def cluster(tmp_path, monkeypatch):
 def test_slurm_runs_the_jobs_of_a_sweep_each_with_two_processes(toy_root, tmp_path, cluster):
     out = tmp_path / "sweep"
     given = ["fit", "-m", "experiment=toy_var", f"data.root={toy_root}", *SMALL, "data.workers=0", f"out={out}"]
-    given += ["trainer.max_steps=1", "callbacks.pictures=null", "rasterizer=reference", "trainer=slurm", "seed=0,1"]
+    given += ["trainer.max_steps=1", "callbacks.images=null", "rasterizer=reference", "trainer=slurm", "seed=0,1"]
     given += ["hydra/launcher=submitit_slurm", "hydra.launcher.timeout_min=10", "hydra.launcher.tasks_per_node=2"]
     program = [sys.executable, str(script(tmp_path)), *given, "trainer.precision=32-true"]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}

@@ -39,7 +39,7 @@ def test_a_finished_run_returns_its_metric(command, pipeline):
 @pytest.mark.slow
 def test_optuna_finds_the_better_of_two_settings(command, toy_root, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="hydra-optuna-sweeper is not installed")
-    settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "callbacks.pictures=null", "test=false"]
+    settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "callbacks.images=null", "test=false"]
     sweep = ["-m", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "hydra.sweeper.direction=maximize"]
     sweep += ["optimized_metric=val/psnr_novel", "model.background=choice(0.0,1.0)", "hydra.sweeper.sampler.seed=1"]
     finished = command("fit", *sweep, *settings, "out=SEARCH")

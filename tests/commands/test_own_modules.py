@@ -35,7 +35,7 @@ def own(tmp_path, monkeypatch):
 
 
 def test_a_loss_and_an_ablation_of_the_working_folder_are_trained_with_and_the_run_is_tested(command, own, toy_root):
-    settings = [f"data.root={toy_root}", *SMALL, "callbacks.pictures=null", "test=false"]
+    settings = [f"data.root={toy_root}", *SMALL, "callbacks.images=null", "test=false"]
     trained = command("fit", "experiment=toy_var", *OWN_TERM, *settings, "out=RUN")
     assert trained.status == 0, trained.err
     terms = OmegaConf.load(own / "RUN/config.yaml").loss.terms
@@ -139,7 +139,7 @@ def test_an_installed_wheel_does_what_the_documents_say_in_every_process(install
     installed.run(own, "python", "-c", "import test_dataset_pictures as t; t.write('DATA')")
     pictures = ["data=pictures", "data.root=DATA", "data.image_size=32"]
     run("data", "check", *pictures, "workers=2", "out=CHECK")
-    quick = ["callbacks.pictures=null", "test=false"]
+    quick = ["callbacks.images=null", "test=false"]
     own_fit = ["experiment=toy_var", *OWN_TERM, f"data.root={toy_root}", *SMALL, *quick]
     processes = ["trainer.devices=2", "trainer.strategy=ddp", "rasterizer=reference", "data.workers=1"]
     run("fit", *own_fit, *processes, "out=RUN")

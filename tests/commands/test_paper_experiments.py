@@ -16,7 +16,7 @@ def test_stage1_starts_from_a_vae_is_tested_on_sequences_never_seen_and_continue
     fit = ["fit", "experiment=paper_var_stage1", f"data.root={tmp_path / 'co3d'}", f"data.category={CATEGORY}"]
     fit += ["data.image_size=32", "data.batch_size=2", "data.workers=0", "rasterizer=tiled", "trainer.accelerator=cpu"]
     fit += ["trainer.max_steps=2", "trainer.max_epochs=null", "trainer.val_check_interval=2", "callbacks.progress=null"]
-    fit += ["callbacks.pictures=null"]
+    fit += ["callbacks.images=null"]
     fit += [f"autoreconstructor.encoder.{name}" for name in ("channels=[8,8,16,16]", "layers_per_block=1")]
     fit += ["autoreconstructor.encoder.norm_groups=4"]
 

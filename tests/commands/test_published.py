@@ -8,8 +8,7 @@ from PIL import Image
 from published_weights import write_published
 from support import SMALL, compose_config, strict_json
 
-from completesplat.baselines.splatter_image.directional import DirectionalRasterizer
-from completesplat.baselines.splatter_image.model import PublishedOneAnswer
+from completesplat.baselines.splatter_image.model import DirectionalRasterizer, PublishedOneAnswer
 from completesplat.commands.trained import Trained
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
@@ -137,7 +136,7 @@ def test_a_test_sees_objects_only_at_their_depths_and_its_figures_stand_apart(co
 def test_what_is_trained_on_is_predicted_with_from_its_run(command, toy_root, tmp_path):
     weights = write_published(tmp_path / "captures", "hydrants", size=32)
     given = ["experiment=toy_var", "model=splatter_image_published", f"model.model.weights={weights}", *SMALL]
-    given += [f"data.root={toy_root}", "data.background=0", "callbacks.pictures=null", "test=false"]
+    given += [f"data.root={toy_root}", "data.background=0", "callbacks.images=null", "test=false"]
     refused = command("fit", *given, "data.image_size=64", "out=OTHER")
     assert (refused.status, refused.err) == (2, "error: data.image_size=64: model_hydrants.pth needs 32\n")
     trained = command("fit", *given, "optimizer.lr=1e-3", "out=RUN")

@@ -87,7 +87,7 @@ def test_every_sample_turns_as_its_video_does_and_a_short_video_gives_all_its_fr
 
 
 def test_images_beyond_the_limits_are_left_out_and_counted(results, tmp_path):
-    page = Page(written(results, tmp_path, "most.pictures=2", "most.samples=1", "most.runs=2"))
+    page = Page(written(results, tmp_path, "most.images=2", "most.samples=1", "most.runs=2"))
     assert "3 more in" in page.text
     assert "2 more samples left out" in page.text
     assert "1 more runs left out" in page.text

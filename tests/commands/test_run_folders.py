@@ -106,7 +106,7 @@ def test_links_in_a_run_s_folder_are_not_followed(command, toy_root, tmp_path):
 
 
 FIT = [*SMALL, "experiment=toy_var", "test=false", "trainer.max_steps=2", "trainer.log_every_n_steps=1"]
-FIT += ["callbacks.pictures=null", "callbacks.checkpoint.every_n_train_steps=1", "ckpt_path=last"]
+FIT += ["callbacks.images=null", "callbacks.checkpoint.every_n_train_steps=1", "ckpt_path=last"]
 
 
 def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tmp_path, monkeypatch):

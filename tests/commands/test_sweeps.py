@@ -24,7 +24,7 @@ def root_with(*overrides: str):
 
 
 def settings(root: Path) -> list[str]:
-    given = [f"data.root={root}", *SMALL, "trainer.max_steps=1", "callbacks.pictures=null", "test=false"]
+    given = [f"data.root={root}", *SMALL, "trainer.max_steps=1", "callbacks.images=null", "test=false"]
     return ["fit", "-m", "experiment=toy_var", *given]
 
 
@@ -149,7 +149,7 @@ def test_the_second_part_of_stage_one_is_swept_from_the_jobs_of_the_first(comman
     random = {name: 0.05 * torch.randn(value.shape, generator=generator) for name, value in blank().items()}
     vgg = saved(random, tmp_path / "vgg.pth")  # in the place of the one that would be downloaded
     monkeypatch.setattr("completesplat.losses.lpips.load_vgg16", lambda weights, sha256: load_vgg16(str(vgg)))
-    shared = [f"data.root={toy_root}", *SMALL, "callbacks.pictures=null", "ablation=full,no_lpips", "seed=choice(0)"]
+    shared = [f"data.root={toy_root}", *SMALL, "callbacks.images=null", "ablation=full,no_lpips", "seed=choice(0)"]
     one, two = tmp_path / "PART1", tmp_path / "TABLE"
     assert command("fit", "-m", "experiment=toy_var", *shared, "test=false", f"out={one}").status == 0
     start = f"model.checkpoint={one}/ablation-${{hydra:runtime.choices.ablation}}+seed-${{seed}}/{LAST}"

@@ -63,7 +63,7 @@ def test_weights_that_are_not_there_are_refused_before_the_page_opens(command):
 
 def run_in_training(path, step: int = 2):
     """A run's folder as far as it is watched."""
-    newest = path / "pictures/newest"
+    newest = path / "images/newest"
     newest.mkdir(parents=True, exist_ok=True)
     scenes = scene_batch(batch=2)
     gaussians = balls(points=5)
@@ -94,15 +94,15 @@ def test_what_a_run_writes_is_shown_when_it_is_new(tmp_path, capsys):
         run_in_training(run, step)
         show_newest(page, run)
     assert shown == ["step 4 of the training", "step 6 of the training"]
-    (run / "pictures/newest/scenes.json").write_text("{")
+    (run / "images/newest/scenes.json").write_text("{")
     show_newest(page, run)
     assert len(shown) == 2
-    with pytest.raises(CompleteSplatError, match=r"no pictures/ here, which fit fills"):
+    with pytest.raises(CompleteSplatError, match=r"no images/ here, which fit fills"):
         newest_scenes(tmp_path)
 
 
 def test_a_run_without_scenes_is_waited_for(tmp_path, capsys, monkeypatch):
-    (tmp_path / "run/pictures").mkdir(parents=True)
+    (tmp_path / "run/images").mkdir(parents=True)
     monkeypatch.setattr("completesplat.commands.view.time.sleep", lambda _: run_in_training(tmp_path / "run"))
     samples, up = newest_scenes(tmp_path / "run")
     assert (len(samples), up) == (2, UP)

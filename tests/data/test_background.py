@@ -70,12 +70,6 @@ def test_without_rembg_or_its_network_it_is_said_what_to_do(rembg, tmp_path, mon
         read_photograph(tmp_path / "a.png", 16, remove_background=True)
 
 
-def test_a_image_without_an_object_is_refused(rembg, tmp_path):
-    Image.new("RGB", (32, 32), "red").save(tmp_path / "a.png")
-    with pytest.raises(ImageError, match=r"a\.png: background=remove leaves nothing"):
-        read_photograph(tmp_path / "a.png", 16, remove_background=True)
-
-
 def test_features_are_colours_their_spread_and_how_fine_they_are():
     image = torch.zeros(3, 4, 4)
     image[0], image[1, :, 2:], image[2, 1::2] = 0.25, 1, 1

@@ -7,7 +7,6 @@ import pytest
 from co3d_trees import (
     CATEGORY,
     FRAMES,
-    SEQUENCES,
     SET_LIST,
     SUBSET,
     change,
@@ -20,9 +19,7 @@ from co3d_trees import (
 )
 
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.co3d.source import from_depth_maps
 from completesplat.data.co3d.splits import Category, Filters, SeededSplit, read_category
-from completesplat.data.placement import upright_axes
 from completesplat.data.validation import BadCamera, OutsidePath
 from completesplat.errors import DataError
 
@@ -180,18 +177,3 @@ def test_cameras_that_do_not_move_are_refused(tmp_path):
         data.source("train").read("a")
     assert (caught.value.file, caught.value.sequence) == (str(category / FRAMES), "a")
     assert data.source("val").read("b").frames == (0, 1, 2)
-
-
-def test_sequences_without_a_cloud_are_placed_by_their_depth_maps(tmp_path):
-    """The maps of `write_tree` show a disc across the axis of each camera, at the origin: its distance stays 4."""
-    category = write_tree(tmp_path, {"a": 6, "b": 2, "c": 2}, {"train": ["a"], "val": ["b"], "test": ["c"]})
-    change(category / SEQUENCES, lambda entries: entries[0].update(point_cloud=None))
-    data = CO3DDataModule(str(tmp_path), CATEGORY, image_size=8, on_bad="raise", depth_before=0.5, depth_after=0.7)
-    frames = read(tmp_path).splits["train"].frames["a"]
-    placement = from_depth_maps(frames, upright_axes([frame.camera for frame in frames]))
-    factor = 0.57 / placement.half_size
-    depths = [(frame.camera.world_to_camera[2, :3] @ placement.center + 4).item() * factor for frame in frames]
-    sequence = data.source("train").read("a")
-    np.testing.assert_allclose(sequence.cameras.centers.norm(dim=-1), 4 * factor)
-    np.testing.assert_allclose(sequence.depth_ranges, [[depth - 0.5, depth + 0.7] for depth in depths], rtol=1e-6)
-    assert placement.half_size < 4 * 10 / 36

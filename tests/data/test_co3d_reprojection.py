@@ -21,8 +21,7 @@ from torch import Tensor
 
 from completesplat.data.co3d.annotations import camera_from_viewpoint
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.images.crop import principal_square
-from completesplat.geometry.cameras import crop_resize, project
+from completesplat.geometry.cameras import project
 from completesplat.scene import SceneBatch
 
 CENTER = np.array([5.0, -3.0, 2.0])
@@ -136,18 +135,3 @@ def test_points_land_where_pytorch3d_puts_them(layout, size):
     if layout == LAYOUTS[0]:  # As annotations older than the format are normalised.
         del viewpoint["intrinsics_format"]
         assert torch.equal(camera_from_viewpoint(viewpoint, size).intrinsics, camera.intrinsics)
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_crop_is_centred_touches_a_border_and_moves_points_linearly(layout):
-    rng, size = np.random.default_rng(1), (300, 400)
-    viewpoint, points = random_viewpoint(rng, layout), rng.normal(size=(50, 3))
-    camera = camera_from_viewpoint(viewpoint, size)
-    center = camera.intrinsics[:2, 2].tolist()
-    square = principal_square(tuple(center), size)
-    borders = [square.left, square.top, 400 - square.left - square.side, 300 - square.top - square.side]
-    assert min(borders) == pytest.approx(0, abs=1e-9)
-    cropped = crop_resize(camera, square.left, square.top, square.side, 64)
-    assert cropped.intrinsics[:2, 2].tolist() == pytest.approx([32, 32])
-    expected = (pytorch3d_pixels(viewpoint, size, points)[0] - [square.left, square.top]) * 64 / square.side
-    np.testing.assert_allclose(project(cropped, torch.from_numpy(points))[0].numpy(), expected, atol=1e-9)

@@ -1,12 +1,10 @@
 from dataclasses import fields
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from latent_caches import FRAMES, broken_rooms, rooms, small_autoreconstructor, sound_rooms
+from latent_caches import broken_rooms, rooms, small_autoreconstructor, sound_rooms
 
-from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.data.loading.loader import SceneLoader
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import CachedScene
@@ -126,12 +124,3 @@ def test_encodings_of_other_data_are_refused_before_training(cache, root, tmp_pa
     rooms(root, latent_cache=str(tmp_path / "gone")).setup("test")
     with pytest.raises(DataError, match="no finished latent cache"):
         rooms(root, latent_cache=str(tmp_path / "gone")).setup("fit")
-
-
-def test_opening_maps_the_arrays_of_all_frames(cache, root):
-    store, names = LatentCache(cache), rooms(root).source("train").names
-    assert all(isinstance(array, np.memmap) and array.mode == "r" for array in store.arrays.values())
-    frames = {name: FRAMES - 1 if name == "c5" else FRAMES for name in names}  # of c5 one could not be packed
-    stored = {name: sequence.stored for name, sequence in store.sequences.items()}
-    assert stored == {name: tuple(range(count)) for name, count in frames.items()}
-    assert {len(array) for array in store.arrays.values()} == {sum(frames.values())}

@@ -28,22 +28,11 @@ def test_world_up_is_found_from_level_cameras(seed, elevation):
     torch.testing.assert_close(world_up(level_orbit(up, elevation)), up)
 
 
-def test_typical_camera_of_known_cameras():
+def test_typical_camera_of_known_cameras_counts_sequences_by_their_frames():
     up = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     ranges = torch.tensor([[1.0, 3.0]], dtype=torch.float64).expand(12, 2)
-    camera = typical_camera([level_orbit(up, 0.2), level_orbit(up, 0.2)], [ranges, ranges + 1])
+    camera = typical_camera([level_orbit(up, 0.2), level_orbit(up, 0.2, frames=4)], [ranges, ranges[:4] + 1])
     assert camera.fov_degrees == pytest.approx(60, abs=1e-4)
-    assert camera.depth_range == pytest.approx((1.5, 3.5))
+    assert camera.depth_range == pytest.approx((1.25, 3.25))
     # A camera that looks down by 0.2 sees up tilted away from its own up, backwards.
     assert camera.up == pytest.approx((0, -math.cos(0.2), -math.sin(0.2)), abs=1e-6)
-
-
-def test_sequences_of_different_lengths_count_by_their_frames():
-    short, long = (
-        Cameras(torch.eye(4).expand(n, 4, 4), pinhole(fov, 32).expand(n, 3, 3), (32, 32))
-        for n, fov in ((1, 40), (3, 60))
-    )
-    ranges = [torch.tensor([[1.0, 5.0]]), torch.tensor([[2.0, 9.0]]).expand(3, 2)]
-    camera = typical_camera([short, long], ranges)
-    assert camera.depth_range == (1.75, 8.0)
-    assert camera.fov_degrees == pytest.approx(55, abs=1e-3)

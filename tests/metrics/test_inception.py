@@ -37,11 +37,11 @@ def test_features_are_those_of_the_image_in_8_bits_from_a_frozen_network_that_kn
     network = load_inception(str(file), hashlib.sha256(file.read_bytes()).hexdigest())
     levels = torch.tensor([0.0, 0.4999 / 255, 0.5001 / 255, 0.6, 1.0, 1.5, -1.0])
     images = levels.view(-1, 1, 1, 1) * torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1).expand(3, 4, 5)
-    features = network.features(images)
+    features = network.describe(images)
     red = torch.tensor([0.0, 0, 1, 153, 255, 255, 0])
     torch.testing.assert_close(features, torch.stack([red, 0 * red, 0 * red, red / 3], dim=1))
     with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(network.features(images), features)
+        assert torch.equal(network.describe(images), features)
     assert not features.requires_grad
 
 

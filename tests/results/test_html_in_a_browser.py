@@ -13,7 +13,7 @@ from completesplat.results.html_page import page
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
-MOST = {"frames": FRAMES, "samples": 8, "predictions": 8, "runs": 8, "pictures": 8, "megabytes": 40}
+MOST = {"frames": FRAMES, "samples": 8, "predictions": 8, "runs": 8, "images": 8, "megabytes": 40}
 SIZES = {"phone": (390, 844), "desktop": (1440, 900)}
 
 pytestmark = pytest.mark.browser

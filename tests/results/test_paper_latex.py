@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from completesplat.commands import conf_folder
-from completesplat.results.paper_figures import PrintedCell, PublishedTable, published
+from completesplat.results.paper_figures import SIGNS, PublishedTable, parse, published
+from completesplat.results.tables import BLANK, Cell
 
 ENVIRONMENT = re.compile(r"\\begin\{table(\*?)\}.*?\\end\{table\1\}", re.DOTALL)
 COMMENT = re.compile(r"(?<!\\)%.*")
@@ -24,7 +25,7 @@ MARKED = {
 }
 
 
-def grid(table: str, last_heading: str) -> tuple[list[str], list[list[PrintedCell]]] | None:
+def grid(table: str, last_heading: str) -> tuple[list[str], list[list[Cell]]] | None:
     """Return joined headings, and the cells below them, repeated where they span rows or columns.
 
     The headings end with the first row that holds the text `last_heading`.
@@ -33,18 +34,19 @@ def grid(table: str, last_heading: str) -> tuple[list[str], list[list[PrintedCel
     rows = _spread([[_span(cell) for cell in line] for line in lines])
     for index, row in enumerate(rows):
         if any(last_heading in cell.text for cell in row):
-            levels = zip(*rows[: index + 1], strict=False)
-            headings = [" ".join(dict.fromkeys(cell.text for cell in column if cell.text)) for column in levels]
+            columns = zip(*rows[: index + 1], strict=False)
+            texts = ([cell.text for cell in column if cell.text != BLANK] for column in columns)
+            headings = [" ".join(dict.fromkeys(levels)) for levels in texts]
             return headings, rows[index + 1 :]
     return None
 
 
-def figure(cell: str) -> PrintedCell:
+def figure(cell: str) -> Cell:
     """Text and marks of a cell: bold is the best, underlined the second."""
-    marks = frozenset(mark for mark, pattern in MARKED.items() if pattern.search(cell))
+    marks = [mark for mark, pattern in MARKED.items() if pattern.search(cell)]
     for pattern in (re.compile(r"~?\\cite\{[^}]*\}"), *MARKED.values()):
         cell = pattern.sub("", cell)
-    return PrintedCell(" ".join(re.sub(r"[{}]", "", cell).replace(r"\#", "#").split()), marks)
+    return parse(" ".join([re.sub(r"[{}]", "", cell).replace(r"\#", "#"), *marks]))
 
 
 def _body(table: str) -> str:
@@ -62,7 +64,7 @@ def _cells(line: str) -> list[str]:
     return re.split(r"(?<!\\)&", DECORATION.sub("", line))
 
 
-def _span(cell: str) -> tuple[PrintedCell, int, int]:
+def _span(cell: str) -> tuple[Cell, int, int]:
     """Return the cell, and the numbers of rows (upwards if negative) and columns that it spans."""
     match = SPAN.fullmatch(cell.strip())
     if match is None:
@@ -71,7 +73,7 @@ def _span(cell: str) -> tuple[PrintedCell, int, int]:
     return figure(content), int(count) if direction == "row" else 1, int(count) if direction == "column" else 1
 
 
-def _spread(lines: list[list[tuple[PrintedCell, int, int]]]) -> list[list[PrintedCell]]:
+def _spread(lines: list[list[tuple[Cell, int, int]]]) -> list[list[Cell]]:
     rows = [[cell for cell, _, columns in line for _ in range(columns)] for line in lines]
     for index, line in enumerate(lines):
         place = 0
@@ -112,7 +114,8 @@ def test_every_table_is_complete() -> None:
     for known in published():
         assert all(len(row) == len(known.columns) for row in known.rows)
         assert all(data_set for *_, data_set in known.scored)
-        signs = {mark for row in known.rows for cell in row for mark in cell.marks} & {"dagger", "star"}
+        text = " ".join(cell.text for row in known.rows for cell in row)
+        signs = {name for name, sign in SIGNS.items() if sign in text}
         assert signs == set(known.legend)
     assert len({known.place for known in published()}) == len(published()) == 4
 

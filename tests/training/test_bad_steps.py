@@ -181,7 +181,7 @@ def test_two_processes_leave_out_the_same_steps(tmp_path, request):
 
 
 def fit(command, root, run, *settings):
-    given = ["experiment=toy_var", f"data.root={root}", *SMALL, "callbacks.pictures=null", "test=false"]
+    given = ["experiment=toy_var", f"data.root={root}", *SMALL, "callbacks.images=null", "test=false"]
     return command("fit", *given, "trainer.log_every_n_steps=1", *settings, f"out={run}")
 
 

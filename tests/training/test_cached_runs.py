@@ -12,7 +12,7 @@ from completesplat.data.loading.latent_cache import LatentCache
 LAST = "checkpoints/last.ckpt"
 STEPS = 3
 QUICK = [*SMALL, f"trainer.max_steps={STEPS}", "trainer.precision=32-true", "trainer.log_every_n_steps=1"]
-QUICK += ["callbacks.pictures=null", "callbacks.samples=null", "sampler.steps=1", "test=false"]
+QUICK += ["callbacks.images=null", "callbacks.samples=null", "sampler.steps=1", "test=false"]
 
 
 def logged(run: Path, pattern: str) -> pandas.DataFrame:

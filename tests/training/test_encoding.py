@@ -15,7 +15,6 @@ from torch import nn
 
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.loading.latent_cache import LatentCache
-from completesplat.data.packed import writing
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import CachedScene
 from completesplat.tensors import stack
@@ -159,7 +158,7 @@ def test_settings_without_a_meaning_and_a_full_disk_are_refused(root, tmp_path, 
         with pytest.raises(CompleteSplatError, match=said):
             encode(**{"root": root, "out": tmp_path / "cache"} | options)
     assert not (tmp_path / "cache").exists()
-    monkeypatch.setattr(writing.shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
     with pytest.raises(DataError, match=r"not enough space: about .* for 20 frames of 4 sequences"):
         encode(root, tmp_path / "cache")
     assert list((tmp_path / "cache").iterdir()) == []

@@ -13,7 +13,7 @@ from completesplat.training.reconstruction import ReconstructionModule
 
 STEPS = 6
 SETTINGS = [*SMALL, f"trainer.max_steps={STEPS}", "trainer.log_every_n_steps=1", "data.references_per_sequence=4"]
-SETTINGS += ["callbacks.pictures.every_n_steps=2", "test=false", "data.batch_size=2"]
+SETTINGS += ["callbacks.images.every_n_steps=2", "test=false", "data.batch_size=2"]
 PLACES_OF_WEIGHTS = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers")
 
 
@@ -107,13 +107,13 @@ def results(run) -> dict:
 @pytest.mark.slow
 def test_drawing_images_and_samples_does_not_change_training(settings, whole, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for stage, drawn in {"var": ["pictures"], "diffusion": ["pictures", "samples"]}.items():
-        kept = [setting for setting in settings[stage] if not setting.startswith(("callbacks.pic", "callbacks.sam"))]
+    for stage, drawn in {"var": ["images"], "diffusion": ["images", "samples"]}.items():
+        kept = [setting for setting in settings[stage] if not setting.startswith(("callbacks.im", "callbacks.sam"))]
         off = [f"callbacks.{name}=null" for name in drawn]
         assert call(monkeypatch, *kept, *off, f"out={tmp_path / stage}") == 0
         expected, found = (weights(run) for run in (whole(stage), tmp_path / stage))
         assert all(torch.equal(v, found[k]) for k, v in expected.items() if isinstance(v, Tensor))
         for name in drawn:
             assert not (tmp_path / stage / name).exists()
-            pictures = sorted(path.name for path in (whole(stage) / name).glob("step_*"))
-            assert pictures == [f"step_00000{n}.png" for n in (2, 4, 6)]
+            images = sorted(path.name for path in (whole(stage) / name).glob("step_*"))
+            assert images == [f"step_00000{n}.png" for n in (2, 4, 6)]

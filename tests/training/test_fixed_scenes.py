@@ -167,9 +167,9 @@ def test_targets_are_spread_over_all_that_a_scene_has(views, chosen):
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
 def test_a_run_writes_images_and_rows(pipeline, stage):
     run = getattr(pipeline, stage)
-    assert {path.name for path in (run / "pictures").iterdir()} == {"step_000002.png", "newest"}
+    assert {path.name for path in (run / "images").iterdir()} == {"step_000002.png", "newest"}
     # One validation scene in eight panels.
-    assert cells(Image.open(run / "pictures/step_000002.png"), 32, 32).shape[:2] == (1, 8)
+    assert cells(Image.open(run / "images/step_000002.png"), 32, 32).shape[:2] == (1, 8)
     layers = {column for column in pandas.read_csv(run / "metrics.csv") if column.startswith("layers/")}
     assert layers == {"layers/opacity_1", "layers/opacity_2", "layers/behind_2"}
     table = pandas.read_csv(run / "metrics.csv")
@@ -184,8 +184,8 @@ SIDE = 32
 
 
 def some_drawings(samples: int = 2, views: int = 3) -> SceneDrawings:
-    pictures = torch.rand(1 + samples, views, 3, SIDE, SIDE)
-    return SceneDrawings(pictures[0], pictures[1:], torch.ones(1, views, 1, SIDE, SIDE))
+    images = torch.rand(1 + samples, views, 3, SIDE, SIDE)
+    return SceneDrawings(images[0], images[1:], torch.ones(1, views, 1, SIDE, SIDE))
 
 
 def assert_shows(found: torch.Tensor, expected: torch.Tensor) -> None:

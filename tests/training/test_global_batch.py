@@ -57,7 +57,7 @@ def test_accumulated_batches_share_the_batch_and_the_share_is_recorded(command, 
 
     monkeypatch.setattr(ReconstructionModule, "training_step", counted)
     settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "data.batch_size=4", "test=false"]
-    settings += ["trainer.accumulate_grad_batches=2", "callbacks.pictures=null", "data.references_per_sequence=8"]
+    settings += ["trainer.accumulate_grad_batches=2", "callbacks.images=null", "data.references_per_sequence=8"]
     finished = command("fit", *settings, f"out={tmp_path / 'run'}")
     assert finished.status == 0
     assert counts == [2, 2, 2, 2]  # two optimizer steps

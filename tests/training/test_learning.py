@@ -68,7 +68,7 @@ def test_one_scene_is_learned_by_heart(command, tmp_path):
         "data.height=32",
     ]
     settings = [f"data.root={tmp_path / 'data'}", *one_scene, "data.image_size=32", "data.batch_size=4", *SHORT]
-    steps = ["trainer.max_steps=1000", "test=false", "callbacks.pictures=null", "data.color_jitter=null"]
+    steps = ["trainer.max_steps=1000", "test=false", "callbacks.images=null", "data.color_jitter=null"]
     assert command("fit", "experiment=toy_var", *settings, *steps, f"out={tmp_path / 'run'}").status == 0
     values = psnr_of_training_views(tmp_path / "run")
     assert len(values) == 8

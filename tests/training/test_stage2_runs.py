@@ -17,7 +17,7 @@ from completesplat.weights.checkpoint_reading import read_checkpoint
 
 VAE = ["conditioning=stable_diffusion", "conditioning.channels=[8,8,16,16]"]
 VAE += ["conditioning.layers_per_block=1", "conditioning.norm_groups=4"]
-QUICK = [*SMALL, "sampler.steps=1", "test=false", "callbacks.pictures=null", "trainer.log_every_n_steps=1"]
+QUICK = [*SMALL, "sampler.steps=1", "test=false", "callbacks.images=null", "trainer.log_every_n_steps=1"]
 PREFIX = "completesplat."
 exactly = partial(torch.testing.assert_close, atol=0, rtol=0)
 FROM_STAGE_1 = ["experiment=toy_diffusion", "model.autoreconstructor_checkpoint={var}"]

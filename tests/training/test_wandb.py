@@ -22,7 +22,7 @@ LOGGED = [
     ("number", FIT, "speed/scenes_per_second speed/data_wait train/bad_steps"),
     ("number", FIT if Path("/proc/self/status").exists() else (), "memory/process_gb"),
     ("number", FIT if torch.cuda.is_available() else (), "memory/gpu_gb"),
-    ("image", FIT, "pictures"),
+    ("image", FIT, "images"),
     ("number", (STAGE1,), "train/psnr train/mse train/ssim train/kl latent/bits latent/bits_* latent/active_channels"),
     ("number", (STAGE2,), "train/loss_t* samples/psnr samples/psnr_of_mean samples/diversity"),
     ("number", (STAGE2,), "latents/std_* latents/mean_*"),
@@ -84,7 +84,7 @@ def test_jobs_of_a_sweep_are_a_group_and_a_continued_job_is_the_same_run(command
     monkeypatch.setattr(ReconstructionModule, "training_step", failing)
     monkeypatch.delenv("WANDB_MODE", raising=False)
     sweep = ["-m", *fit_settings(pipeline, STAGE1), "logger=wandb", "seed=0,1", f"out={tmp_path / 'some_sweep'}"]
-    sweep += ["test=false", "callbacks.checkpoint.every_n_train_steps=1", "callbacks.pictures=null"]
+    sweep += ["test=false", "callbacks.checkpoint.every_n_train_steps=1", "callbacks.images=null"]
     with pytest.raises(RuntimeError, match="the first job"):
         command("fit", *sweep)
     assert command("fit", *sweep).status == 0

@@ -9,8 +9,7 @@ import pytest
 from omegaconf import OmegaConf
 from wandb_files import offline_runs
 
-from completesplat.errors import CompleteSplatError
-from completesplat.training.wandb import START_SECONDS, WandbRun, wandb_runs
+from completesplat.training.loggers import START_SECONDS, WandbRun, wandb_runs
 
 wandb = pytest.importorskip("wandb")
 pytestmark = pytest.mark.processes
@@ -63,8 +62,3 @@ def test_a_run_that_is_stopped_says_so(tmp_path):
         raise KeyboardInterrupt
     (run,) = offline_runs(tmp_path)
     assert run.only("exit").exit_code == 1
-
-
-def test_an_unknown_mode_is_refused(tmp_path):
-    with pytest.raises(CompleteSplatError, match=r"wandb\.mode=onlin: choose one of online"):
-        WandbRun(str(tmp_path), "onlin", "some")

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from os.path import isfile
 from pathlib import Path
 from typing import Any, TypeVar
@@ -48,8 +49,8 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
     files = tuple(require_file(model / f"{name}.{suffix}") for name in ("cameras", "images", "points3D"))
     lenses = dict(_parsed(_camera_of, read, files[0]))
     with at(files[1]):
-        frames = in_order([_frame_of(*entry, lenses, images, masks) for entry in _parsed(_image_of, read, files[1])])
-    points = np.array(_parsed(_position_of, read, files[2]))
+        frames = in_order(_parsed(partial(_frame_of, lenses=lenses, images=images, masks=masks), read, files[1]))
+    points = np.array(_parsed(lambda row: [float(coordinate) for coordinate in row[1:4]], read, files[2]))
     return Capture(files, frames, points if len(points) else None)
 
 
@@ -75,33 +76,18 @@ def _camera_of(row: Row) -> tuple[int, Lens]:
     raise BadCamera(f"camera model {kind} is not supported; undistort the images with COLMAP's image_undistorter")
 
 
-def _image_of(row: Row) -> tuple[int, tuple[float, ...], int, str]:
-    """Return an image's number, pose (qw, qx, qy, qz, tx, ty, tz), camera and name."""
-    return int(row[0]), tuple(map(float, row[1:8])), int(row[8]), " ".join(map(str, row[9:]))
-
-
-def _position_of(row: Row) -> tuple[float, ...]:
-    return tuple(map(float, row[1:4]))
-
-
-def _frame_of(
-    number: int,
-    pose: tuple[float, ...],
-    camera: int,
-    name: str,
-    lenses: Mapping[int, Lens],
-    images: Path,
-    masks: Path | None,
-) -> CapturedFrame:
+def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | None) -> CapturedFrame:
+    """Return an image with its camera; a row has number, pose (qw, qx, qy, qz, tx, ty, tz), camera and name."""
+    number, camera, name = int(row[0]), int(row[8]), " ".join(map(str, row[9:]))
     with at(frame=number):
         if camera not in lenses:
             raise BadAnnotation(f"no camera {camera}")
-        values = finite_array(pose, (7,), "the pose")
-        if not values[:4].any():
+        pose = finite_array([float(value) for value in row[1:8]], (7,), "the pose")
+        if not pose[:4].any():
             raise BadCamera("the quaternion of the pose is zero")
         world_to_camera = np.eye(4)
-        world_to_camera[:3, :3] = quaternion_to_matrix(torch.from_numpy(values[:4])).numpy()
-        world_to_camera[:3, 3] = values[4:]
+        world_to_camera[:3, :3] = quaternion_to_matrix(torch.from_numpy(pose[:4])).numpy()
+        world_to_camera[:3, 3] = pose[4:]
         mask = None if masks is None else _find_mask(masks, name)
         return CapturedFrame(number, require_file(inside(images, name)), mask, lenses[camera], world_to_camera)
 

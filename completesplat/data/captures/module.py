@@ -12,9 +12,7 @@ from completesplat.data.captures.capture import Capture, CapturedFrame
 from completesplat.data.captures.colmap import read_colmap
 from completesplat.data.captures.transforms_json import read_transforms
 from completesplat.data.images.crop import cut_square
-from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.data.loading.scenes import Choice
-from completesplat.data.loading.view_selection import evaluation_views, spread_views, training_views
+from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.placement import (
     ObjectFraming,
@@ -27,7 +25,7 @@ from completesplat.data.placement import (
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.data.validation import MissingFile, at, refused_to
 from completesplat.errors import DataError
-from completesplat.settings.schema import Positive, Range
+from completesplat.settings.schema import Range
 
 # Points whose distance from the median point exceeds this multiple of the median distance are outliers, because the
 # farthest point determines the scale of the scene.
@@ -120,7 +118,7 @@ def _read(name: str, frames: list[CapturedFrame], size: int, index: int) -> Mask
         return MaskedImage(cut_square(image, square, size), cut_square(mask, square, size))
 
 
-class CaptureDataModule(SceneDataModule):
+class CaptureDataModule(ObjectDataModule):
     """Scenes of captures, each with its own training frames and held-out frames for validation and test.
 
     Images are undistorted (by pycolmap) when they are read, cut to the largest square around the principal point, and
@@ -129,28 +127,14 @@ class CaptureDataModule(SceneDataModule):
     Args:
         root: folder or file of a capture (`read_capture`), a folder of such folders, or prepared captures.
         hold_out: one of every `hold_out` frames is for validation and test.
-        evaluation_targets: at most this many evenly spaced targets of the reference, the first held-out frame; None:
-            all other held-out frames.
-        spread_targets: spread the training targets evenly around the reference, for a posterior that sees them.
-        depth_before, depth_after: depth range in front of and behind the object's centre; its half size is 0.57.
-        **settings: of `SceneDataModule`.
+        **settings: of `ObjectDataModule`; the reference of validation and test is the first held-out frame.
     """
 
-    def __init__(
-        self,
-        root: str,
-        hold_out: Annotated[int, Range(2)] = 8,
-        evaluation_targets: Positive | None = None,
-        spread_targets: bool = False,
-        depth_before: float = 2.0,
-        depth_after: float = 2.0,
-        **settings: Any,
-    ) -> None:
+    splits_share_sequences = True
+
+    def __init__(self, root: str, hold_out: Annotated[int, Range(2)] = 8, **settings: Any) -> None:
         super().__init__(root, **settings)
         self.hold_out = hold_out
-        self.evaluation_targets = evaluation_targets
-        self.spread_targets = spread_targets
-        self.framing = ObjectFraming(self.image_size, depth_before, depth_after)
 
     def describe(self) -> dict[str, str | None]:
         targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
@@ -182,11 +166,3 @@ class CaptureDataModule(SceneDataModule):
         training, held_out = partial(members, self.hold_out, False), partial(members, self.hold_out, True)
         parts = {"train": training, "val": held_out, "test": held_out}
         return {part: CaptureSource(captures, members, self.framing, refused) for part, members in parts.items()}
-
-    def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
-        """Draw a random reference and targets at random, or spread around it."""
-        return (spread_views if self.spread_targets else training_views)(frames, self.targets, rng)
-
-    def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
-        """Return the first held-out frame as reference and others as targets."""
-        return evaluation_views(len(sequence.frames), self.evaluation_targets)

@@ -11,12 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from completesplat.data.captures.capture import (
-    Capture,
-    CapturedFrame,
-    Lens,
-    in_order,
-)
+from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, in_order
 from completesplat.data.images.files import stored_size
 from completesplat.data.images.photograph import read_photograph
 from completesplat.data.sequences import shortened

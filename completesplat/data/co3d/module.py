@@ -3,24 +3,15 @@
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-import numpy as np
-
 from completesplat.data.co3d.source import CO3DSource
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
-from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.data.loading.scenes import Choice
-from completesplat.data.loading.view_selection import evaluation_views, spread_views, training_views
+from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
-from completesplat.data.placement import ObjectFraming
-from completesplat.data.sequences import PosedSequence
 from completesplat.settings.schema import Natural, Positive, Range, Share
 
 
-class CO3DDataModule(SceneDataModule):
+class CO3DDataModule(ObjectDataModule):
     """Scenes of one category, read without PyTorch3D and without the `co3d` package.
-
-    Training draws a random reference and random targets of a sequence. Validation and test take a sequence's first
-    frame as the reference and other frames as targets.
 
     Args:
         root: folder of the categories, or a prepared category.
@@ -30,13 +21,9 @@ class CO3DDataModule(SceneDataModule):
             `fewview_train` does, and so do all lists that divide the frames of a sequence (`manyview_...`).
         val_fraction, test_fraction, split_seed: see `SeededSplit`.
         min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences: see `Filters`.
-        evaluation_targets: at most this many evenly spaced targets of a test scene; None: all other frames.
-        validation_targets: the same for a validation scene; None: as for a test scene.
-        spread_targets: spread the training targets evenly around the reference (the sequence taken as a ring), in
-            random order, for a posterior that sees them; false: draw random targets.
-        depth_before, depth_after: depth range in front of and behind the object's centre; the object's half size is
-            0.57 (Splatter Image: 2 and 2, for masked objects; not stated by the paper for full images).
-        **settings: of `SceneDataModule`.
+        depth_before, depth_after: see `ObjectDataModule` (Splatter Image: 2 and 2, for masked objects; not stated by
+            the paper for full images).
+        **settings: of `ObjectDataModule`.
     """
 
     def __init__(
@@ -52,23 +39,16 @@ class CO3DDataModule(SceneDataModule):
         min_viewpoint_quality: float | None = None,
         min_point_cloud_quality: float | None = None,
         most_training_sequences: Positive | None = None,
-        evaluation_targets: Positive | None = None,
-        validation_targets: Positive | None = None,
-        spread_targets: bool = False,
         depth_before: float = 1.5,
         depth_after: float = 4.0,
         **settings: Any,
     ) -> None:
-        super().__init__(root, **settings)
+        super().__init__(root, depth_before=depth_before, depth_after=depth_after, **settings)
         self.category = category
         self.subset = subset
         self.allow_shared_sequences = allow_shared_sequences
         self.seeded = SeededSplit(val_fraction, test_fraction, split_seed)
         self.filters = Filters(min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences)
-        self.framing = ObjectFraming(self.image_size, depth_before, depth_after)
-        self.spread_targets = spread_targets
-        self.evaluation_targets = evaluation_targets
-        self.validation_targets = evaluation_targets if validation_targets is None else validation_targets
 
     def describe(self) -> dict[str, str | None]:
         targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
@@ -99,12 +79,3 @@ class CO3DDataModule(SceneDataModule):
         which = self.root, self.category, self.subset
         splits, files, refused = read_category(*which, self.seeded, self.filters, self.allow_shared_sequences)
         return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}
-
-    def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
-        """Draw a random reference and targets at random, or spread around it."""
-        return (spread_views if self.spread_targets else training_views)(frames, self.targets, rng)
-
-    def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
-        """Return the first frame as reference and others as targets."""
-        targets = self.validation_targets if split == "val" else self.evaluation_targets
-        return evaluation_views(len(sequence.frames), targets)

@@ -66,15 +66,12 @@ def object_placement(point_cloud: Path | None, frames: Sequence[CO3DFrame], capt
         DataError: the point cloud, a depth map or a mask is missing or unreadable.
         BadPlacement: as `from_points` and `from_cameras`.
     """
+    axes = upright_axes([frame.camera for frame in captured])
     if point_cloud is not None:
         with at(point_cloud):
-            return from_points(read_points(point_cloud), _axes(captured), "the point cloud")
+            return from_points(read_points(point_cloud), axes, "the point cloud")
     with_depth = [frame for frame in frames if frame.depth is not None]
-    return from_depth_maps(with_depth, _axes(captured)) if with_depth else from_cameras([f.camera for f in frames])
-
-
-def _axes(frames: Sequence[CO3DFrame]) -> Axes:
-    return upright_axes([frame.camera for frame in frames])
+    return from_depth_maps(with_depth, axes) if with_depth else from_cameras([frame.camera for frame in frames])
 
 
 def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:

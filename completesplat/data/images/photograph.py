@@ -5,6 +5,7 @@ Also masks of hidden regions, statistics that characterize a set of images, and 
 
 import io
 import math
+import os
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
@@ -102,9 +103,13 @@ def _square(
     if isinstance(source, (np.ndarray, Tensor)):
         source = _pixels(source)
     if not isinstance(source, Image.Image):
-        _check_file(Path(source))
+        if not os.path.isfile(source):  # `Path.is_file` raises if a name is too long.
+            raise ImageError("no such file")
+        if not os.path.getsize(source):
+            raise ImageError("the file is empty")
     with nullcontext(source) if isinstance(source, Image.Image) else opened(source, FORMATS) as file:
-        _check_side(*file.size)
+        if min(file.size) < SMALLEST_SIDE:
+            raise ImageError(f"{file.size} pixels; at least {SMALLEST_SIDE} on a side are needed")
         if not isinstance(source, Image.Image):
             check_sums(file, source)
         file.load()
@@ -113,16 +118,12 @@ def _square(
     if object_share is None:
         seen = seen.crop(_central_square(*seen.size))
     if remove_background:
-        seen = _cut_out(seen, background)
+        if seen.mode not in EIGHT_BIT_MODES:
+            raise ImageError(f"colour mode {seen.mode} goes without background=remove")
+        seen = without_background(_to_srgb(seen, background))
     if object_share is not None:
         seen = _around_object(seen, object_share) or seen.crop(_central_square(*seen.size))
     return _to_tensor(seen, file, size, background), crop_fov(exif, file.size)
-
-
-def _cut_out(image: Image.Image, background: float) -> Image.Image:
-    if image.mode not in EIGHT_BIT_MODES:
-        raise ImageError(f"colour mode {image.mode} goes without background=remove")
-    return without_background(_to_srgb(image, background))
 
 
 def _around_object(image: Image.Image, share: float) -> Image.Image | None:
@@ -141,11 +142,6 @@ def _around_object(image: Image.Image, share: float) -> Image.Image | None:
     side = round(max(cut_out.size) / share)
     left, top = (cut_out.width - side) // 2, (cut_out.height - side) // 2
     return cut_out.crop((left, top, left + side, top + side))
-
-
-def _check_side(width: int, height: int) -> None:
-    if min(width, height) < SMALLEST_SIDE:
-        raise ImageError(f"{width, height} pixels; at least {SMALLEST_SIDE} on a side are needed")
 
 
 def _central_square(width: int, height: int) -> tuple[int, int, int, int]:
@@ -170,17 +166,6 @@ def _pixels(image: np.ndarray | Tensor) -> Image.Image:
     if not ((values >= 0) & (values <= 1)).all():
         raise ImageError("values outside of [0, 1]")
     return Image.fromarray(np.rint(255 * values.astype(np.float32)).astype(np.uint8))
-
-
-def _check_file(path: Path) -> None:
-    try:
-        exists = path.is_file()
-    except OSError as error:  # such as a name that is too long
-        raise ImageError(str(error.strerror)) from error
-    if not exists:
-        raise ImageError("no such file")
-    if path.stat().st_size == 0:
-        raise ImageError("the file is empty")
 
 
 def _to_tensor(square: Image.Image, source: Image.Image, size: int, background: float) -> Float[Tensor, "3 size size"]:

@@ -1,4 +1,4 @@
-"""Base class of all data modules: settings and loaders."""
+"""Base classes of all data modules: settings and loaders."""
 
 import logging
 import os
@@ -14,14 +14,17 @@ from jaxtyping import Float
 from lightning import LightningDataModule
 from torch import Tensor
 
+from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augment
 from completesplat.data.loading.distributed import batch_per_process, processes
 from completesplat.data.loading.latent_cache import CachedTrainingScenes, LatentCache
 from completesplat.data.loading.loader import EpochSampler, SceneLoader
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.loading.training_statistics import TypicalCamera, feature_moments, mean_camera, mean_image
+from completesplat.data.loading.view_selection import evaluation_views, spread_views, training_views
 from completesplat.data.packed.manifest import Scalar, is_packed, settings_must_match
 from completesplat.data.packed.source import PackedSource, local_root
+from completesplat.data.placement import ObjectFraming
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import TooFewFrames, at
 from completesplat.errors import CompleteSplatError, DataError
@@ -56,6 +59,9 @@ class SceneDataModule(LightningDataModule):
         max_bad_fraction: skipping more than this share of an epoch's items is an error.
         allow_changed: a resumed run may continue with training data that have changed.
     """
+
+    splits_share_sequences = False
+    """Whether splits have the same sequences on purpose, because they divide the frames of each."""
 
     def __init__(
         self,
@@ -143,6 +149,14 @@ class SceneDataModule(LightningDataModule):
         """Return whether all evaluation scenes have the same number of targets."""
         return scenes.stackable()
 
+    def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
+        """Return all test scenes, each with up to `views` views that show the modes best and evenly spread targets.
+
+        Raises:
+            CompleteSplatError: the alternatives for what the reference image hides are not known.
+        """
+        raise CompleteSplatError("evaluation=hidden_modes needs data whose hidden parts are known: toy objects")
+
     def setup(self, stage: str | None = None) -> None:
         """List the sequences (images are read later).
 
@@ -184,7 +198,7 @@ class SceneDataModule(LightningDataModule):
             logger.info("%s: %d sequences%s", split, len(source.names), left_out)
             if source.refused:
                 logger.warning("%d annotations cannot be used; the first: %s", len(source.refused), source.refused[0])
-            self._stores[split] = SceneStore(used, used.names, self.mask_threshold, self.cache, self.background)
+            self._stores[split] = SceneStore(used, self.mask_threshold, self.cache, self.background)
         return self._stores[split]
 
     @cached_property
@@ -288,3 +302,45 @@ class SceneDataModule(LightningDataModule):
     def mean_image(self) -> Float[Tensor, "3 height width"]:
         """Return the mean of the images that `typical_camera` averages: a baseline that ignores the input."""
         return mean_image(self.store("train"), self.image_size)
+
+
+class ObjectDataModule(SceneDataModule):
+    """Scenes of objects that the cameras surround.
+
+    Training draws a random reference and other frames of a sequence. Validation and test take a sequence's first frame
+    as the reference and other frames as targets.
+
+    Args:
+        evaluation_targets: at most this many evenly spaced targets of a test scene; None: all other frames.
+        validation_targets: the same for a validation scene; None: as for a test scene.
+        spread_targets: spread the training targets evenly around the reference (the sequence taken as a ring), in
+            random order, for a posterior that sees them; false: draw random targets.
+        depth_before, depth_after: depth range in front of and behind the object's centre; the object's half size is
+            0.57.
+        **settings: of `SceneDataModule`.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        evaluation_targets: Positive | None = None,
+        validation_targets: Positive | None = None,
+        spread_targets: bool = False,
+        depth_before: float = 2.0,
+        depth_after: float = 2.0,
+        **settings: Any,
+    ) -> None:
+        super().__init__(root, **settings)
+        self.framing = ObjectFraming(self.image_size, depth_before, depth_after)
+        self.spread_targets = spread_targets
+        self.evaluation_targets = evaluation_targets
+        self.validation_targets = evaluation_targets if validation_targets is None else validation_targets
+
+    def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
+        """Draw a random reference and targets at random, or spread around it."""
+        return (spread_views if self.spread_targets else training_views)(frames, self.targets, rng)
+
+    def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
+        """Return the first frame as reference and others as targets."""
+        targets = self.validation_targets if split == "val" else self.evaluation_targets
+        return evaluation_views(len(sequence.frames), targets)

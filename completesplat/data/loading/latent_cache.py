@@ -18,14 +18,7 @@ from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import Choice, SceneStore, TrainingScenes
 from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, json_text, read_as
 from completesplat.data.sequences import SequenceSource
-from completesplat.data.validation import (
-    ChangedFile,
-    MissingFile,
-    UnreadableFile,
-    at,
-    inside,
-    require_file,
-)
+from completesplat.data.validation import ChangedFile, MissingFile, UnreadableFile, at, inside, require_file
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import write_text, writing
 from completesplat.scene import CachedScene
@@ -87,11 +80,6 @@ class LatentCacheManifest:
     sequences: tuple[CachedSequence, ...]
     checksums: str
     sha256: str = NO_SUM
-
-
-def is_latent_cache(root: Path) -> bool:
-    """Return whether a folder holds a finished store."""
-    return (root / MANIFEST).is_file()
 
 
 def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
@@ -185,7 +173,7 @@ class LatentCache:
     """
 
     def __init__(self, folder: Path) -> None:
-        if not is_latent_cache(folder):
+        if not (folder / MANIFEST).is_file():
             raise MissingFile("no finished latent cache: completesplat data latents makes one", str(folder))
         self.folder = folder
         self.manifest = read_as(LatentCacheManifest, folder / MANIFEST, HEADER, "encode the images again")
@@ -223,13 +211,8 @@ class LatentCache:
 
     def must_belong_to(self, source: SequenceSource, settings: dict[str, Scalar]) -> None:
         """Refuse a store that was made with other settings or from another data set."""
-        differing = differences(self.origin.settings, settings)
-        if differing:
+        if differing := differences(self.origin.settings, settings):
             raise DataError(f"encoded with {differing}: set these as they were, or encode again", str(self.folder))
-        self.must_be_of(source)
-
-    def must_be_of(self, source: SequenceSource) -> None:
-        """Refuse a store that was made from another data set."""
         if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
             raise DataError("made from other data than the training set now: encode it again", str(self.folder))
 

@@ -36,7 +36,7 @@ class Loaded(NamedTuple):
 
 
 class SceneStore:
-    """Scenes from those sequences of a source that `names` lists, in this order.
+    """Scenes from the sequences of a source, in the order of its names.
 
     Args:
         mask_threshold: masks are 1 where the foreground probability reaches it, else 0; None keeps soft masks.
@@ -47,13 +47,12 @@ class SceneStore:
     def __init__(
         self,
         source: SequenceSource,
-        names: Sequence[str],
         mask_threshold: float | None = None,
         cache: bool = False,
         background: float | None = None,
     ) -> None:
         self.source = source
-        self.names = list(names)
+        self.names = source.names
         self.mask_threshold = mask_threshold
         self.background = background
         self._cache: dict[tuple[str, int], MaskedImage] | None = {} if cache else None

@@ -1,19 +1,16 @@
-"""Writer of a packed store, with a size estimate, several processes, and continuation after an interruption."""
+"""Writer of a packed store, by several processes, with continuation after an interruption."""
 
 import hashlib
 import json
 import logging
-import shutil
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import pyarrow as pa
 from rich.filesize import decimal
 from rich.progress import Progress
@@ -32,7 +29,7 @@ from completesplat.data.packed.manifest import (
     write_json,
 )
 from completesplat.data.packed.rows import CODECS, encode_image, schema, to_row
-from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource, spread_places
+from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource
 from completesplat.data.validation import TooFewFrames, at, field, read_json, refused_to
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import CompleteSplatError, DataError
@@ -42,10 +39,6 @@ from completesplat.weights import sha256_of
 FEWEST_FRAMES = 2
 UNFINISHED = ".unfinished"
 PLAN = "plan.json"
-# Number of sequences, and of frames of each, from which a store's size is estimated.
-SEQUENCES, FRAMES = 3, 2
-# Bytes of a frame's camera, depth range, number, checksum and two offsets.
-BYTES_PER_FRAME = 8 * (16 + 9 + 1 + 1 + 1 + 2)
 
 OnBad = Literal["raise", "skip"]
 
@@ -156,38 +149,6 @@ def _plans(sources: Mapping[str, SequenceSource], sequences_per_shard: int) -> l
     return plans
 
 
-def _check_space(writer: ShardWriter, plans: Sequence[ShardPlan]) -> None:
-    """Estimate the shards' size from a few sequences, and check that the disk has enough space."""
-    names = [(plan.split, name) for plan in plans for name in plan.names]
-    frames, sizes = [], []
-    for place in spread_places(len(names), SEQUENCES):
-        split, name = names[place]
-        # Sequences with errors are refused and counted when the shards are written.
-        with suppress(DataError):
-            sequence = writer.sources[split].read(name)
-            for index in spread_places(len(sequence.frames), FRAMES):
-                encoded = encode_image(sequence, index, writer.codec)
-                sizes.append(len(encoded.image) + len(encoded.mask or b""))
-            frames.append(len(sequence.frames))
-    if frames and sizes:
-        count = round(float(np.mean(frames)) * len(names))
-        size = round(count * (float(np.mean(sizes)) + BYTES_PER_FRAME))
-        require_space(size, f"{count:,} frames of {len(names):,} sequences in {len(plans):,} shards", writer.folder)
-
-
-def require_space(size: int, contents: str, folder: Path, advice: str = "") -> None:
-    """Log how many bytes will be written for `contents`.
-
-    Raises:
-        DataError: the disk has less space; `advice` says how to reduce the size.
-    """
-    free = shutil.disk_usage(folder).free
-    needed = f"about {decimal(size)} for {contents}; {decimal(free)} are free"
-    if size > free:
-        raise DataError(f"not enough space: {needed}{advice}", str(folder))
-    logger.info(needed)
-
-
 def prepare(
     sources: Mapping[str, SequenceSource],
     settings: Mapping[str, Scalar],
@@ -210,7 +171,8 @@ def prepare(
         on_bad: "skip" and record unreadable frames and sequences, up to `max_bad_fraction` of each; or "raise".
 
     Raises:
-        DataError: the folder holds something else, there is too little space, or too much is unreadable.
+        DataError: the folder holds something else, or too much is unreadable.
+        DiskError: the disk is full; a run that is started again keeps the finished shards.
     """
     if codec not in CODECS:
         raise CompleteSplatError(f"codec={codec}: choose one of {', '.join(CODECS)}")
@@ -229,7 +191,6 @@ def prepare(
     if on_bad == "raise" and listed:
         raise listed[0]
     if missing:
-        _check_space(writer, missing)
         with Progress(disable=not progress) as bar:
             task = bar.add_task("preparing sequences", total=sum(len(plan.names) for plan in missing))
             for plan, record in zip(missing, map_in_processes(writer.write, missing, workers), strict=True):

@@ -12,12 +12,9 @@ from pathlib import Path
 from typing import TypeGuard
 
 import torch
-from jaxtyping import UInt8
 from torch import Tensor
 
-from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.files import decode, stored_size
-from completesplat.data.realestate10k.clips import CAMERA_NUMBERS, FORMATS, Clip, clip_cameras
+from completesplat.data.realestate10k.clips import CAMERA_NUMBERS, Clip, make_clip
 from completesplat.data.validation import BadAnnotation, UnreadableFile, at, inside, read_json, refused_to, require_file
 from completesplat.errors import DataError, TensorFileError
 from completesplat.weights.checkpoint_reading import read_tensor_file
@@ -115,14 +112,7 @@ def _clip_from_entry(path: Path, key: str, entry: dict[str, object]) -> Clip:
         raise BadAnnotation("timestamps are not int64")
     if not len(images) == len(rows) == len(times):
         raise BadAnnotation(f"{len(images)} images, {len(rows)} cameras and {len(times)} timestamps")
-    with at(frame=0):
-        size = stored_size(images[0].numpy().tobytes(), str(path), FORMATS) if images else (1, 1)
-
-    def read(frame: int, square: Square, side: int) -> UInt8[Tensor, "3 side side"]:
-        return cut_square(decode(images[frame].numpy().tobytes(), str(path), "RGB", size), square, side)
-
-    timestamps = tuple(times.tolist())
-    return Clip(key, path, timestamps, clip_cameras(rows, timestamps, size), read)
+    return make_clip(key, path, times.tolist(), rows, images)
 
 
 def _is_bytes(image: object) -> TypeGuard[Tensor]:

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from completesplat.data.images.crop import Square, read_square
-from completesplat.data.images.files import stored_size
+from completesplat.data.images.crop import Square, cut_square
+from completesplat.data.images.files import decode, stored_size
 from completesplat.data.validation import (
     ROTATION_TOLERANCE,
     BadAnnotation,
@@ -38,16 +38,38 @@ class Clip:
 
     Attributes:
         source: the file that holds the cameras.
-        timestamps: microseconds of the video.
         cameras: [view], float64, in pixels of the stored images and in the clip's own units of length.
-        read: (frame, square, size) -> the square part of that frame's image, resized to `size`.
+        images: image files, or their bytes in the file `source`.
     """
 
     key: str
     source: Path
-    timestamps: tuple[int, ...]
     cameras: Cameras
-    read: Callable[[int, Square, int], UInt8[Tensor, "3 size size"]]
+    images: Sequence[Path] | Sequence[UInt8[Tensor, " _"]]
+
+    def read(self, frame: int, square: Square, size: int) -> UInt8[Tensor, "3 {size} {size}"]:
+        """Return the square part of a frame's image, resized to `size`."""
+        return cut_square(
+            decode(*_stored(self.images[frame], self.source), "RGB", self.cameras.image_size), square, size
+        )
+
+
+def make_clip(
+    key: str,
+    source: Path,
+    timestamps: Sequence[int],
+    rows: Float[Tensor, "view 18"],
+    images: Sequence[Path] | Sequence[UInt8[Tensor, " _"]],
+) -> Clip:
+    """Return the clip of stored rows and images; the first image determines the size. Errors as in `clip_cameras`."""
+    with at(frame=0):
+        size = stored_size(*_stored(images[0], source), FORMATS) if images else (1, 1)
+    return Clip(key, source, clip_cameras(rows, timestamps, size), images)
+
+
+def _stored(image: Path | Tensor, source: Path) -> tuple[Path | bytes, str]:
+    """Return an image's file or content, and the file to name in errors."""
+    return (image, str(image)) if isinstance(image, Path) else (image.numpy().tobytes(), str(source))
 
 
 def clip_cameras(rows: Float[Tensor, "view 18"], timestamps: Sequence[int], image_size: tuple[int, int]) -> Cameras:
@@ -107,14 +129,8 @@ class TextClips:
                 if time not in images:
                     raise MissingFile("no such image", str(self.folder / key / f"{time}.jpg"), key, frame)
             paths = [images[time] for time in timestamps]
-            with at(frame=0):
-                size = stored_size(paths[0], str(paths[0]), FORMATS) if paths else (1, 1)
-
-            def read(frame: int, square: Square, side: int) -> UInt8[Tensor, "3 side side"]:
-                return read_square(paths[frame], size, square, side, "RGB")
-
             numbers = torch.tensor(rows, dtype=torch.float64).reshape(-1, CAMERA_NUMBERS)
-            return Clip(key, path, timestamps, clip_cameras(numbers, timestamps, size), read)
+            return make_clip(key, path, timestamps, numbers, paths)
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the text files' names and sizes (reading tens of thousands would be slow)."""

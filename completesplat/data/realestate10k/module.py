@@ -25,8 +25,6 @@ from completesplat.settings.schema import Natural, OneOf, Positive, Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 
-CROPS = ("center", "principal")
-
 Clips = TextClips | ChunkedClips
 
 
@@ -72,7 +70,7 @@ class RE10KSource(SequenceSource):
     def read(self, name: str) -> PosedSequence:
         """Read one clip's cameras; its images are read by `PosedSequence.read`."""
         clip, framing = self._clips.clip(name), self.framing
-        count = len(clip.timestamps)
+        count = len(clip.images)
         squares = [_square(clip, framing.crop, frame) for frame in range(count)]
         if len(set(squares)) == 1:
             cameras = crop_resize(clip.cameras, *squares[0], framing.image_size)
@@ -128,7 +126,7 @@ class RE10KDataModule(SceneDataModule):
         evaluation_gap: Positive | None = None,
         evaluation_index: str | None = None,
         scene_list: str | None = None,
-        crop: Annotated[str, OneOf(CROPS)] = "center",
+        crop: Annotated[str, OneOf(("center", "principal"))] = "center",
         near: float = 0.7,
         far: float = 10.0,
         scale: float = 1.0,

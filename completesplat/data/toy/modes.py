@@ -63,7 +63,7 @@ Chosen = tuple[list[int], Float[Tensor, "mode view 3 size size"], Bool[Tensor, "
 
 @dataclass
 class ToyHiddenModes:
-    """Scenes of a store with all their modes; see `KnowsHiddenModes.hidden_modes`.
+    """Scenes of a store with all their modes; see `SceneDataModule.hidden_modes`.
 
     `folder` is that of their category, a key of `DRAW`, and must hold a complete set of this version. Only the
     reference that `choose` returns is used.

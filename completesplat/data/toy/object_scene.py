@@ -7,7 +7,6 @@ learns only the overall frequency of the colours.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from completesplat.data.toy.shapes import (
     FRUSTUM,
     PLAIN,
     RIPPLES,
+    SAMPLES,
     STRIPES,
     Array,
     Look,
@@ -26,6 +26,7 @@ from completesplat.data.toy.shapes import (
     Point,
     Shapes,
     as_arrays,
+    camera_rays,
     color,
     part,
     plain,
@@ -149,7 +150,6 @@ PATCH_COLORS = {
     "blue": (0.1, 0.25, 0.9),
     "yellow": (0.98, 0.85, 0.1),
 }
-SAMPLES = 3
 EVEN = np.full(len(PATCH_COLORS), 0.25)
 NOSES = {"light": 0.97, "dark": 0.05}
 CHANCES = {"light": np.array([0.4, 0.3, 0.2, 0.1]), "dark": np.array([0.1, 0.2, 0.3, 0.4])}
@@ -249,21 +249,12 @@ def render_frame(scene: ToyScene, frame: int, size: int) -> tuple[Array, Array, 
 
     Pixels average SAMPLES^2 rays. Depth is the middle ray's, along the optical axis, in the scene's own units.
     """
-    rays = _camera_rays(scene.fov_degrees, size)
+    focal = 0.5 * size / np.tan(np.radians(scene.fov_degrees) / 2)
+    rays = camera_rays(focal, focal, size / 2, size / 2, size, size, unit=True)
     pose = scene.camera_to_world[frame]
     colors, coverage, distances = trace(scene.shapes, scene.light, (scene.dome, scene.patch), pose, rays)
     depth = distances * rays[:, SAMPLES**2 // 2, 2]
     return colors.reshape(size, size, 3), coverage.reshape(size, size), depth.reshape(size, size)
-
-
-@lru_cache(maxsize=1)
-def _camera_rays(fov_degrees: float, size: int) -> Array:
-    """Return unit rays [pixel sample 3] in the camera's frame, in rows of pixels from the top."""
-    centers = (np.arange(size * SAMPLES) + 0.5) / SAMPLES - size / 2
-    v, u = (axis.reshape(size, SAMPLES, size, SAMPLES).swapaxes(1, 2) for axis in np.meshgrid(centers, centers)[::-1])
-    rays = np.stack([u, v, np.full_like(u, 0.5 * size / np.tan(np.radians(fov_degrees) / 2))], axis=-1)
-    units: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-    return units.reshape(size * size, SAMPLES**2, 3)
 
 
 def orbit(rng: np.random.Generator, frames: int, start: float) -> Array:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ from completesplat.data.toy.shapes import (
     Part,
     Shapes,
     as_arrays,
+    camera_rays,
     color,
     part,
     rotation_about,
@@ -135,7 +135,6 @@ LOWEST, HIGHEST = 1.0, 1.7
 STEPS = (0.012, 0.032)
 LARGEST_TURN = np.radians(3.0)
 WAYPOINTS = 4
-SAMPLES = 3
 FIELD_OF_VIEW = (55, 75)
 DENSE = 400
 ASPECT = 16 / 9
@@ -258,19 +257,9 @@ def draw_room_scene(rng: np.random.Generator, frames: int) -> RoomScene:
 
 def render_room_frame(scene: RoomScene, frame: int, height: int, width: int) -> tuple[Array, Array]:
     """Render the image [height width 3] and the depth [height width], along the optical axis in the room's units."""
-    rays = _camera_rays(*scene.move.intrinsics(height, width) * np.array([width, height, width, height]), height, width)
+    rays = camera_rays(*scene.move.intrinsics(height, width) * np.array([width, height, width, height]), height, width)
     colors, _, depth = trace(scene.shapes, scene.light, scene.room, scene.move.camera_to_room[frame], rays)
     return colors.reshape(height, width, 3), depth.reshape(height, width)
-
-
-@lru_cache(maxsize=1)
-def _camera_rays(fx: float, fy: float, cx: float, cy: float, height: int, width: int) -> Array:
-    """Return rays [pixel sample 3] in the camera's frame, with a component of 1 along the optical axis."""
-    offsets = (np.arange(SAMPLES) + 0.5) / SAMPLES
-    x = (np.arange(width)[:, None] + offsets - cx) / fx
-    y = (np.arange(height)[:, None] + offsets - cy) / fy
-    grid = np.broadcast_arrays(x[None, :, None, :], y[:, None, :, None], 1.0)
-    return np.stack(grid, axis=-1).reshape(height * width, SAMPLES**2, 3)
 
 
 def _faces(rng: np.random.Generator) -> tuple[Array, Array]:

@@ -1,8 +1,9 @@
-"""Parts of toy scenes: ellipsoids, cone frusta and boxes with patterns, and their arrays for the ray tracer."""
+"""Input of the ray tracer: parts of toy scenes (ellipsoids, cone frusta and boxes with patterns), and camera rays."""
 
 import colorsys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 ELLIPSOID, FRUSTUM, BOX = 0, 1, 2
 # Patterns: the first number of a texture. The others are its frequency (radians per unit of length) and phase.
 PLAIN, STRIPES, CHECKS, RIPPLES = 0, 1, 2, 3
+SAMPLES = 3  # rays of a pixel in each direction
 
 Array = NDArray[np.float64]
 Look = tuple[Array, Array]
@@ -102,3 +104,14 @@ def color(hue: float, saturation: float, value: float) -> Array:
 def plain(shade: Array) -> Look:
     """Return the look of one colour without a pattern."""
     return np.stack([shade, shade]), np.array([PLAIN, 0.0, 0.0])
+
+
+@lru_cache(maxsize=1)
+def camera_rays(fx: float, fy: float, cx: float, cy: float, height: int, width: int, unit: bool = False) -> Array:
+    """Return rays [pixel sample 3] in the camera's frame, of unit length or with depth 1, in rows from the top."""
+    offsets = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    x = (np.arange(width)[:, None] + offsets - cx) / fx
+    y = (np.arange(height)[:, None] + offsets - cy) / fy
+    grid = np.broadcast_arrays(x[None, :, None, :], y[:, None, :, None], 1.0)
+    rays = np.stack(grid, axis=-1).reshape(height * width, SAMPLES**2, 3)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True) if unit else rays

@@ -42,11 +42,20 @@ Written = tuple[str, list[Annotation], Annotation]
 """Split of a sequence, and annotations of its frames and of itself."""
 
 
-def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewest: int, **numbers: int) -> Path:
-    """Make `folder`, let `fill` write into it, and finally write the numbers to `toy.json`.
+def _write_set(
+    folder: Path,
+    write: Callable[[Path, tuple[int, str]], Result],
+    splits: Sequence[str],
+    finish: Callable[[Path, list[Result]], None],
+    fewest: int,
+    workers: int | None,
+    progress: bool,
+    **numbers: int,
+) -> Path:
+    """Make `folder`, call `write` with it and (index, split) of every scene, then `finish`, and write `toy.json`.
 
-    The bytes depend only on `scenes` (at least `fewest`), `frames`, `size` and `seed`. A folder that was made with the
-    same numbers remains unchanged.
+    The bytes depend only on the `numbers`: `scenes` (at least `fewest`), `frames`, `size` and `seed`. `workers` are
+    processes (None: one for each core). A folder that was made with the same numbers remains unchanged.
 
     Raises:
         DataError: a number is out of its range, or the folder holds something else.
@@ -67,17 +76,10 @@ def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewes
             Console().print(f"{folder} already holds these scenes")
         return folder
     with atomic_folder(folder) as unfinished:
-        fill(unfinished)
+        written = map_in_processes(partial(write, unfinished), list(enumerate(splits)), workers)
+        finish(unfinished, list(track(written, f"Rendering {folder.name}", len(splits), disable=not progress)))
         (unfinished / "toy.json").write_text(json.dumps(parameters, indent=1) + "\n")
     return folder
-
-
-def write_scenes(
-    write: Callable[[tuple[int, str]], Result], splits: Sequence[str], workers: int | None, name: str, progress: bool
-) -> list[Result]:
-    """Call `write` with (index, split) of every scene in `workers` processes (None: one for each core), in order."""
-    written = map_in_processes(write, list(enumerate(splits)), workers)
-    return list(track(written, f"Rendering {name}", len(splits), disable=not progress))
 
 
 def to_bytes(values: Array) -> UInt8[np.ndarray, "..."]:
@@ -138,15 +140,12 @@ def write_objects(
     """Write `scenes` sequences of `frames` square images with masks, depth, point clouds and annotations.
 
     The subset `fewview_train` splits the sequences: about 85 % train, 5 % val, 10 % test. `<seq>/toy.json` reveals the
-    family and the colour of the patch on the back. See `write_once` for the numbers; `workers` are processes (None: one
-    for each core). Return the folder of the category (a key of `DRAW`).
+    family and the colour of the patch on the back. See `_write_set` for the numbers and `workers`. Return the folder of
+    the category (a key of `DRAW`).
     """
-
-    def fill(folder: Path) -> None:
-        write = partial(_write_scene, folder, category, frames, size, seed)
-        _write_lists(folder, write_scenes(write, _splits(scenes), workers, category, progress))
-
-    return write_once(out / category, fill, progress, 1, scenes=scenes, frames=frames, size=size, seed=seed)
+    numbers = {"scenes": scenes, "frames": frames, "size": size, "seed": seed}
+    write = partial(_write_scene, category=category, frames=frames, size=size, seed=seed)
+    return _write_set(out / category, write, _splits(scenes), _write_lists, 1, workers, progress, **numbers)
 
 
 def _splits(scenes: int) -> list[str]:
@@ -156,7 +155,7 @@ def _splits(scenes: int) -> list[str]:
     return ["train"] * (scenes - val - test) + ["val"] * val + ["test"] * test
 
 
-def _write_scene(root: Path, category: str, frames: int, size: int, seed: int, place: tuple[int, str]) -> Written:
+def _write_scene(root: Path, place: tuple[int, str], category: str, frames: int, size: int, seed: int) -> Written:
     """Write one sequence, drawn from a separate random generator, and return its split and annotations."""
     index, split = place
     scene = DRAW[category](np.random.default_rng([seed, index]), frames)
@@ -185,18 +184,15 @@ def write_rooms(
     """Write `scenes` clips of `frames` images, `size` high and 16 / 9 as wide, with poses and intrinsics.
 
     `text`/<split>/ has <key>.txt and <key>/<timestamp>.jpg. The first and every tenth clip after it are in the split
-    `test`, the others in `train`. See `write_once` for the numbers; `workers` are processes (None: one for each core).
-    Return the folder, `out`/toy_rooms.
+    `test`, the others in `train`. See `_write_set` for the numbers and `workers`. Return the folder, `out`/toy_rooms.
     """
     splits = ["test" if index % 10 == 0 else "train" for index in range(scenes)]
-
-    def fill(folder: Path) -> None:
-        write_scenes(partial(_write_clip, folder / "text", frames, size, seed), splits, workers, ROOMS, progress)
-
-    return write_once(out / ROOMS, fill, progress, 2, scenes=scenes, frames=frames, size=size, seed=seed)
+    numbers = {"scenes": scenes, "frames": frames, "size": size, "seed": seed}
+    write = partial(_write_clip, frames=frames, size=size, seed=seed)
+    return _write_set(out / ROOMS, write, splits, lambda folder, clips: None, 2, workers, progress, **numbers)
 
 
-def _write_clip(text: Path, frames: int, size: int, seed: int, place: tuple[int, str]) -> None:
+def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed: int) -> None:
     """Write one clip, drawn from a separate random generator.
 
     The text has the address of the video, then a line for each frame: timestamp, fx fy cx cy as fractions of width or
@@ -209,7 +205,7 @@ def _write_clip(text: Path, frames: int, size: int, seed: int, place: tuple[int,
     intrinsics, poses = scene.move.intrinsics(size, width), scene.move.world_to_camera().reshape(frames, 12)
     rows = np.concatenate([np.broadcast_to(intrinsics, (frames, 4)), np.zeros((frames, 2)), poses], axis=1)
     key = f"room{index:05d}"
-    images = text / split / key
+    images = root / "text" / split / key
     images.mkdir(parents=True)
     lines = [f"https://example.com/toy/{key}"]  # no real video
     for frame, row in enumerate(rows.astype(np.float32)):
@@ -217,13 +213,11 @@ def _write_clip(text: Path, frames: int, size: int, seed: int, place: tuple[int,
         # Nine digits identify a float32 exactly.
         lines.append(" ".join([str(time), *(f"{number:.9g}" for number in row)]))
         write_image(images / f"{time}.jpg", render_room_frame(scene, frame, size, width)[0])
-    (text / split / f"{key}.txt").write_text("\n".join(lines) + "\n")
+    images.with_suffix(".txt").write_text("\n".join(lines) + "\n")
 
 
 KINDS: dict[str, Callable[..., Path]] = {
-    "objects": write_objects,
-    "minis": partial(write_objects, category="toy_minis"),
-    "marked_minis": partial(write_objects, category="toy_marked_minis"),
+    **{category.removeprefix("toy_"): partial(write_objects, category=category) for category in DRAW},
     "rooms": write_rooms,
 }
 

@@ -1,7 +1,7 @@
 """Check of a whole data set: numbers of usable sequences and frames, and reasons for those that are not usable."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -70,13 +70,20 @@ class Findings:
         write_text(path, json.dumps(self.json(), indent=2, allow_nan=False) + "\n")
 
 
-def check(sources: Sources, workers: int | None = None, progress: bool = True) -> Findings:
+def check(
+    sources: Sources, workers: int | None = None, progress: bool = True, splits_share_sequences: bool = False
+) -> Findings:
     """Read every sequence and every image once, even if several splits share them.
 
     A sequence without errors that is not usable is refused for too few frames. `workers` are processes (None: one for
-    each core); with several, the sources (by split) must be picklable.
+    each core); with several, the sources (by split) must be picklable. Shared sequences are reported unless the splits
+    share them on purpose (`SceneDataModule.splits_share_sequences`).
     """
-    refused = [error for source in sources.values() for error in _before_reading(source)]
+    refused: list[DataError] = []
+    for source in sources.values():
+        refused += source.refused
+        refused += [LeftOut(reason, sequence=name) for reason, names in source.left_out.items() for name in names]
+        refused += source.verify()
     sequences, batches = list[_Sequence](), _batches(sources)
     with Progress(disable=not progress) as bar:
         task = bar.add_task("reading sequences", total=sum(map(len, batches)))
@@ -96,7 +103,7 @@ def check(sources: Sources, workers: int | None = None, progress: bool = True) -
             split: _numbers([sequence.usable & sequence.frames.get(split, set()) for sequence in sequences])
             for split in sources
         },
-        shared=shared_names({split: source.names for split, source in sources.items()}),
+        shared={} if splits_share_sequences else shared_names({split: sources[split].names for split in sources}),
     )
 
 
@@ -127,13 +134,6 @@ class _Sequence:
     frames: dict[str, set[int]] = field(default_factory=dict)
     usable: set[int] = field(default_factory=set)
     refused: list[DataError] = field(default_factory=list)
-
-
-def _before_reading(source: SequenceSource) -> Iterator[DataError]:
-    yield from source.refused
-    for reason, names in source.left_out.items():
-        yield from (LeftOut(reason, sequence=name) for name in names)
-    yield from source.verify()
 
 
 def _batches(sources: Sources) -> list[_Batch]:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from completesplat.data.hidden_modes import hidden_modes
 from completesplat.data.toy.modes import DIFFERENCE, SAME_IMAGE, frame_camera, unseen
 from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS, draw_scene, render_frame
@@ -17,7 +16,7 @@ from completesplat.geometry.cameras import pixel_centers, project, unproject
 def scenes_of(root, views=2, image_size=32):
     module = ToyObjectsDataModule(str(root), image_size=image_size)
     module.setup("test")
-    return hidden_modes(module, views, spread_views=3), module
+    return module.hidden_modes(views, spread_views=3), module
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +68,7 @@ def test_views_look_at_the_back_and_a_front_that_tells_the_colour_is_refused(toy
 
 def test_other_data_are_refused(toy_root, tmp_path):
     with pytest.raises(CompleteSplatError, match="needs data whose hidden parts are known: toy objects"):
-        hidden_modes(ToyRoomsDataModule(str(tmp_path)), 1, 1)
+        ToyRoomsDataModule(str(tmp_path)).hidden_modes(1, 1)
     copy = shutil.copytree(toy_root, tmp_path / "copy")
     path = copy / "toy_objects/toy.json"
     numbers = json.loads(path.read_text())
