@@ -42,7 +42,7 @@ from completesplat.data.images.crop import Square
 from completesplat.data.images.exif import ORIENTATION
 from completesplat.data.images.files import decode, read_depth, stored_size
 from completesplat.data.images.photograph import read_photograph
-from completesplat.data.realestate10k.chunks import ChunkedClips
+from completesplat.data.realestate10k.clips import ChunkedClips
 from completesplat.data.validation import read_points
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import read_ply, write_ply

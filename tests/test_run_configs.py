@@ -80,7 +80,7 @@ FOREIGN = [
     {"_target_": "torch.optim.adam.torch.load", "f": "PAYLOAD", "weights_only": False},
     {"_target_": "torch.optim.Adam.__init__.__globals__"},
     {"_target_": "completesplat.commands.launch", "verb": "test", "arguments": []},
-    {"_target_": "completesplat.losses.mse.torch.load", "f": "PAYLOAD", "weights_only": False},
+    {"_target_": "completesplat.losses.terms.torch.load", "f": "PAYLOAD", "weights_only": False},
     {"_target_": "missing_module.Thing"},
     {"_target_": ""},
     {"_target_": ["os.system"]},
@@ -195,7 +195,7 @@ def test_what_is_no_configuration_is_refused(run, text):
         configuration(run)
 
 
-@pytest.mark.parametrize("verb", ["test", "report samplers", "data latents"])
+@pytest.mark.parametrize("verb", ["test", "report controls", "data latents"])
 def test_no_verb_runs_what_a_run_names(command, run, elsewhere, monkeypatch, tmp_path, verb):
     monkeypatch.chdir(elsewhere)  # `command` works in the folder that holds the run
     torch.save(Payload(tmp_path / "sprung"), tmp_path / "payload")

@@ -14,7 +14,7 @@ import torch
 from fuzzing import CLEAR, bounded
 
 from completesplat.baselines.splatter_image.files import STATE, read_tensors
-from completesplat.data.realestate10k.chunks import read_chunk
+from completesplat.data.realestate10k.clips import read_chunk
 from completesplat.errors import CompleteSplatError
 from completesplat.weights.checkpoint_reading import read_checkpoint
 

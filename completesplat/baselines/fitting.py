@@ -4,7 +4,6 @@ There is no densification and no pruning, so the number of Gaussians stays const
 random depths instead of a structure-from-motion cloud, because a data set may lack one.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -12,14 +11,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
+from completesplat.geometry.cameras import pixel_centers, unproject
 from completesplat.losses import Prediction, WeightedSum
+from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
 from completesplat.settings.schema import Positive, Share
 from completesplat.splatter_image import SH_C0
-
-Render = Callable[[Gaussians, Cameras], Tensor]
-"""Renderer from Gaussians [batch] and cameras [batch view] to images [batch view 3 height width]."""
 
 POSITION_RATE, POSITION_DECAY = 1.6e-4, 0.01
 RATES = {"log_scales": 5e-3, "quaternions": 1e-3, "logits": 5e-2, "harmonics": 2.5e-3}
@@ -93,7 +90,8 @@ def initial_gaussians(
 def fit_gaussians(
     views: Views,
     depth_range: Float[Tensor, "batch 2"],
-    render: Render,
+    rasterizer: Rasterizer,
+    background: float,
     loss: WeightedSum,
     settings: FittingSettings,
     generator: torch.Generator,
@@ -112,7 +110,8 @@ def fit_gaussians(
             chosen = torch.randperm(views.images.shape[1], generator=generator)[: settings.views]
             # Indexing copies the views, so autograd can use them even if they were made in inference mode.
             truth, gaussians = views[:, chosen.to(views.images.device)], raw.gaussians()
-            total, _ = loss(Prediction(render(gaussians, truth.cameras), gaussians, None), truth, step)
+            images = rasterizer(gaussians, truth.cameras).over(background)
+            total, _ = loss(Prediction(images, gaussians, None), truth, step)
             optimizer.zero_grad()
             torch.autograd.backward(total)
             optimizer.step()

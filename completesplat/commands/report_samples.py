@@ -4,9 +4,8 @@ Each study raises the errors of `Trained.open`, `diffusion_of`, `first_scenes` a
 `completesplat.studies`.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, TypedDict, Unpack
 
@@ -16,15 +15,12 @@ from rich.console import Console
 from completesplat.commands import quieten
 from completesplat.commands.protocol import write_json
 from completesplat.commands.trained import Trained, diffusion_of
-from completesplat.errors import CompleteSplatError
 from completesplat.export.images import SheetCell, image_sheet, write_png
-from completesplat.results.machine import machine
-from completesplat.results.tables import SSIM_NOTE, records_table, show
+from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
 from completesplat.settings.schema import Entries, Positive, Range, Share
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
-from completesplat.studies import samplers as samplers_study
 from completesplat.studies.samples import SampleRenderer, first_scenes
 
 Weights = Annotated[Sequence[Share], Entries(1)]
@@ -39,45 +35,6 @@ class Run(TypedDict):
     scenes: Positive
     seed: int
     samples: Annotated[int, Range(2)]
-
-
-def samplers(
-    samplers: Mapping[str, Mapping[str, object]],
-    steps: Mapping[str, Annotated[Sequence[Annotated[int, Range(1, 1000)]], Entries(1)]],
-    skip_weight: Share,
-    guidance_weight: Share,
-    out: Path,
-    **run: Unpack[Run],
-) -> None:
-    """Write `samplers.json` and `samplers.png`; print the table and the fewest steps that are enough.
-
-    Samplers' configs and numbers of steps are by the sampler's name; see `conf/report_task/samplers.yaml`.
-
-    Raises:
-        CompleteSplatError: steps belong to an unknown sampler, or are impossible.
-    """
-    for name in steps:
-        if name not in samplers:
-            raise CompleteSplatError(f"steps.{name}: no such sampler; there are {', '.join(samplers)}")
-    renderer, scenes, settings = _open(run)
-    weights = {"skip_weight": skip_weight, "guidance_weight": guidance_weight}
-    with _status() as tick:
-        rows = samplers_study.rows(renderer, samplers, steps, scenes, weights, tick)
-    best = samplers_study.fewest(rows)
-    report = {
-        "machine": machine(),
-        "settings": settings | weights,
-        "rows": list(map(asdict, rows)),
-        "fewest": asdict(best),
-    }
-    write_json(out / "samplers.json", report)
-    title = f"Samplers: {len(scenes)} scenes, {run['samples']} samples each"
-    samplers_study.plot_samplers(rows, out / "samplers.png", title)
-    show(records_table(f"Samplers, from the same noise. {SSIM_NOTE}", list(map(asdict, rows))))
-    print(
-        f"fewest denoiser calls within {samplers_study.CLOSE} dB of {rows[0].sampler} with {rows[0].steps} steps: "
-        f"{best.calls} ({best.sampler}, {best.steps} steps, {best.psnr - rows[0].psnr:+.2f} dB)"
-    )
 
 
 def controls(

@@ -97,7 +97,7 @@ class Trained:
 
         from completesplat.baselines.splatter_image.model import DirectionalRasterizer
         from completesplat.losses import WeightedSum
-        from completesplat.losses.mse import MeanSquaredError
+        from completesplat.losses.terms import MeanSquaredError
         from completesplat.training.latent_diffusion import LatentDiffusion
         from completesplat.training.optimization import constant
         from completesplat.training.reconstruction import ReconstructionModule

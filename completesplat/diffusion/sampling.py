@@ -143,23 +143,14 @@ def fresh_noise(noise: Latents) -> Iterator[Latents]:
         yield torch.stack(drawn).to(noise)
 
 
-def _scheduler_names(*samplers: Mapping[str, Any]) -> list[str]:
-    return [str(sampler["scheduler"].get("_target_")).rpartition(".")[2] for sampler in samplers]
-
-
-def of_one_kind(*samplers: Mapping[str, Any]) -> bool:
-    """Return whether these sampler configs are all for diffusion, or all for flow matching."""
-    return len({name.startswith("FlowMatch") for name in _scheduler_names(*samplers)}) == 1
-
-
 def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
     """Return a sampler's config with the noise schedule and prediction type of the sampler used in training.
 
     Raises:
         CompleteSplatError: one of the two is for diffusion, the other for flow matching.
     """
-    if not of_one_kind(sampler, trained):
-        names = _scheduler_names(sampler, trained)
+    names = [str(config["scheduler"].get("_target_")).rpartition(".")[2] for config in (sampler, trained)]
+    if names[0].startswith("FlowMatch") != names[1].startswith("FlowMatch"):
         raise CompleteSplatError(f"sampler: {names[0]} cannot draw from a denoiser that was trained for {names[1]}")
     fixed = {key: value for key, value in trained["scheduler"].items() if key in FORWARD_PROCESS}
     return {**sampler, "scheduler": {**sampler["scheduler"], **fixed}}

@@ -1,4 +1,4 @@
-"""Training losses of the reconstruction stage (paper, Eq. 1): one term per file, combined by name."""
+"""Training losses of the reconstruction stage (paper, Eq. 1): terms, combined by name."""
 
 from completesplat.losses.weighted_sum import LossTerm, Prediction, WeightedSum
 

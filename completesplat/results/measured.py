@@ -103,11 +103,9 @@ class Entry:
 
     def cell(self, name: str, notes: Notes) -> Cell:
         """Return a cell with the score `REGION_VIEW_METRIC`, or with the number of the note on why there is none."""
-        value, metric = self.scores.get(name), name.rpartition("_")[2]
-        if value is not None:
-            return Cell(format(value, FORMATS[metric]), value=value)
-        reasons = self.run.protocol.get("missing", {})
-        return notes.missing(f"{metric}: {reasons.get(metric, f'not measured for {self.predictor}')}")
+        if (value := self.scores.get(name)) is not None:
+            return Cell(format(value, FORMATS[name.rpartition("_")[2]]), value=value)
+        return notes.missing(name, self.run.protocol, f"not measured for {self.predictor}")
 
     def leading(self, notes: Notes) -> dict[str, Cell]:
         """Return the cells before the scores, by the keys of `LEADING`; unknown values are `ABSENT`."""

@@ -23,7 +23,7 @@ from completesplat.results.measured import (
     mode_tables,
     score_tables,
 )
-from completesplat.results.runs import HOW, MODES, SCORES, Job, Protocol, RunTree, collect
+from completesplat.results.runs import HOW, MODES, SCORES, Job, RunTree, collect
 from completesplat.results.sweeps import figures, sweep_rows
 from completesplat.results.tables import (
     ABSENT,
@@ -48,6 +48,7 @@ VIEWS = (
     "The paper names both reference and novel views in its protocol and does not say how it weighs them; "
     "our rows are of novel views."
 )
+LACKING = "not measured in all jobs of this row"
 APART = "Rows of ours are by the protocol in their note, not by the paper's: they compare among each other only."
 
 
@@ -181,16 +182,11 @@ def ablations_beside(table: PublishedTable, sweeps: Mapping[str, Sequence[Job]])
                 theirs = "".join(f" ({table.options[part]})" for part in row.label.split(", ") if part in table.options)
                 label = f"{OURS}{row.label}{theirs}{f', {row.seeds} seeds' if row.seeds else ''} [{note}]"
                 pairs = zip(names, cells, strict=True)
-                scores = [cell if cell.text else _missing(score, protocol, notes) for score, cell in pairs]
+                scores = [cell if cell.text else notes.missing(name, protocol, LACKING) for name, cell in pairs]
                 rows.append(TableRow("ours", [Cell(label), *scores]))
     headings = [Heading("setting", figures=False), *(Heading(column.heading) for column in table.columns[1:])]
     remarks = [_source(table), *([APART] if sweeps else []), LEGEND]
     return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
-
-
-def _missing(column: str, protocol: Protocol, notes: Notes) -> Cell:
-    metric = column.rpartition("_")[2]
-    return notes.missing(f"{metric}: {protocol.get('missing', {}).get(metric, 'not measured in all jobs of this row')}")
 
 
 def tables(tree: RunTree | None) -> list[Table]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from completesplat.files import atomic_path, write_text
-from completesplat.results.runs import UPPER_BOUND, flat
+from completesplat.results.runs import UPPER_BOUND, Protocol, flat
 
 if TYPE_CHECKING:
     from rich.table import Table as PrintedTable
@@ -110,9 +110,11 @@ class Notes:
             self.texts.append(text)
         return self.texts.index(text) + 1
 
-    def missing(self, reason: str) -> Cell:
-        """Return a cell for a missing score, which refers to a note on the reason."""
-        return Cell(f"missing: note {self.number(reason.removeprefix('missing: '))}")
+    def missing(self, column: str, protocol: Protocol, otherwise: str) -> Cell:
+        """Return a cell for a missing score, which refers to a note on the protocol's reason, or on `otherwise`."""
+        metric = column.rpartition("_")[2]
+        reason = protocol.get("missing", {}).get(metric, otherwise)
+        return Cell(f"missing: note {self.number(f'{metric}: {reason}')}")
 
 
 @dataclass(frozen=True)

@@ -77,11 +77,10 @@ class PerScene(Stage):
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Fit each scene to its reference and all its targets."""
-        render = lambda gaussians, cameras: self.rasterizer(gaussians, cameras).over(self.background)  # noqa: E731
+        views, settings = scenes.all_views(), (self.background, self.loss, self.fitting)
         generator = torch.Generator().manual_seed(seed)
         with torch.autocast(self.device.type, enabled=False):
-            views = scenes.all_views()
-            return fit_gaussians(views, scenes.depth_range, render, self.loss, self.fitting, generator)
+            return fit_gaussians(views, scenes.depth_range, self.rasterizer, *settings, generator)
 
 
 class Preoptimized(PerScene):
@@ -148,25 +147,25 @@ class FittedScenes:
         """Fit missing scenes; raise DataError if a sequence cannot be read."""
         missing = [name for name in names if not self._path(name).is_file()]
         for name in track(missing, "fitting Gaussians to scenes", disable=not progress):
-            self._make(name)
+            self._fitted(name)
         if missing:
             logger.info("fitted Gaussians to %d scenes", len(missing))
 
     def seen_from(self, name: str, frame: int) -> Gaussians:
         """Return a sequence's Gaussians in the frame of one of its cameras, on the CPU."""
-        if not self._path(name).is_file():
-            self._make(name)
         cameras = self.stores[name].source.read(name).cameras
         to_frame = cameras[frame].relative_to(cameras[0]).world_to_camera
-        return Gaussians(**load_file(self._path(name))).transform(to_frame.float())
+        return self._fitted(name).transform(to_frame.float())
 
-    def _make(self, name: str) -> None:
-        """Fit a sequence in the frame of its first camera, and write its file."""
-        store = self.stores[name]
-        sequence = store.source.read(name)
-        gaussians = self.fit(stack([store.scene(sequence, 0, range(1, len(sequence.frames)))]))[0]
-        with atomic_path(self._path(name)) as temporary:
-            save_file({key: value.cpu().contiguous() for key, value in vars(gaussians).items()}, temporary)
+    def _fitted(self, name: str) -> Gaussians:
+        """Return a sequence's Gaussians in the frame of its first camera; fit them if there is no file of them."""
+        if not (path := self._path(name)).is_file():
+            store = self.stores[name]
+            sequence = store.source.read(name)
+            gaussians = self.fit(stack([store.scene(sequence, 0, range(1, len(sequence.frames)))]))[0]
+            with atomic_path(path) as temporary:
+                save_file({key: value.cpu().contiguous() for key, value in vars(gaussians).items()}, temporary)
+        return Gaussians(**load_file(path))
 
     def _path(self, name: str) -> Path:
         """Return the file of a sequence; it is named by a hash because sequence names may have slashes."""

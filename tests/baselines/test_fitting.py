@@ -7,7 +7,7 @@ from completesplat.baselines.fitting import FittingSettings, fit_gaussians, init
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 from completesplat.losses import WeightedSum
-from completesplat.losses.mse import MeanSquaredError
+from completesplat.losses.terms import MeanSquaredError
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import Views
@@ -23,7 +23,8 @@ def render(gaussians: Gaussians, cameras: Cameras) -> torch.Tensor:
 
 
 def fit(views: Views, seed: int, settings: FittingSettings = FEW) -> Gaussians:
-    return fit_gaussians(views, DEPTH_RANGE, render, MSE, settings, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    return fit_gaussians(views, DEPTH_RANGE, ReferenceRasterizer(), 0.5, MSE, settings, generator)
 
 
 @pytest.fixture(scope="module")

@@ -1,14 +1,8 @@
 """`completesplat report`: what its studies of samples write, say and refuse, on a model without skill."""
 
-from types import SimpleNamespace
-
 import imageio.v3 as imageio
 import pytest
 from support import refused, strict_json
-
-from completesplat.studies import samplers as samplers_study
-from completesplat.studies.samplers import SamplerRow
-from completesplat.studies.samples import SampleRenderer
 
 
 @pytest.fixture
@@ -24,39 +18,6 @@ def report(command, pipeline, tmp_path):
 
 def weights_of(rows):
     return [(row["skip_weight"], row["guidance_weight"], row["paper"]) for row in rows]
-
-
-def test_samplers_are_measured_from_the_same_noise(report, tmp_path):
-    message, results = report("samplers", "steps={ddim: [2], dpm: [4], unipc: [3]}")
-    rows = results["rows"]
-    steps = [(row["sampler"], row["steps"], row["calls"]) for row in rows]
-    assert steps == [("ddim", 50, 50), ("ddim", 2, 2), ("dpm", 4, 4), ("unipc", 3, 3)]
-    assert results["fewest"] in rows
-    assert rows[0]["agreement"] == 100  # the limit: with itself
-    assert all(10 < row["agreement"] < 100 for row in rows[1:])
-    assert imageio.imread(tmp_path / "out/samplers.png").ndim == 3
-    assert f"steps: {results['fewest']['calls']} (" in message
-    assert message.splitlines()[-1] == str(tmp_path / "out")
-
-
-def test_flow_matching_is_measured_with_its_own_samplers(monkeypatch):
-    scored = lambda renderer, scenes, name, count, *_: SamplerRow(name, count, *[0] * 6)  # noqa: E731
-    monkeypatch.setattr(samplers_study, "_row", scored)
-
-    def configured(name: str) -> dict:
-        return {"scheduler": {"_target_": f"diffusers.{name}"}, "name": name}
-
-    names = {"ddim": "DDIMScheduler", "flow": "FlowMatchEulerDiscreteScheduler"}
-    samplers = {key: configured(name) for key, name in names.items()}
-    chosen = []
-
-    renderer = object.__new__(SampleRenderer)  # whose model is not asked for a sample here
-    model = SimpleNamespace(architecture={"sampler": samplers["flow"]}, replace_sampler=chosen.append)
-    object.__setattr__(renderer, "model", model)
-    steps = {"ddim": [2], "flow": [50, 5]}
-    rows = samplers_study.rows(renderer, samplers, steps, [], {}, print)
-    assert [(row.sampler, row.steps) for row in rows] == [("flow", 50), ("flow", 5)]
-    assert chosen == [samplers["flow"]] * 2
 
 
 def test_controls_hold_the_papers_settings(report, tmp_path):
@@ -82,10 +43,9 @@ def test_depth_is_measured_with_the_papers_settings_and_one_is_drawn(report, tmp
 @pytest.mark.parametrize(
     ("task", "setting", "message"),
     [
-        ("samplers", "samples=1", "samples=1: must be at least 2"),
-        ("samplers", "+steps.nonsense=[5]", "steps.nonsense: no such sampler"),
+        ("controls", "samples=1", "samples=1: must be at least 2"),
         ("controls", "guidance_weights=0.5", "guidance_weights=0.5: must be a list, such as guidance_weights=[0.5]"),
-        ("samplers", "seed=0", "nowhere.ckpt: no such checkpoint"),
+        ("controls", "seed=0", "nowhere.ckpt: no such checkpoint"),
     ],
 )
 def test_impossible_settings_are_refused_before_the_model_is_opened(task, setting, message):
@@ -95,8 +55,7 @@ def test_impossible_settings_are_refused_before_the_model_is_opened(task, settin
 def test_settings_that_the_model_or_its_data_cannot_follow_are_refused(pipeline):
     for run, setting, message in (
         (pipeline.diffusion, "scenes=9", "there are 1 test scenes, not scenes=9"),
-        (pipeline.diffusion, "steps.ddim=[30]", "steps=30: DDIM's must divide 1000"),
         (pipeline.var, "samples=2", "a diffusion model is needed"),
     ):
-        given = ["report_task=samplers", f"ckpt={run / 'checkpoints/last.ckpt'}", "scenes=1", "samples=2"]
+        given = ["report_task=controls", f"ckpt={run / 'checkpoints/last.ckpt'}", "scenes=1", "samples=2"]
         assert message in refused("report", *given, setting)

@@ -24,9 +24,8 @@ from realestate10k_trees import (
 )
 
 from completesplat.data.images.crop import Square
-from completesplat.data.realestate10k import chunks
-from completesplat.data.realestate10k.chunks import ChunkedClips, read_chunk
-from completesplat.data.realestate10k.clips import TextClips
+from completesplat.data.realestate10k import clips
+from completesplat.data.realestate10k.clips import ChunkedClips, TextClips, read_chunk
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.validation import (
     BadAnnotation,
@@ -257,7 +256,7 @@ def test_entries_of_an_index_that_lead_elsewhere_are_refused(tmp_path, caplog):
 def loads(monkeypatch):
     """Names of the chunks in the order they are read, and the largest number of them alive at once."""
     names, alive, counts = [], [], []
-    original = chunks.read_chunk
+    original = clips.read_chunk
 
     def watched(path: Path):
         chunk = original(path)
@@ -266,7 +265,7 @@ def loads(monkeypatch):
         names.append(path.name)
         return chunk
 
-    monkeypatch.setattr(chunks, "read_chunk", watched)
+    monkeypatch.setattr(clips, "read_chunk", watched)
     return names, counts
 
 

@@ -13,10 +13,13 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
 from completesplat.losses import Prediction, WeightedSum
-from completesplat.losses.kl import KullbackLeibler
-from completesplat.losses.mse import MeanSquaredError
-from completesplat.losses.regularizers import MeanOpacity, MeanScale
-from completesplat.losses.ssim import StructuralDissimilarity
+from completesplat.losses.terms import (
+    KullbackLeibler,
+    MeanOpacity,
+    MeanScale,
+    MeanSquaredError,
+    StructuralDissimilarity,
+)
 from completesplat.scene import Views
 
 SHAPE = (2, 3, 3, 24, 24)

@@ -11,7 +11,7 @@ from completesplat.errors import CompleteSplatError, DataError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.losses import WeightedSum
-from completesplat.losses.mse import MeanSquaredError
+from completesplat.losses.terms import MeanSquaredError
 from completesplat.rasterizers import Rendering
 from completesplat.scene import SceneBatch, Views
 from completesplat.studies.mode_benchmark import measure, predictors, usable

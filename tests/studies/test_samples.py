@@ -6,13 +6,10 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
-from support import tiny_generator
 
-from completesplat.data.images.photograph import Photograph
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.metrics.images import PSNR_LIMIT, psnr
 from completesplat.studies.controls import PAPER, grid, plot_controls
-from completesplat.studies.samplers import SamplerRow, denoiser_calls, fewest, plot_samplers
 from completesplat.studies.samples import near, object_psnr
 
 
@@ -56,34 +53,3 @@ def test_the_papers_settings_are_always_in_the_grid_and_marked(tmp_path):
     for paper in (True, False):
         plot_controls([row | {"paper": paper, "near_object_psnr": None}], tmp_path / "controls.png", "title")
         assert shows(read(tmp_path / "controls.png"), (220, 20, 60)) == paper
-
-
-def test_each_sampler_has_its_line(tmp_path):
-    measures = {"psnr": 20.0, "ssim": 0.5, "diversity": 0.1, "agreement": 30.0, "ms": 9.0}
-    rows = [SamplerRow("ddim", n, n, **measures) for n in (50, 10)]
-    plot_samplers([*rows, SamplerRow("dpm", 5, 5, **measures)], tmp_path / "samplers.png", "title")
-    image = read(tmp_path / "samplers.png")
-    assert [shows(image, color) for color in ((31, 119, 180), (255, 127, 14), (44, 160, 44))] == [True, True, False]
-
-
-def row(calls: int, psnr: float, agreement: float = 30.0) -> SamplerRow:
-    return SamplerRow("ddim", calls, calls, psnr, 0.5, 0.1, agreement, 9.0)
-
-
-def test_the_fewest_calls_within_a_tenth_of_a_decibel_are_named():
-    reference = row(50, 20.0, 100.0)
-    rows = [reference, row(5, 20.2), row(8, 19.85), row(10, 20.05), row(10, 20.0, 40.0), row(20, 20.0)]
-    assert fewest(rows) is rows[4]
-    assert fewest([reference, row(5, 19.0)]) is reference
-
-
-def test_calls_are_those_of_the_denoiser():
-    model = tiny_generator()
-    photograph = Photograph(torch.rand(3, 32, 32), 50.0, "given")
-    given = (photograph.image[None], model.camera(photograph)[None], model.depth_range[None])
-    for steps in (1, 5):
-        with denoiser_calls(model) as calls:
-            model.generate(*given, samples=2, steps=steps, guidance_weight=0.5)
-        assert len(calls) == steps
-    model.generate(*given)
-    assert len(calls) == 5

@@ -12,9 +12,8 @@ from lightning.pytorch.loggers.logger import Logger
 from scenes_for_training import scene_batch
 from torch.utils.data import DataLoader
 
-from completesplat.training import throughput
-from completesplat.training.callbacks import Progress, StepSeeds, step_seed
-from completesplat.training.throughput import Throughput, memory
+from completesplat.training import callbacks
+from completesplat.training.callbacks import Progress, StepSeeds, Throughput, memory, step_seed
 
 QUIET = dict.fromkeys(("enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
 QUIET["accelerator"] = "cpu"
@@ -36,8 +35,8 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch) -> Clock:
     made = Clock()
-    monkeypatch.setattr(throughput, "now", made)
-    monkeypatch.setattr(throughput, "time", SimpleNamespace(perf_counter=made))
+    monkeypatch.setattr(callbacks, "now", made)
+    monkeypatch.setattr(callbacks, "time", SimpleNamespace(perf_counter=made))
     return made
 
 

@@ -1,4 +1,9 @@
-"""Clips of RealEstate10K in any form, and clips stored as text files beside folders of frames."""
+"""Clips of RealEstate10K, as text files beside folders of frames or in pixelSplat's chunks.
+
+Chunks are `<split>/NNNNNN.torch`, with each clip's file in `<split>/index.json`. A chunk is a list of clips as
+dictionaries with key, url, timestamps int64 [view], cameras float32 [view 18] and images, a list of JPEG files as uint8
+tensors (`real_estate_10k_tools`, `src/convert.py`). Reading a chunk runs no code from it.
+"""
 
 import hashlib
 import json
@@ -6,7 +11,9 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
+from typing import TypeGuard
 
 import torch
 from jaxtyping import Float, UInt8
@@ -20,16 +27,25 @@ from completesplat.data.validation import (
     BadCamera,
     MissingFile,
     TooFewFrames,
+    UnreadableFile,
     at,
+    inside,
+    read_json,
     read_text,
+    refused_to,
+    require_file,
 )
-from completesplat.errors import DataError
+from completesplat.errors import DataError, TensorFileError
 from completesplat.geometry.cameras import Cameras
+from completesplat.weights.checkpoint_reading import read_tensor_file
 
 CAMERA_NUMBERS = 18
 FORMATS = ("JPEG", "PNG")
 SUFFIXES = (".png", ".jpg")
 MOST_BYTES = 2**26  # a frame needs about 300
+CHUNKS_IN_MEMORY = 2
+
+Chunk = dict[str, dict[str, object]]
 
 
 @dataclass(frozen=True)
@@ -61,27 +77,18 @@ def make_clip(
     rows: Float[Tensor, "view 18"],
     images: Sequence[Path] | Sequence[UInt8[Tensor, " _"]],
 ) -> Clip:
-    """Return the clip of stored rows and images; the first image determines the size. Errors as in `clip_cameras`."""
-    with at(frame=0):
-        size = stored_size(*_stored(images[0], source), FORMATS) if images else (1, 1)
-    return Clip(key, source, clip_cameras(rows, timestamps, size), images)
-
-
-def _stored(image: Path | Tensor, source: Path) -> tuple[Path | bytes, str]:
-    """Return an image's file or content, and the file to name in errors."""
-    return (image, str(image)) if isinstance(image, Path) else (image.numpy().tobytes(), str(source))
-
-
-def clip_cameras(rows: Float[Tensor, "view 18"], timestamps: Sequence[int], image_size: tuple[int, int]) -> Cameras:
-    """Convert stored rows to cameras [view] (float64) for images of (height, width).
+    """Convert stored rows and images to a clip; the first image determines the size.
 
     Raises:
         TooFewFrames: there are fewer than two frames.
         BadAnnotation: timestamps repeat, or numbers are not finite.
         BadCamera: a focal length is not positive, the lens has distortion, or a pose is not rigid.
+        BadImage: the first image is unusable.
     """
     if len(rows) < 2:
         raise TooFewFrames(f"{len(rows)} frames, at least two are needed")
+    with at(frame=0):
+        size = stored_size(*_stored(images[0], source), FORMATS)
     rows, count = rows.double(), Counter(timestamps)
     world_to_camera = rows[:, 6:].reshape(-1, 3, 4)
     rotation = world_to_camera[:, :, :3]
@@ -97,10 +104,15 @@ def clip_cameras(rows: Float[Tensor, "view 18"], timestamps: Sequence[int], imag
         if bad.any():
             raise kind(reason, frame=int(bad.nonzero()[0]))
     intrinsics, pose = (torch.eye(n, dtype=rows.dtype).repeat(len(rows), 1, 1) for n in (3, 4))
-    sides = rows.new_tensor(image_size[::-1])
+    sides = rows.new_tensor(size[::-1])
     intrinsics[:, [0, 1], [0, 1]], intrinsics[:, :2, 2] = rows[:, :2] * sides, rows[:, 2:4] * sides
     pose[:, :3] = world_to_camera
-    return Cameras(pose, intrinsics, image_size)
+    return Clip(key, source, Cameras(pose, intrinsics, size), images)
+
+
+def _stored(image: Path | Tensor, source: Path) -> tuple[Path | bytes, str]:
+    """Return an image's file or content, and the file to name in errors."""
+    return (image, str(image)) if isinstance(image, Path) else (image.numpy().tobytes(), str(source))
 
 
 class TextClips:
@@ -168,3 +180,105 @@ def _images_of(folder: Path) -> dict[int, Path]:
         paths = [Path(entry.path) for entry in entries]
     ordered = sorted((path for path in paths if path.suffix in SUFFIXES), key=lambda path: SUFFIXES.index(path.suffix))
     return {int(path.stem): path for path in ordered if path.stem.isdecimal()}
+
+
+class ChunkedClips:
+    """Clips of one folder whose chunks exist; at most two chunks (about 100 MB each) are in memory.
+
+    Attributes:
+        keys: names of the clips, in the order of their files.
+        missing: names of the clips whose chunk is missing.
+        refused: errors of index entries that lead outside of the folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        path = folder / "index.json"
+        index = read_json(path)
+        if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
+            raise BadAnnotation("not a table of keys and files", str(path))
+        self.refused: list[DataError] = []
+        paths: dict[str, Path] = {}
+        for key, name in index.items():
+            with refused_to(self.refused.append), at(path, key):
+                paths[key] = inside(folder, name)
+        # `Path.is_file` raises if a name is too long.
+        existing = {path for path in set(paths.values()) if isfile(path)}
+        self.folder = folder
+        self._files = {key: path for key, path in paths.items() if path in existing}
+        self.keys = sorted(self._files, key=lambda key: (self._files[key], key))
+        self.missing = sorted(paths.keys() - self._files.keys())
+        self._loaded: dict[Path, Chunk] = {}
+
+    def chunks(self, keys: Sequence[str]) -> list[list[int]]:
+        """Group the indices of `keys` by chunk."""
+        members: dict[Path, list[int]] = {}
+        for number, key in enumerate(keys):
+            members.setdefault(self._files[key], []).append(number)
+        return list(members.values())
+
+    def clip(self, key: str) -> Clip:
+        """Return a clip from its chunk, which is read unless it is in memory; refuse an unreadable chunk or clip."""
+        path = self._files[key]
+        with at(path, key):
+            chunk = self._chunk(path)
+            if key not in chunk:
+                raise BadAnnotation("the chunk does not hold this clip, which index.json says it does")
+            return _clip_from_entry(path, key, chunk[key])
+
+    def fingerprint(self) -> str:
+        """Return the SHA-256 of the index and of the chunks' sizes."""
+        sizes = sorted((path.name, path.stat().st_size) for path in set(self._files.values()))
+        index = {key: path.name for key, path in sorted(self._files.items())}
+        return hashlib.sha256(json.dumps([index, sizes]).encode()).hexdigest()
+
+    def _chunk(self, path: Path) -> Chunk:
+        if path not in self._loaded and len(self._loaded) >= CHUNKS_IN_MEMORY:
+            # Delete the least recently used chunk before reading the next one, so that there are never three.
+            del self._loaded[next(iter(self._loaded))]
+        self._loaded[path] = self._loaded.pop(path) if path in self._loaded else read_chunk(path)
+        return self._loaded[path]
+
+
+def read_chunk(path: Path) -> Chunk:
+    """Read the clips of a chunk by key, as they are stored.
+
+    Raises:
+        MissingFile: the file does not exist.
+        UnreadableFile: the file is no chunk, is damaged, would run code, or unpacks to more than its own size.
+        BadAnnotation: the content is not a list of clips, or clips have the same key.
+    """
+    require_file(path)
+    try:
+        content = read_tensor_file(path)
+    except TensorFileError as error:
+        raise UnreadableFile(f"not a chunk that can be read safely ({error})", str(path)) from None
+    if not isinstance(content, list) or not all(isinstance(e, dict) and isinstance(e.get("key"), str) for e in content):
+        raise BadAnnotation("not a list of clips with keys", str(path))
+    chunk = {entry["key"]: entry for entry in content}
+    if len(chunk) < len(content):
+        raise BadAnnotation("several clips with the same key", str(path))
+    return chunk
+
+
+def _clip_from_entry(path: Path, key: str, entry: dict[str, object]) -> Clip:
+    images, times, rows = entry.get("images"), entry.get("timestamps"), entry.get("cameras")
+    if not isinstance(images, list) or not all(_is_bytes(image) for image in images):
+        raise BadAnnotation("images are not a list of JPEG files (uint8)")
+    if not _is_plain(rows) or not rows.is_floating_point() or rows.shape[1:] != (CAMERA_NUMBERS,):
+        raise BadAnnotation(f"cameras are not {CAMERA_NUMBERS} columns of floats")
+    if not _is_plain(times) or times.dtype != torch.int64 or times.ndim != 1:
+        raise BadAnnotation("timestamps are not int64")
+    if not len(images) == len(rows) == len(times):
+        raise BadAnnotation(f"{len(images)} images, {len(rows)} cameras and {len(times)} timestamps")
+    return make_clip(key, path, times.tolist(), rows, images)
+
+
+def _is_bytes(image: object) -> TypeGuard[Tensor]:
+    return _is_plain(image) and image.dtype == torch.uint8 and image.ndim == 1 and image.is_contiguous()
+
+
+def _is_plain(value: object) -> TypeGuard[Tensor]:
+    """Return whether a value is a dense CPU tensor that is not part of an autograd graph."""
+    if not isinstance(value, Tensor) or value.layout != torch.strided:
+        return False
+    return value.device.type == "cpu" and not value.requires_grad

@@ -14,8 +14,7 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import Choice, EvaluationScenes
 from completesplat.data.loading.view_selection import GrowingGap, evaluation_views_within, nearby_views
 from completesplat.data.packed.manifest import Scalar
-from completesplat.data.realestate10k.chunks import ChunkedClips
-from completesplat.data.realestate10k.clips import Clip, TextClips
+from completesplat.data.realestate10k.clips import ChunkedClips, Clip, TextClips
 from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource, split_by_hash
 from completesplat.data.validation import BadAnnotation, at, require_file
@@ -97,8 +96,8 @@ def _read(clip: Clip, squares: list[Square], size: int, index: int) -> MaskedIma
 class RE10KDataModule(SceneDataModule):
     """Scenes of room tours.
 
-    `root` is prepared, or has folders `train` and `test` with text files and frames as published (`realestate10k_text`)
-    or with pixelSplat's chunks (`realestate10k_chunks`). Training draws a random reference and random targets near it.
+    `root` is prepared, or has folders `train` and `test` with text files and frames as published or with
+    pixelSplat's chunks. Training draws a random reference and random targets near it.
     Clips are checked when they are read. Each loading process has at most two chunks in memory.
 
     Args:

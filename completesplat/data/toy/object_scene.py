@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from completesplat.data.placement import OBJECT_HALF_SIZE
 from completesplat.data.toy.raytracing import Dome, Light, Patch, trace
 from completesplat.data.toy.shapes import (
     CHECKS,
@@ -141,7 +142,6 @@ def hydrant(rng: np.random.Generator) -> Blueprint:
 FAMILIES = (hydrant, bear)
 
 
-OBJECT_HALF_SIZE = 0.57
 DOME_RADIUS = 3.5
 SURFACE_DIRECTIONS, SURFACE_RAYS = 60, 130
 PATCH_COLORS = {

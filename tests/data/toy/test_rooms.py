@@ -18,10 +18,6 @@ def rooms(tmp_path_factory) -> Path:
     return write_rooms(root, scenes=3, frames=FRAMES, size=18, seed=0, workers=1, progress=False)
 
 
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
 def read_text(path: Path) -> tuple[str, list[int], np.ndarray]:
     url, *lines = path.read_text().splitlines()
     columns = [line.split() for line in lines]
@@ -36,7 +32,7 @@ def test_the_folder_says_what_was_made_and_something_else_is_left_alone(rooms, t
     settings = {"scenes": 2, "frames": 2, "size": 8, "seed": 0, "workers": 1, "progress": False}
     with pytest.raises(DataError, match="choose another folder"):
         write_rooms(tmp_path, **settings)
-    assert files_of(tmp_path) == {"toy_rooms/mine.txt": b"mine"}
+    assert [path.name for path in (tmp_path / "toy_rooms").iterdir()] == ["mine.txt"]
     for name, small in (("scenes", 1), ("frames", 1), ("size", 7)):
         with pytest.raises(DataError, match=name):
             write_rooms(tmp_path / "small", **{**settings, name: small})

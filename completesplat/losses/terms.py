@@ -1,0 +1,58 @@
+"""Loss terms of the reconstruction stage (paper, Eq. 1) without weights of their own, and two regularisers.
+
+The regularisers are off by default (weight 0) and not in the paper.
+"""
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from completesplat.losses.weighted_sum import Prediction
+from completesplat.scene import Views
+
+
+class MeanSquaredError:
+    """Mean over all pixels, channels and views (paper, Eq. 1, first term)."""
+
+    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        return nn.functional.mse_loss(prediction.images, truth.images)
+
+
+class StructuralDissimilarity:
+    """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term, which may also mean half of it).
+
+    The Gaussian window has 11 pixels a side (Wang et al. 2004, as in Splatter Image's metric).
+    """
+
+    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        from kornia.metrics import ssim  # imports for more than a second
+
+        similarity = ssim(prediction.images.flatten(0, 1), truth.images.flatten(0, 1), window_size=11)
+        return 1 - similarity.mean()
+
+
+class KullbackLeibler:
+    """KL of the latent posterior to the standard normal, in nats per value of an image, averaged over the batch.
+
+    Stable Diffusion adds 1e-6 times the KL of a latent to the *sum* of the errors over the 3 * H * W values of its
+    image (CompVis `ldm/modules/losses/contperceptual.py`). The other terms here are means over values, so the KL is
+    divided by 3 * H * W too: its weight means the same as Stable Diffusion's at every image size. The KL is 0 for a
+    model without a posterior.
+    """
+
+    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        posterior, values = prediction.posterior, prediction.images[0, 0].numel()
+        return posterior.kl().mean() / values if posterior is not None else prediction.images.new_zeros(())
+
+
+class MeanScale:
+    """Mean of the Gaussians' scales, in scene units (Kheradmand et al. 2024, "3DGS as Markov Chain Monte Carlo")."""
+
+    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        return prediction.gaussians.scales.mean()
+
+
+class MeanOpacity:
+    """Mean of the Gaussians' opacities (Kheradmand et al. 2024)."""
+
+    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        return prediction.gaussians.opacities.mean()
