@@ -22,8 +22,8 @@ $(READY): pyproject.toml $(if $(LOCKED),requirements.lock)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
 	@touch $(READY)
 
-# The scenes have another seed than those of the weights' training. The held-out picture is the first frame of the last one.
-demo: $(READY) ## Complete two pictures with the weights in the package, and score them (CPU, minutes)
+# The scenes have another seed than those of the weights' training. The held-out image is the first frame of the last one.
+demo: $(READY) ## Complete two images with the weights in the package, and score them (CPU, minutes)
 	rm -rf $(DEMO)
 	$(BIN)/completesplat data toy kind=objects scenes=$(DEMO_SCENES) seed=1000 out=$(DEMO)/data
 	cp $(DEMO)/data/toy_objects/*$(DEMO_LAST)_*/images/frame000001.jpg $(DEMO)/held_out.jpg
@@ -38,7 +38,7 @@ demo: $(READY) ## Complete two pictures with the weights in the package, and sco
 	@echo "  test/         metrics.json: scores of one sample for each held-out scene, beside two naive predictors"
 	@echo "Next: $(BIN)/completesplat predict image=FILE, and make demo-train for both stages of training"
 
-demo-train: $(READY) ## Make toy scenes, train both stages briefly, evaluate, complete a picture (CPU, under 15 minutes)
+demo-train: $(READY) ## Make toy scenes, train both stages briefly, evaluate, complete an image (CPU, under 15 minutes)
 	rm -rf $(TRAINED)
 	$(BIN)/completesplat data toy kind=objects scenes=240 out=$(TRAINED)/data
 	$(BIN)/completesplat fit experiment=toy_var data.root=$(TRAINED)/data trainer.max_steps=2200 data.color_jitter=null test=false out=$(TRAINED)/var

@@ -42,7 +42,7 @@ def atomic_path(path: str | Path, name: str | None = None, size: int = 0) -> Ite
     path = Path(path)
     temporary = path.with_name(name or f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
     try:
-        with _asking_the_disk(path, temporary, size):
+        with writing(path, size, temporary):
             temporary.unlink(missing_ok=True)
             yield temporary
             with temporary.open("rb+") as file:
@@ -65,7 +65,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     unfinished = folder.with_name(f".{folder.name}.unfinished")
     shutil.rmtree(unfinished, ignore_errors=True)
     try:
-        with _asking_the_disk(folder, unfinished):
+        with writing(folder, temporary=unfinished):
             unfinished.mkdir()
             yield unfinished
             unfinished.rename(folder)
@@ -74,12 +74,19 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def writing(path: Path, size: int = 0) -> Iterator[None]:
-    """Raise DiskError if the operating system refuses what the block writes to `path`, `size` bytes at least."""
+def writing(path: Path, size: int = 0, temporary: Path | None = None) -> Iterator[None]:
+    """Raise DiskError if the operating system refuses what the block writes to `path`, `size` bytes at least.
+
+    If `temporary` is given, a file or folder that is to become `path`, a test write to it finds the reason of an
+    exception that names none.
+    """
     try:
         yield
-    except OSError as error:
-        if (refusal := _disk_error(error, path, size)) is None:
+    except CompleteSplatError:
+        raise
+    except Exception as error:
+        cause = error if isinstance(error, OSError) and error.errno is not None else _asked(temporary)
+        if cause is None or (refusal := _disk_error(cause, path, size, temporary)) is None:
             raise
         raise refusal from error
 
@@ -118,22 +125,10 @@ def file_refusal(error: BaseException) -> CompleteSplatError | None:
     return _disk_error(error, Path(name)) if error.errno in {*NO_SPACE, errno.EROFS} else None
 
 
-@contextmanager
-def _asking_the_disk(path: Path, temporary: Path, size: int = 0) -> Iterator[None]:
-    """Raise DiskError if `temporary`, a file or folder that is to become `path`, cannot be written."""
-    try:
-        yield
-    except CompleteSplatError:
-        raise
-    except Exception as error:
-        cause = error if isinstance(error, OSError) and error.errno is not None else _asked(temporary)
-        if cause is None or (refusal := _disk_error(cause, path, size, temporary)) is None:
-            raise
-        raise refusal from error
-
-
-def _asked(path: Path) -> OSError | None:
+def _asked(path: Path | None) -> OSError | None:
     """Write more to a file or folder, which is no longer needed, and return the operating system's error, if any."""
+    if path is None:
+        return None
     try:
         with (path / "more" if path.is_dir() else path).open("ab") as file:
             file.write(bytes(PROBE_BYTES))

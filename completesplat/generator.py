@@ -21,7 +21,7 @@ from completesplat.diffusion.sampling import Sampler, draw_noise, in_parts, with
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.opening import SavedModel, locate, read_saved
+from completesplat.opening import locate, read_saved
 from completesplat.opening.parts import PartConfig, build, check_architecture, untrained
 from completesplat.scene import Views
 from completesplat.scene_model import SceneModel, camera_tensors
@@ -78,11 +78,6 @@ class CompleteSplat(SceneModel):
     def reconstruction_model(self) -> VariationalAutoReconstructor:
         """Return the autoreconstructor."""
         return self.autoreconstructor
-
-    @property
-    def default_steps(self) -> int:
-        """Return the sampler's number of denoising steps."""
-        return self.sampler.steps
 
     def train(self, mode: bool = True) -> "CompleteSplat":
         """Switch the trainable parts; the autoreconstructor stays frozen in evaluation mode."""
@@ -202,7 +197,7 @@ class CompleteSplat(SceneModel):
         """
         try:
             file = locate(path)
-            model = PublishedOneAnswer(str(file)) if is_published(file) else _load(read_saved(file))
+            model = PublishedOneAnswer(str(file)) if is_published(file) else _loaded(*read_saved(file))
             name = not_finite(model.state_dict())
         except WeightsError:
             raise
@@ -251,7 +246,7 @@ def _checked(architecture: dict[str, Any], training: Mapping[str, object] | None
     return complete
 
 
-def _load(saved: SavedModel) -> SceneModel:
-    model = (OneAnswer if "network" in saved.architecture else CompleteSplat)(**saved.architecture)
-    model.load_state_dict(saved.tensors)
+def _loaded(architecture: dict[str, Any], tensors: Mapping[str, Tensor]) -> SceneModel:
+    model = (OneAnswer if "network" in architecture else CompleteSplat)(**architecture)
+    model.load_state_dict(tensors)
     return model

@@ -57,11 +57,6 @@ class SceneModel(nn.Module):
         """Return the network that makes a Splatter Image without sampling."""
         return self.network
 
-    @property
-    def default_steps(self) -> int:
-        """Return the number of denoising steps of a drawing without `steps`; 1 if it draws no samples."""
-        return 1
-
     @torch.no_grad()
     def generate(
         self,

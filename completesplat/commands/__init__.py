@@ -52,6 +52,8 @@ def launch(verb: str, arguments: list[str]) -> None:
     logging.raiseExceptions = False
     arguments = for_hydra(verb, arguments)
     sweep = any(flag in arguments for flag in SWEEP)
+    if sweep and any(argument.startswith(("--cfg=", "-c=", "--info=", "-i=")) for argument in arguments):
+        raise CompleteSplatError("--cfg and --info show the settings of one run: leave out -m")
     if jobs.one_of_several() and sweep:
         message = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
         raise CompleteSplatError(message)

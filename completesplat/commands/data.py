@@ -46,7 +46,7 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
     show_statistics(results)
 
 
-def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], pictures: Positive, out: Path) -> None:
+def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path) -> None:
     """Write `show.png`: images and cameras of some sequences, evenly spread over a split."""
     from completesplat.studies.contact_sheet import show as draw
 
@@ -56,7 +56,7 @@ def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], pictures:
     sequences = list(_readable(source, chosen))
     if not sequences:
         raise DataError(f"no {split} sequences that can be used", str(data.root))
-    draw(sequences, out / "show.png", pictures, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences")
+    draw(sequences, out / "show.png", images, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences")
 
 
 def prepare(

@@ -14,7 +14,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.files import printable
 from completesplat.settings.checks import REMOVE, check_parts
 from completesplat.signals import Interrupted
-from completesplat.weights import CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE
+from completesplat.weights import CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, check_name
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 KINDS = {".ply": "scene", ".ckpt": "weights", ".pth": "weights"}
@@ -36,6 +36,8 @@ def run(config: DictConfig, out: Path) -> None:
     from completesplat.viewer.access import start_server, stop_server
 
     config.update(settings_of(Path(config.path)) if config.path is not None else {})
+    if config.scene is None and config.watch is None and ":" not in config.weights:  # a colon: `splatter_image:NAME`
+        check_name(config.weights)
     background = 0.5 if config.background == REMOVE else config.background
     server = start_server(0 if config.export is not None else config.port, background)
     page = None
@@ -124,8 +126,7 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
         page.show(samples, "" if config.watch is None else step_of(samples))
         return page
     page = Page(server, splats, saver, model.parameterization.layers)
-    steps = model.default_steps if config.steps is None else config.steps
-    start = {name: config[name] for name in SLIDERS} | {"steps": steps, "remove_background": remove}
+    start = {name: config[name] for name in SLIDERS} | {"remove_background": remove}
     completion = Completion(page, model, start)
     if photograph is not None:
         completion.load(printable(Path(config.image).name), photograph)

@@ -66,29 +66,26 @@ def write_formats(
     Raises:
         CompleteSplatError: there is nothing to write, or the converter (for `CONVERTED` formats) is missing or fails.
     """
-    if converter is None and set(formats) & set(CONVERTED):
-        raise CompleteSplatError(f"a converter is needed for {', '.join(set(formats) & set(CONVERTED))}")
-    if "ply" in formats:
-        write_ply(folder / f"{name}.ply", gaussians, comments)
-    gaussians = replace(gaussians, colors=gaussians.colors.clamp(0, 1))
-    with tempfile.TemporaryDirectory() as temporary:
-        source = Path(temporary) / f"{name}.ply"
-        write_ply(source, gaussians, comments)
-        for kind in formats:
-            target = folder / f"{name}.{kind}"
-            if kind == "splat":
-                write_splat(target, gaussians)
-            elif kind == "glb":
-                write_glb(target, gaussians, comments)
-            elif kind == "html" and converter is not None:
-                write_page(target, gaussians, view, converter)
-            elif kind == "spz" and converter is not None:
-                visible, seen = Path(temporary) / "visible.ply", gaussians.keep(~transparent(gaussians))
-                if not seen.count:
-                    raise CompleteSplatError(f"{target}: all {gaussians.count} Gaussians are transparent")
-                write_ply(visible, seen, comments)
-                converter.convert(visible, target)
-            elif kind in CONVERTED and converter is not None:
+    clipped = replace(gaussians, colors=gaussians.colors.clamp(0, 1))
+    for kind in formats:
+        target = folder / f"{name}.{kind}"
+        if kind == "ply":
+            write_ply(target, gaussians, comments)
+        elif kind == "splat":
+            write_splat(target, clipped)
+        elif kind == "glb":
+            write_glb(target, clipped, comments)
+        elif converter is None:
+            raise CompleteSplatError(f"a converter is needed for {kind}")
+        elif kind == "html":
+            write_page(target, clipped, view, converter)
+        else:
+            stored = clipped.keep(~transparent(clipped)) if kind == "spz" else clipped
+            if not stored.count:
+                raise CompleteSplatError(f"{target}: all {clipped.count} Gaussians are transparent")
+            with tempfile.TemporaryDirectory() as temporary:
+                source = Path(temporary) / f"{name}.ply"
+                write_ply(source, stored, comments)
                 converter.convert(source, target)
     return {name if kind == "ply" else f"{name}_{kind}": f"{name}.{kind}" for kind in formats}
 

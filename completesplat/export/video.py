@@ -25,13 +25,9 @@ def orbit_views(
     pivot: Float[Tensor, "3"],
     frames: int,
     background: float,
-    up: Float[Tensor, "3"] | None = None,
+    up: Float[Tensor, "3"],
 ) -> tuple[Frames, Float[Tensor, "frame 1 height width"]]:
-    """Call `render_views` for a full turn about the pivot and the direction up, starting at the reference camera.
-
-    By default, up is that of the camera, because a photo does not tell the direction of gravity.
-    """
-    up = -reference.world_to_camera[1, :3] if up is None else up
+    """Call `render_views` for a full turn about the pivot and the direction up, starting at the reference camera."""
     return render_views(rasterizer, gaussians, orbit(reference, pivot, up, frames), background)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from hydra.utils import get_object
 from omegaconf import OmegaConf
@@ -22,7 +22,6 @@ from yaml import YAMLError
 
 from completesplat.baselines.splatter_image.files import find, is_published
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.files import printable
 from completesplat.opening.parts import check_architecture, check_sizes, read_architecture, untrained
 from completesplat.scene_model import camera_tensors
 from completesplat.settings.checks import check_image_size, check_optimizer, check_parts
@@ -37,6 +36,7 @@ from completesplat.weights import (
     SCENES,
     WEIGHTS_FILE,
     check_folder,
+    check_name,
     first_line,
     from_hub,
     read_small,
@@ -44,7 +44,6 @@ from completesplat.weights import (
 )
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
-HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 SECTIONS = ["model", "data"]
 """Sections of a run's config that are read."""
 ONLY_FOR_TRAINING = (
@@ -68,13 +67,6 @@ STAGES = {
 }
 
 
-class SavedModel(NamedTuple):
-    """Checked config of a model, and its tensors by name."""
-
-    architecture: dict[str, Any]
-    tensors: Mapping[str, Tensor]
-
-
 def locate(weights: Path | str) -> Path:
     """Return the file of tensors that `weights` means.
 
@@ -89,12 +81,10 @@ def locate(weights: Path | str) -> Path:
     name, path = str(weights), Path(weights).expanduser()
     if is_published(weights):
         return find(name).weights
+    check_name(name)
     if name in shipped():
         path = shipped()[name]
-    elif not os.path.exists(path):  # `Path.exists` raises if a name is too long
-        if HUB_ID.fullmatch(name) is None:
-            included = ", ".join(shipped()) or "no weights"
-            raise WeightsError(f"{printable(name)}: no such folder; with the package come {included}")
+    elif not os.path.exists(path):
         path = from_hub(name)
     elif path.is_file() and path.name != WEIGHTS_FILE:
         return path
@@ -109,8 +99,10 @@ def locate(weights: Path | str) -> Path:
     return path / WEIGHTS_FILE
 
 
-def read_saved(file: Path) -> SavedModel:
-    """Read the model of a file from `locate`, unless it is Splatter Image's; averaged weights if a run averages them.
+def read_saved(file: Path) -> tuple[dict[str, Any], Mapping[str, Tensor]]:
+    """Read a model's checked config and its tensors by name, averaged ones if a run averages its weights.
+
+    The file is one from `locate`, and not Splatter Image's.
 
     Raises:
         WeightsError: the config or the tensors cannot be read, name parts that weights may not name, or do not belong
@@ -119,14 +111,14 @@ def read_saved(file: Path) -> SavedModel:
     if file.name == WEIGHTS_FILE:
         architecture, tensors = read_architecture(file.with_name(CONFIG_FILE)), load_file(file)
         check_sizes(architecture, tensors, (WEIGHTS_FILE, CONFIG_FILE))
-        return SavedModel(architecture, tensors)
+        return architecture, tensors
     architecture, prefix = architecture_of_run(file)
     contents = read_checkpoint(file)
     one_answer = "network" in architecture
     name = "network." if one_answer else ""
     tensors = {name + k.removeprefix(prefix): x for k, x in contents["state_dict"].items() if k.startswith(prefix)}
     check_sizes(architecture, tensors, (file.name, RUN_CONFIG_FILE))
-    return SavedModel(architecture, tensors | camera_tensors(contents.get(CAMERA, {})) if one_answer else tensors)
+    return architecture, tensors | camera_tensors(contents.get(CAMERA, {})) if one_answer else tensors
 
 
 def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -> Any:

@@ -38,7 +38,8 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
     """
     draws, most_steps, first_steps = model.draws_samples, 2, 1
     if isinstance(model, CompleteSplat):
-        most_steps, first_steps = possible_steps(model.sampler)[-1], nearest_steps(model.sampler, start["steps"])
+        most_steps = possible_steps(model.sampler)[-1]
+        first_steps = nearest_steps(model.sampler, start["steps"] or model.sampler.steps)
     with gui.add_folder("Photograph", order=1):
         upload = gui.add_upload_button("Load an image", mime_type="image/*", hint="completes the scene that it shows")
         preview = gui.add_html("")

@@ -5,12 +5,14 @@ a model card too, `README.md`.
 """
 
 import hashlib
+import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlparse
 
 from completesplat.errors import WeightsError
-from completesplat.files import write_text
+from completesplat.files import printable, write_text
 
 SHIPPED = Path(__file__).parent
 CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE = "config.json", "model.safetensors", "SHA256SUMS"
@@ -19,11 +21,20 @@ RUN_WEIGHTS, RUN_CONFIG_FILE, RUN_CHECKPOINT, SCENES = "weights", "config.yaml",
 NEWEST = "images/newest"  # in a training run's folder, too: its fixed scenes as they are now, with `scenes.json`
 CAMERA = "camera"  # in stage 1's checkpoints: the typical camera of the training set
 LARGEST_TEXT = 1_000_000
+HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 
 
 def shipped() -> dict[str, Path]:
     """Return the names and folders of the weights that come with the package."""
     return {path.parent.name: path.parent for path in sorted(SHIPPED.glob(f"*/{WEIGHTS_FILE}"))}
+
+
+def check_name(name: str) -> None:
+    """Raise WeightsError for a name that is no file or folder here, no shipped weights, and no id for the hub."""
+    # `Path.exists` raises if a name is too long.
+    if name not in shipped() and not os.path.exists(Path(name).expanduser()) and HUB_ID.fullmatch(name) is None:
+        included = ", ".join(shipped()) or "no weights"
+        raise WeightsError(f"{printable(name)}: no such folder; with the package come {included}")
 
 
 def check_folder(folder: Path) -> None:

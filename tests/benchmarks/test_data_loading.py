@@ -1,9 +1,7 @@
 """`completesplat bench data`: how epochs are timed, and what it writes, prints and refuses."""
 
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from support import strict_json
@@ -12,7 +10,7 @@ from completesplat.benchmarks import data_loading
 from completesplat.benchmarks.data_loading import Epoch, rows
 
 QUICK = [
-    *("bench", "data", "repeats=1"),
+    *("bench", "data", "repeats=1", "workers=[0]", "codecs=[jpeg]"),
     *("objects.write.scenes=3", "objects.write.frames=4", "objects.write.size=24", "objects.write.workers=1"),
     *("objects.data.image_size=16", "objects.data.batch_size=2"),
     "objects.references_per_sequence={raw: 2, prepared: 4}",
@@ -44,35 +42,16 @@ def test_forms_take_turns_and_the_median_counts_without_the_first_epoch(monkeypa
     assert (slow["times_first"], fast["times_first"]) == (1.0, 4.0)
 
 
-@pytest.fixture
-def quick(command, tmp_path, monkeypatch):
-    """Run the benchmark; return its results, its output and its folder."""
+def test_everything_is_measured_written_and_printed(command, tmp_path, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # starting workers costs more than writing a few files
-
-    def run(*arguments: str) -> tuple[dict[str, Any], str, Path]:
-        finished = command(*QUICK, *arguments, f"out={tmp_path / 'out'}")
-        assert finished.status == 0, finished.err
-        assert finished.out.splitlines()[-1] == str(tmp_path / "out")
-        return strict_json(tmp_path / "out/data.json"), finished.out, tmp_path / "out"
-
-    return run
-
-
-@pytest.mark.slow
-def test_everything_is_measured_written_and_printed(quick):
-    results, printed, out = quick()
-    prepared = ["prepared bmp", "prepared png", "prepared jpeg"]
-    for form_rows, forms in [(results["rows"], ["raw", *prepared]), (results["clips"], ["text", *prepared])]:
-        assert [(row["workers"], row["form"]) for row in form_rows] == [(n, form) for n in (0, 2) for form in forms]
+    finished = command(*QUICK, f"out={tmp_path / 'out'}")
+    assert finished.status == 0, finished.err
+    results = strict_json(tmp_path / "out/data.json")
+    for form_rows, first in [(results["rows"], "raw"), (results["clips"], "text")]:
+        assert [(row["workers"], row["form"]) for row in form_rows] == [(0, first), (0, "prepared jpeg")]
         for row in form_rows:
             assert row["images_per_second"] == pytest.approx(4 * row["scenes_per_second"])
     for text in ("Training batches", "Training batches of clips", results["machine"]["processor"]):
-        assert text in printed
-    assert not list(out.glob("bench_data_*"))
-
-
-def test_parts_can_be_left_out(quick):
-    results, _, out = quick("rooms=false", "workers=[0]", "codecs=[jpeg]")
-    assert set(results) == {"machine", "rows"}
-    assert [row["form"] for row in results["rows"]] == ["raw", "prepared jpeg"]
-    assert not list(out.glob("bench_data_*"))
+        assert text in finished.out
+    assert finished.out.splitlines()[-1] == str(tmp_path / "out")
+    assert not list((tmp_path / "out").glob("bench_data_*"))

@@ -68,10 +68,3 @@ def test_failing_work_has_the_reason_in_its_row():
         raise RuntimeError("out of memory\nand a long story")
 
     assert measured(fail, 1, torch.device("cpu")) == {"not_measured": "RuntimeError: out of memory"}
-
-
-def test_a_refusal_is_one_line_and_status_two(command, tmp_path, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    finished = command("bench", "paper", "device=cuda", f"out={tmp_path / 'out'}")
-    assert finished.status == 2
-    assert finished.err.splitlines()[-1].startswith("error: device=cuda: no GPU is available")

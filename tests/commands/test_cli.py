@@ -61,7 +61,7 @@ def test_help_shows_all_verbs_and_the_settings_of_each(command):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["report", "samplers"], "ckpt is needed: give ckpt=VALUE"),
+        (["report", "controls"], "ckpt is needed: give ckpt=VALUE"),
         (["test", "ckpt=nowhere/checkpoints/last.ckpt"], "no such checkpoint"),
         (["data", "toy", "kind=nonsense"], "no toy data of kind 'nonsense'"),
     ],

@@ -44,6 +44,14 @@ def test_a_job_is_named_by_what_is_swept_plainly_and_like_no_other():
     assert swept_keys(given) == ["ablation", "seed", "x", "y"]
 
 
+def test_a_sweep_has_no_one_config_to_show(command):
+    finished = command("fit", "-m", "experiment=toy_var", "seed=0,1", "--cfg", "job")
+    assert (finished.status, finished.err) == (
+        2,
+        "error: --cfg and --info show the settings of one run: leave out -m\n",
+    )
+
+
 @pytest.fixture(scope="module")
 def whole(toy_root, tmp_path_factory) -> Path:
     """A sweep of one job that ran through."""

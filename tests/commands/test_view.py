@@ -10,7 +10,7 @@ from urllib.request import ProxyHandler, build_opener
 import pytest
 import torch
 from scenes_for_training import scene_batch
-from support import LIMIT, compose_config
+from support import LIMIT
 from viewer_scenes import balls
 from written_commands import ROOT
 
@@ -18,8 +18,6 @@ from completesplat.commands.jobs import alone_in
 from completesplat.commands.view import LOADING, newest_scenes, settings_of, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
-from completesplat.settings.checks import View
-from completesplat.settings.schema import check_settings
 from completesplat.training.fixed_scenes import write_newest
 from completesplat.viewer.sample import UP
 
@@ -55,6 +53,12 @@ def test_what_cannot_be_shown_is_refused(tmp_path):
     ):
         with pytest.raises(CompleteSplatError, match=re.escape(said)):
             settings_of(tmp_path / path)
+
+
+def test_weights_that_are_not_there_are_refused_before_the_page_opens(command):
+    finished = command("view", "weights=nowhere")
+    assert (finished.status, finished.out) == (2, "")
+    assert finished.err.startswith("error: nowhere: no such folder")
 
 
 def run_in_training(path, step: int = 2):
@@ -103,12 +107,6 @@ def test_a_run_without_scenes_is_waited_for(tmp_path, capsys, monkeypatch):
     samples, up = newest_scenes(tmp_path / "run")
     assert (len(samples), up) == (2, UP)
     assert "no scenes yet; waiting" in capsys.readouterr().out
-
-
-def test_settings_out_of_their_ranges_are_refused():
-    for setting, said in (("samples=9", "between 1 and 8"), ("port=99999", "between 1 and 65535")):
-        with pytest.raises(CompleteSplatError, match=f"{setting}: must lie {said}"):
-            check_settings(View, compose_config("view", setting))
 
 
 def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path):

@@ -13,40 +13,26 @@ WHOLE, NUMBER = "must be a whole number", "must be a number"
 ODD = [
     ("predict", "samples=abc", f"samples=abc: {WHOLE}"),
     ("predict", "samples=-1", "samples=-1: must lie between 1 and 1000"),
+    ("view", "port=99999", "port=99999: must lie between 1 and 65535"),
     ("predict", "maps=perhaps", "maps=perhaps: must be true or false"),
     ("predict", "box=[a,b,c,d]", f"box=['a', 'b', 'c', 'd']: {NUMBER}"),
     ("predict", "weights=[a]", "weights=['a']: must be a text"),
     ("predict", "video=1", "video=1: choose from orbit, swipe, wobble"),
-    ("predict", "formats=5", "formats=5: choose from ply, "),
     ("data", "scenes=many", f"scenes=many: {WHOLE}"),
-    ("data", "size=1000000", "size=1000000: must lie between 8 and 4096"),
     ("test", "overrides=5", "overrides=5: must be a list, such as overrides=[5]"),
-    ("fit", "seed=-1", "seed=-1: must lie between 0 and"),
     ("fit", "test=1", "test=1: must be true or false"),
     ("fit", "data.image_size=50", "data.image_size=50: must be a multiple of 8 for the levels of these networks"),
-    ("fit", "data.batch_size=0", "data.batch_size=0: must be at least 1"),
     ("fit", "data.color_jitter=1", "data.color_jitter=1: must be a mapping"),
     ("fit", "+data.rot=x", "ToyObjectsDataModule has no setting rot (data.rot); did you mean root?"),
     ("fit", "optimizer.lr=nan", f"optimizer.lr=nan: {NUMBER}"),
     ("fit", "optimizer.lr=-1", "optimizer: Invalid learning rate: -1"),
     ("fit", "trainer.val_check_interval=0", "trainer.val_check_interval=0: must be at least "),
-    ("fit", "trainer.accumulate_grad_batches=0", "trainer.accumulate_grad_batches=0: must be at least 1"),
     ("fit", "trainer.precision=half", "trainer.precision=half: choose one of "),
     ("fit", "trainer.accelerator=abacus", "trainer: "),
     ("fit", "loss.terms.kl.weight=inf", "loss.terms.kl.weight=inf: must be finite"),
-    ("fit", "data.workers=4000", "data.workers=4000: must lie between 0 and 256"),
     ("data", "data_task=check workers=-1", "workers=-1: must be at least 1"),
-    ("data", "data_task=prepare workers=0", "workers=0: must be at least 1"),
     ("data", "frames=1001", "toy_objects: frames=1001: must lie between 2 and 1000"),
-    ("fit", "loss.terms=null", "loss.terms=None: must be a mapping"),
     ("fit", "autoreconstructor.encoder.channels=8", "autoreconstructor.encoder.channels=8: must be a list, such as "),
-    ("fit", "sampler.steps=0", "sampler.steps=0: must lie between 1 and 10000"),
-    ("fit", "callbacks.checkpoint.every_n_train_steps=0", "every_n_train_steps=0: must be at least 1"),
-    (
-        "fit",
-        "data=co3d_category data.root=x data.category=y data.min_frames=1",
-        "data.min_frames=1: must be at least 2",
-    ),
     ("fit", "data=toy_rooms data.crop=top", "data.crop=top: choose one of center, principal"),
 ]
 
@@ -57,7 +43,7 @@ def test_an_odd_value_is_named_with_the_values_allowed(verb, setting, message):
         "predict": ["image=a.png", "weights=nowhere"],
         "data": ["data_task=toy"],
         "test": ["ckpt=nowhere"],
-        "view": ["scene=nowhere"],
+        "view": [],
     }
     assert message in refused(verb, *given.get(verb, ["trainer.max_steps=1"]), *setting.split())
 
@@ -84,7 +70,6 @@ def test_a_value_is_named_where_it_was_set():
     ("typed", "message"),
     [
         ("fit optimzer.lr=1", r"no setting 'optimzer.lr' of completesplat fit; did you mean optimizer.lr\?"),
-        ("fit data.rot=x", r"no setting 'data.rot' of completesplat fit; did you mean data.root\?"),
         ("fit experiment=toy_minis_var data.scene=3", r"no setting 'data.scene' .* did you mean data.scenes"),
         (
             "fit xyzzy=1",
@@ -92,7 +77,6 @@ def test_a_value_is_named_where_it_was_set():
         ),
         ("fit experiment=toy_vr", r"no experiment 'toy_vr': there are co3d_small_diffusion, .*; did you mean toy_var"),
         ("fit ablation=no_skip", r"no ablation 'no_skip': there are full, .*; did you mean no_skips"),
-        ("fit data=toy_object", r"no data 'toy_object': there are .*; did you mean toy_objects"),
         ("fit -m loss=stge1,stage2", r"no loss 'stge1': there are stage1, stage2; did you mean stage1"),
         ("fit data=null", r"data=null: choose one of capture, co3d_category, "),
         ("fit toy_var", r"toy_var: no setting, which are given as key=value; did you mean experiment=toy_var\?"),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -117,7 +117,7 @@ def _name(entry: object, index: int) -> str:
         raise BadAnnotation(f"entry {index}: {error.reason}") from None
 
 
-def _read_list(path: Path) -> list[Entry]:
+def _read_list(path: Path) -> list[Any]:
     # CO3D was written by Python's `json`, which writes NaN; every number is checked before use.
     content = read_json(path, allow_nan=True)
     if type(content) is not list:

@@ -103,7 +103,11 @@ def _square(
     if isinstance(source, (np.ndarray, Tensor)):
         source = _pixels(source)
     if not isinstance(source, Image.Image):
-        if not os.path.isfile(source):  # `Path.is_file` raises if a name is too long.
+        try:
+            exists = Path(source).is_file()
+        except OSError as error:  # such as a name that is too long
+            raise ImageError(str(error.strerror)) from error
+        if not exists:
             raise ImageError("no such file")
         if not os.path.getsize(source):
             raise ImageError("the file is empty")
