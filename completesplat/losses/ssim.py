@@ -24,7 +24,8 @@ def structural_similarity(
         mean1, mean2, squares, product = rows @ (products @ columns.T)
         mean_squares, mean_product = mean1 * mean1 + mean2 * mean2, mean1 * mean2
         luminance = (2 * mean_product + C1) / (mean_squares + C1)
-        return luminance * (2 * (product - mean_product) + C2) / (squares - mean_squares + C2)
+        values: Tensor = luminance * (2 * (product - mean_product) + C2) / (squares - mean_squares + C2)
+        return values
 
 
 @cache

@@ -1,7 +1,4 @@
-"""Loss terms of the reconstruction stage (paper, Eq. 1) without weights of their own, and two regularisers.
-
-The regularisers are off by default (weight 0) and not in the paper.
-"""
+"""Loss terms of the reconstruction stage (paper, Eq. 1) without weights of their own."""
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -37,17 +34,3 @@ class KullbackLeibler:
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
         posterior, values = prediction.posterior, prediction.images[0, 0].numel()
         return posterior.kl().mean() / values if posterior is not None else prediction.images.new_zeros(())
-
-
-class MeanScale:
-    """Mean of the Gaussians' scales, in scene units (Kheradmand et al. 2024, "3DGS as Markov Chain Monte Carlo")."""
-
-    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
-        return prediction.gaussians.scales.mean()
-
-
-class MeanOpacity:
-    """Mean of the Gaussians' opacities (Kheradmand et al. 2024)."""
-
-    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
-        return prediction.gaussians.opacities.mean()

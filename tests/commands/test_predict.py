@@ -15,7 +15,7 @@ from completesplat.commands.predict import visible_part
 from completesplat.errors import CompleteSplatError
 
 FEW = ["samples=2", "frames=4", "steps=2"]
-UNNEEDED = ["kornia", "lightning", "matplotlib", "pandas", "torchmetrics", "viser", "wandb"]
+UNNEEDED = ["lightning", "matplotlib", "pandas", "torchmetrics", "viser", "wandb"]
 UNNEEDED += [f"completesplat.{part}" for part in ("data.importing", "data.loading", "metrics", "studies", "training")]
 
 

@@ -17,8 +17,6 @@ from completesplat.losses import Prediction, WeightedSum
 from completesplat.losses.ssim import structural_similarity
 from completesplat.losses.terms import (
     KullbackLeibler,
-    MeanOpacity,
-    MeanScale,
     MeanSquaredError,
     StructuralDissimilarity,
 )
@@ -84,12 +82,6 @@ def test_kl_weighs_as_in_stable_diffusion_at_every_image_size(size):
     errors = (first - second).square().sum() / 2  # of one picture
     assert total.item() == pytest.approx(((errors + 1e-6 * theirs) / (3 * size * size)).item(), rel=1e-5)
     assert KullbackLeibler()(prediction(first), views(second)).item() == 0  # without a posterior
-
-
-def test_regularizers_are_means_over_all_gaussians(pair):
-    predicted = prediction(pair[0], scale=0.3, opacity=0.7)
-    assert MeanScale()(predicted, views(pair[1])).item() == pytest.approx(0.3)
-    assert MeanOpacity()(predicted, views(pair[1])).item() == pytest.approx(0.7)
 
 
 class Constant:

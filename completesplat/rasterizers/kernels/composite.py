@@ -85,7 +85,7 @@ def composite(
     columns = (width + BLOCK - 1) // BLOCK
     integers = records.view(np.int32)
     begin(first_row, end_row, columns, height, width, state)
-    if gradients is not None:
+    if gradients is not None and places is not None:
         flat_gradients = gradients.reshape(-1)
         store(flat_gradients, 0, splat(ZERO))
         places[:] = 0
@@ -149,7 +149,7 @@ def composite(
                     if not any_lane(behind > ZERO):
                         close_block(open_words, row - first_row, column)
                         blocks_left -= 1
-        if gradients is not None and reached:
+        if gradients is not None and places is not None and reached:
             moments = (sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv)
             sums = lane_sums((sum_red, sum_green, sum_blue, sum_z) + moments)  # noqa: RUF005
             written += 1
