@@ -4,7 +4,6 @@ import sys
 from dataclasses import replace
 
 import pytest
-from degenerate_gaussians import NEVER_DRAWN, changed, draw
 from rasterizer_scenes import OTHER_CONSTANTS, assert_agrees, scenes
 
 from completesplat.benchmarks import gsplat_torch
@@ -21,12 +20,6 @@ def test_images_and_gradients_agree_with_the_float64_reference(seed: int, size, 
     gaussians, cameras = scenes(seed, 2, 3, size, constants)
     of = tuple(vars(gaussians))
     assert_agrees(GsplatTorchRasterizer(constants), constants, gaussians, cameras, seed, 1e-4, 1e-3, of)
-
-
-def test_nothing_to_draw() -> None:
-    pytest.importorskip("gsplat")
-    images, gradients = draw(GsplatTorchRasterizer(), changed(NEVER_DRAWN["behind the camera"]), intrinsics=False)
-    assert not any(tensor.any() for tensor in (images, *gradients.values()))
 
 
 def test_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
