@@ -20,14 +20,14 @@ class Source:
     """A split whose sequences have these frames.
 
     Attributes:
-        broken_pictures, broken_sequences: (name, frame) and names that are refused when they are read.
+        broken_images, broken_sequences: (name, frame) and names that are refused when they are read.
         bugs: names whose reading fails for a reason that is no refusal.
         at_once: how many sequences lie together.
-        log: a file to which every picture that is read is appended.
+        log: a file to which every image that is read is appended.
     """
 
     frames: dict[str, tuple[int, ...]]
-    broken_pictures: set[tuple[str, int]] = field(default_factory=set)
+    broken_images: set[tuple[str, int]] = field(default_factory=set)
     broken_sequences: set[str] = field(default_factory=set)
     bugs: set[str] = field(default_factory=set)
     refused: list[DataError] = field(default_factory=list)
@@ -52,14 +52,14 @@ class Source:
             (SIZE, SIZE),
         )
         depth_ranges = torch.tensor([[1.0, 2.0]]).repeat(len(frames), 1)
-        return PosedSequence(name, frames, cameras, depth_ranges, partial(self._picture, name))
+        return PosedSequence(name, frames, cameras, depth_ranges, partial(self._image, name))
 
-    def _picture(self, name: str, index: int) -> MaskedImage:
+    def _image(self, name: str, index: int) -> MaskedImage:
         frame = self.frames[name][index]
         if self.log is not None:
             with self.log.open("a") as log:
                 log.write(f"{name} {frame}\n")
-        if (name, frame) in self.broken_pictures:
+        if (name, frame) in self.broken_images:
             raise BadImage("truncated", f"{name}/{frame}.jpg")
         return MaskedImage(torch.full((3, SIZE, SIZE), frame % 256, dtype=torch.uint8), None)
 

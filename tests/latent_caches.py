@@ -29,7 +29,7 @@ def sound_rooms(root: Path, clips: int = 5, **settings: object) -> Path:
 
 
 def broken_rooms(root: Path) -> Path:
-    """Nine packed clips without what could not be used: one picture of c5, nearly all of c6 and the cameras of c7."""
+    """Nine packed clips without what could not be used: one image of c5, nearly all of c6 and the cameras of c7."""
     clips = [make_clip(f"c{i}", FRAMES) for i in range(9)]
     clips[5].images[1] = b"<html>"
     clips[6].images[1:] = [b"<html>"] * (FRAMES - 1)

@@ -15,7 +15,7 @@ from completesplat.geometry.cameras import Cameras, look_at
 SIZE = 16
 
 
-def smooth_picture(seed: int, masked: bool, size: int = SIZE) -> MaskedImage:
+def smooth_image(seed: int, masked: bool, size: int = SIZE) -> MaskedImage:
     """Waves of colour, and a soft disc as the mask."""
     generator = torch.Generator().manual_seed(seed)
     phase = 6 * torch.rand(3, 2, 1, 1, generator=generator)
@@ -41,7 +41,7 @@ def make_sequence(name: str, frames: int = 4, masked: bool = True, bad: tuple[in
 def _read(name: str, seed: int, masked: bool, bad: tuple[int, ...], index: int) -> MaskedImage:
     if index in bad:
         raise BadImage("cannot be decoded", f"{name}/{index}.jpg")
-    return smooth_picture(seed + index, masked)
+    return smooth_image(seed + index, masked)
 
 
 @dataclass

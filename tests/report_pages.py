@@ -21,28 +21,28 @@ def grey(sample: int, frame: int) -> float:
 
 
 def write_results(root: Path) -> None:
-    """A run with scores and pictures, a benchmark, a report, and a prediction; the first has a hostile name."""
+    """A run with scores and images, a benchmark, a report, and a prediction; the first has a hostile name."""
     run = root / HOSTILE
     _write(run / "run.json", {"command": ["completesplat fit", "a=b c"], "commit": "c0ffee", "started": "2026-11-21"})
     _write(run / "metrics.json", {"protocol": PROTOCOL, "model": {"full": {"novel": {"psnr": 21.125}}}})
     (run / "config.yaml").write_text(f"seed: 0 # {HOSTILE}\n")
     for step in range(5):
-        picture(run / f"images/step_00000{step}.png", 40 * step)
+        image(run / f"images/step_00000{step}.png", 40 * step)
     modes = {"coverage": 0.875, "total_variation": 0.5, "sharpness": 1.0, "rejected": 0.25, "scenes": 2, "samples": 4}
     _write(root / "modes/hidden_modes.json", {"model": modes})
     _write(root / "modes/protocol.json", PROTOCOL)
-    picture(root / "modes/hidden_modes.png", 200, (2400, 60))
+    image(root / "modes/hidden_modes.png", 200, (2400, 60))
     _write(root / "samplers/samplers.json", {"rows": [{"sampler": "ddim", "steps": 50, "psnr": 17.25, "more": {}}]})
     settings = {"image": HOSTILE, "seed": 7, "skip_weight": 0.5, "steps": 20}
     _write(root / "predictions/run.json", {"command": ["completesplat predict", "image=x.jpg"]})
     _write(root / "predictions/x/scene.json", {"settings": settings})
-    picture(root / "predictions/x/sheet.png", 90)
+    image(root / "predictions/x/sheet.png", 90)
     for sample in range(SAMPLES):
         levels = torch.tensor([grey(sample, frame) for frame in range(FRAMES)])
         write_video(root / f"predictions/x/orbit_{sample:02}.mp4", levels[:, None, None, None].expand(-1, 3, 32, 32))
 
 
-def picture(path: Path, level: int, size: tuple[int, int] = (60, 40)) -> None:
+def image(path: Path, level: int, size: tuple[int, int] = (60, 40)) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", size, (level, level, level)).save(path)
 

@@ -9,7 +9,7 @@ SIZE = 16
 
 
 def scene_batch(batch: int = 2, targets: int = 2, seed: int = 0, size: int = SIZE) -> SceneBatch:
-    """Random pictures, all from one camera at the origin."""
+    """Random images, all from one camera at the origin."""
     count = 1 + targets
     cameras = Cameras(
         torch.eye(4).repeat(batch, count, 1, 1), pinhole(60, size).repeat(batch, count, 1, 1), (size, size)

@@ -1,6 +1,6 @@
 """Runs the notebooks from top to bottom and stores them with their outputs: `make notebooks`.
 
-A stored notebook has the hash of the code that it ran, for `test_notebooks.py`, and pictures that are small: JPEG, at
+A stored notebook has the hash of the code that it ran, for `test_notebooks.py`, and images that are small: JPEG, at
 most 1200 pixels wide.
 """
 
@@ -35,9 +35,9 @@ def hash_of(notebook: Notebook) -> str:
 
 def jpeg(content: str) -> str:
     """Encode an image in base64 as JPEG."""
-    picture = Image.open(io.BytesIO(base64.b64decode(content))).convert("RGB")
-    picture.thumbnail((WIDEST, picture.height))
-    picture.save(buffer := io.BytesIO(), "JPEG", quality=QUALITY)
+    image = Image.open(io.BytesIO(base64.b64decode(content))).convert("RGB")
+    image.thumbnail((WIDEST, image.height))
+    image.save(buffer := io.BytesIO(), "JPEG", quality=QUALITY)
     return base64.b64encode(buffer.getvalue()).decode()
 
 

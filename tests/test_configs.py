@@ -173,7 +173,7 @@ def test_every_toy_experiment_trains_on_one_batch(experiment, pipeline: Path, mo
     var, diffusion = (run / "checkpoints/last.ckpt" for run in (pipeline.var, pipeline.diffusion))
     settings += {
         "toy_diffusion": [f"model.autoreconstructor_checkpoint={var}", "sampler.steps=2"],
-        # On the pipeline's stage 1, which has four levels and sees one picture.
+        # On the pipeline's stage 1, which has four levels and sees one image.
         "toy_views_diffusion": [
             *(f"model.autoreconstructor_checkpoint={var}", "posterior=image", "conditioning.channels=[8,8,16,16]"),
             "sampler.steps=2",

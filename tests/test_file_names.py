@@ -1,4 +1,4 @@
-"""Whatever a picture is called, its folder lies in `out`, and its name can be printed."""
+"""Whatever an image is called, its folder lies in `out`, and its name can be printed."""
 
 import os
 from pathlib import Path

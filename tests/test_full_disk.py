@@ -68,7 +68,7 @@ def checkpoint(path: Path) -> None:
     CheckpointFiles().save_checkpoint({"state_dict": {"a": torch.arange(3000.0)}, "lists": [torch.ones(500)]}, path)
 
 
-def picture(path: Path) -> None:
+def image(path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
     write_png(path, Image.fromarray(noise))
 
@@ -89,7 +89,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "metrics.csv": rows,
     "metrics.json": lambda path: write_text(path, "figures " * 500),
     "check.json": lambda path: Findings(1, 1, [], {"left out": dict.fromkeys("ab" * 50, 1)}, {}).write(path),
-    "sheet.png": picture,
+    "sheet.png": image,
     "sample.ply": lambda path: write_ply(path, gaussians(100)),
     "sample.splat": lambda path: write_splat(path, gaussians(100)),
     "orbit.mp4": lambda path: write_video(path, NOISE),
@@ -143,7 +143,7 @@ def test_a_data_set_that_does_not_fit_is_refused_and_nothing_of_it_stays(tmp_pat
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_a_picture_that_does_not_fit_is_not_cut_short(tmp_path, suffix):
+def test_an_image_that_does_not_fit_is_not_cut_short(tmp_path, suffix):
     with quota(100), pytest.raises(OSError, match=rf"Errno {errno.EFBIG}"):
         save_image(Image.effect_noise((64, 64), 50), tmp_path / f"a{suffix}")
 

@@ -55,7 +55,7 @@ pytestmark = [
 ]
 PIXELS = np.random.default_rng(0).integers(0, 256, (12, 16, 4), dtype=np.uint8)
 COMPRESSIONS = (None, "tiff_lzw", "tiff_adobe_deflate", "jpeg", "packbits")
-MOST_MEMORY_OF_A_PICTURE = 2**31  # of 50 million pixels, which are allowed
+MOST_MEMORY_OF_A_PHOTO = 2**31  # of 50 million pixels, which are allowed
 
 
 def each(*reads: Any) -> None:
@@ -66,12 +66,12 @@ def each(*reads: Any) -> None:
 
 
 def encoded(pixels: np.ndarray, form: str, mode: str | None = None, **options: Any) -> bytes:
-    file, picture = io.BytesIO(), Image.fromarray(pixels)
-    (picture if mode is None else picture.convert(mode)).save(file, form, **options)
+    file, photo = io.BytesIO(), Image.fromarray(pixels)
+    (photo if mode is None else photo.convert(mode)).save(file, form, **options)
     return file.getvalue()
 
 
-def pictures() -> dict[str, list[bytes]]:
+def photos() -> dict[str, list[bytes]]:
     """Small files of all formats and most modes, by format."""
     rgb, grey, alpha = PIXELS[..., :3], PIXELS[..., 0], PIXELS[..., 3].astype(np.uint16) * 200
     record = Image.Exif()
@@ -96,10 +96,10 @@ def pictures() -> dict[str, list[bytes]]:
     }
 
 
-def test_pictures(tmp_path):
-    files, path = pictures(), tmp_path / "a"
+def test_images(tmp_path):
+    files, path = photos(), tmp_path / "a"
 
-    def read_pictures(content: bytes) -> None:
+    def read_images(content: bytes) -> None:
         path.write_bytes(content)
         calls = [partial(decode, path, "a", mode) for mode in ("RGB", "L")]
         calls += [
@@ -113,8 +113,8 @@ def test_pictures(tmp_path):
     parts = [png_parts(content) for content in (*files["PNG"], encoded(depth, "PNG"))]
     every = st.one_of(*map(damaged, files.values()), damaged_parts(parts, png_of))
     for content in (content for several in files.values() for content in several):
-        read_pictures(content)
-    fuzz(every, read_pictures, examples=60, most_memory=MOST_MEMORY_OF_A_PICTURE)
+        read_images(content)
+    fuzz(every, read_images, examples=60, most_memory=MOST_MEMORY_OF_A_PHOTO)
 
 
 HEADER = b"""ply

@@ -32,7 +32,7 @@ def folder(model, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def picture(toy_root):
+def photo(toy_root):
     return sorted(toy_root.glob("*/*/images/*.jpg"))[0]
 
 
@@ -40,35 +40,35 @@ def same(first, second) -> bool:
     return all(torch.equal(getattr(first, name), getattr(second, name)) for name in vars(first))
 
 
-def test_what_is_saved_is_loaded_bit_for_bit(model, folder, picture):
+def test_what_is_saved_is_loaded_bit_for_bit(model, folder, photo):
     loaded = CompleteSplat.from_pretrained(folder)
     assert loaded.architecture == model.architecture == json.loads(json.dumps(model.architecture))
     for name, value in model.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], value)
-    for ours, theirs in zip(model(picture, samples=2), loaded(picture, samples=2), strict=True):
+    for ours, theirs in zip(model(photo, samples=2), loaded(photo, samples=2), strict=True):
         assert same(ours, theirs)
 
 
 @pytest.mark.processes
-def test_no_lightning_is_needed_to_generate(folder, picture):
+def test_no_lightning_is_needed_to_generate(folder, photo):
     program = "import sys; from completesplat.generator import CompleteSplat; "
-    program += f"scenes = CompleteSplat.from_pretrained({str(folder)!r})({str(picture)!r}, samples=1, steps=1); "
+    program += f"scenes = CompleteSplat.from_pretrained({str(folder)!r})({str(photo)!r}, samples=1, steps=1); "
     program += "print(len(scenes), 'lightning' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert result.stdout.split() == ["1", "False"]
 
 
-def test_seeds_decide_and_samples_differ(model, picture):
-    (first, second), again, other = (model(picture, samples=2, seed=seed) for seed in (3, 3, 4))
+def test_seeds_decide_and_samples_differ(model, photo):
+    (first, second), again, other = (model(photo, samples=2, seed=seed) for seed in (3, 3, 4))
     assert same(first, again[0])
     assert same(second, again[1])
     assert not torch.equal(first.means, second.means)
     assert not torch.equal(first.means, other[0].means)
 
 
-def test_one_model_draws_in_four_threads_what_it_draws_one_after_the_other(model, picture):
+def test_one_model_draws_in_four_threads_what_it_draws_one_after_the_other(model, photo):
     def draw(seed: int):
-        return model(picture, samples=1, seed=seed, steps=(2, 4, 5, 8)[seed])
+        return model(photo, samples=1, seed=seed, steps=(2, 4, 5, 8)[seed])
 
     alone = [draw(seed) for seed in range(4)]
     with ThreadPoolExecutor(4) as pool:
@@ -86,20 +86,20 @@ def test_one_model_draws_in_four_threads_what_it_draws_one_after_the_other(model
         ({"seed": [1, 2]}, "seed=[1, 2]: 2 seeds for 1 images"),
     ],
 )
-def test_settings_of_wrong_kinds_are_named(model, picture, settings, message):
+def test_settings_of_wrong_kinds_are_named(model, photo, settings, message):
     with pytest.raises(CompleteSplatError) as caught:
-        model(picture, **{"samples": 1, "steps": 1} | settings)
+        model(photo, **{"samples": 1, "steps": 1} | settings)
     assert str(caught.value).startswith(message)
 
 
-def test_samples_of_a_batch_stand_next_to_each_other(model, picture):
-    photograph = model.read(picture)
+def test_samples_of_a_batch_stand_next_to_each_other(model, photo):
+    photograph = model.read(photo)
     images = torch.stack([photograph.image, photograph.image.flip(-1)])
     cameras = model.camera(photograph)[None].map(lambda tensor: tensor.expand(2, *tensor.shape[1:]))
     ranges = model.depth_range.expand(2, 2)
     scenes = model.generate(images, cameras, ranges, samples=3, skip_weight=1.0, steps=2)
     assert scenes.means.shape[0] == 6
-    # With one skip of weight one the picture reaches its own samples only: a changed second picture moves those alone.
+    # With one skip of weight one the image reaches its own samples only: a changed second image moves those alone.
     changed = model.generate(images * torch.tensor([1.0, 0.5]).view(2, 1, 1, 1), cameras, ranges, samples=3, steps=2)
     moved = (changed.means - scenes.means).abs().amax((1, 2)) > 1e-6
     assert moved.tolist() == [False] * 3 + [True] * 3
@@ -122,7 +122,7 @@ def half(model):
 
 
 def calls_of(model, **settings) -> dict[str, list[int]]:
-    """Batch sizes with which the networks are called in a drawing of one picture."""
+    """Batch sizes with which the networks are called in a drawing of one image."""
     encoder, reconstructor = model.autoreconstructor.encoder.network, model.autoreconstructor.reconstructor
     networks = {"conditioning": model.conditioning, "denoiser": model.denoiser, "reconstructor": reconstructor}
     networks |= {"first level": encoder.conv_in, "second level": encoder.down_blocks[1].resnets[0]}
@@ -141,7 +141,7 @@ def calls_of(model, **settings) -> dict[str, list[int]]:
 
 
 @pytest.mark.parametrize(("guidance_weight", "passes"), [(0.0, 1), (0.5, 2)])
-def test_a_picture_is_encoded_once_for_all_samples_and_steps_and_only_as_far_as_skips_reach(
+def test_an_image_is_encoded_once_for_all_samples_and_steps_and_only_as_far_as_skips_reach(
     model, guidance_weight, passes
 ):
     found = calls_of(model, samples=2, steps=1, skip_weight=0.0)
@@ -151,8 +151,8 @@ def test_a_picture_is_encoded_once_for_all_samples_and_steps_and_only_as_far_as_
     assert found == {**once, "denoiser": [20 * passes] * 4}
 
 
-def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(model, picture, monkeypatch):
-    whole, decode, sizes = model(picture, samples=5, steps=2), model._decode, []
+def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(model, photo, monkeypatch):
+    whole, decode, sizes = model(photo, samples=5, steps=2), model._decode, []
 
     def small(*inputs):
         sizes.append(len(inputs[-2]))
@@ -163,15 +163,15 @@ def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(mo
     monkeypatch.setattr(model, "_decode", small)
     denoised = []
     hook = model.denoiser.register_forward_pre_hook(lambda _, inputs: denoised.append(len(inputs[0])))
-    parts = model(picture, samples=5, steps=2)
+    parts = model(photo, samples=5, steps=2)
     hook.remove()
     assert (denoised, sizes) == ([5, 5], [5, 3, 2, 2, 1])
     for one, other in zip(whole, parts, strict=True):
         torch.testing.assert_close(one.means, other.means, atol=1e-4, rtol=1e-4)
 
 
-def test_what_is_hidden_has_no_influence_at_all(model, picture, half):
-    photograph = model.read(picture)
+def test_what_is_hidden_has_no_influence_at_all(model, photo, half):
+    photograph = model.read(photo)
     other = replace(photograph, image=torch.where(half > 0, photograph.image, 1 - photograph.image))
     assert not torch.equal(other.image, photograph.image)
     for first, second in zip(model(photograph, half, samples=2), model(other, half, samples=2), strict=True):
@@ -181,20 +181,20 @@ def test_what_is_hidden_has_no_influence_at_all(model, picture, half):
     assert not same(model(photograph, half)[0], model(other, half)[0])
 
 
-def test_skips_are_off_where_something_is_hidden_and_weights_out_of_place_refused(model, picture, half):
-    assert same(model(picture, half)[0], model(picture, half, skip_weight=0.0)[0])
+def test_skips_are_off_where_something_is_hidden_and_weights_out_of_place_refused(model, photo, half):
+    assert same(model(photo, half)[0], model(photo, half, skip_weight=0.0)[0])
     everything = torch.ones_like(half)
-    assert same(model(picture, everything, skip_weight=1.0)[0], model(picture)[0])
+    assert same(model(photo, everything, skip_weight=1.0)[0], model(photo)[0])
     with pytest.raises(CompleteSplatError, match=r"skip_weight=0\.5: must be 0"):
-        model(picture, half, skip_weight=0.5)
+        model(photo, half, skip_weight=0.5)
     for visible, (name, weight) in product((None, half), {"skip_weight": -0.5, "guidance_weight": math.nan}.items()):
         with pytest.raises(CompleteSplatError, match=f"{name}={weight:g}: must lie between 0 and 1"):
-            model(picture, visible, steps=1, **{name: weight})
+            model(photo, visible, steps=1, **{name: weight})
 
 
-def test_the_scenes_of_all_steps_are_shown(model, picture):
+def test_the_scenes_of_all_steps_are_shown(model, photo):
     shown = []
-    scenes = model(picture, samples=3, steps=4, batch=2, on_step=lambda *step: shown.append(step))
+    scenes = model(photo, samples=3, steps=4, batch=2, on_step=lambda *step: shown.append(step))
     assert [(step, level) for step, level, _ in shown] == 2 * [(0, 999), (1, 749), (2, 499), (3, 249)]
     last = [scene for _, _, part in (shown[3], shown[7]) for scene in (part[i] for i in range(len(part.means)))]
     for scene, estimate in zip(scenes, last, strict=True):
@@ -202,14 +202,14 @@ def test_the_scenes_of_all_steps_are_shown(model, picture):
     assert not torch.allclose(shown[0][2].means, shown[3][2].means, atol=1e-3)
 
 
-def test_another_sampler_is_saved_with_the_weights(model, picture, tmp_path):
+def test_another_sampler_is_saved_with_the_weights(model, photo, tmp_path):
     changed = copy.deepcopy(model)
     changed.replace_sampler(OmegaConf.to_container(compose_config("fit", "sampler=unipc5").sampler))
-    assert not same(changed(picture)[0], model(picture)[0])
+    assert not same(changed(photo)[0], model(photo)[0])
     changed.save_pretrained(tmp_path / "changed")
     loaded = CompleteSplat.from_pretrained(tmp_path / "changed")
     assert loaded.sampler.steps == 5
-    assert same(loaded(picture)[0], changed(picture)[0])
+    assert same(loaded(photo)[0], changed(photo)[0])
 
 
 def test_files_that_are_damaged_missing_or_of_another_model_are_refused(folder):

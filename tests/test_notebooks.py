@@ -38,10 +38,10 @@ def test_the_first_notebook_installs_the_package_before_anything_needs_it():
 def test_outputs_are_made_small_and_a_change_of_the_code_is_noticed():
     noise = np.random.default_rng(0).integers(0, 255, (600, 2 * WIDEST, 3), np.uint8)
     Image.fromarray(noise).save(buffer := io.BytesIO(), "PNG")
-    picture = {"image/png": base64.b64encode(buffer.getvalue()).decode(), "text/plain": "<a picture>"}
+    image = {"image/png": base64.b64encode(buffer.getvalue()).decode(), "text/plain": "<an image>"}
     message = [{"output_type": "stream", "name": "stdout", "text": [f"{i}\n"]} for i in range(2)]
     outputs = [*message, {"output_type": "display_data", "data": {"text/plain": "a bar"}}]
-    outputs.append({"output_type": "execute_result", "data": picture})
+    outputs.append({"output_type": "execute_result", "data": image})
     cell = {"cell_type": "code", "source": ["1 +\n", "1"], "outputs": outputs}
     notebook = slimmed({"cells": [{"cell_type": "markdown", "source": ["text"]}, cell], "metadata": {}})
     stream, result = cell["outputs"]

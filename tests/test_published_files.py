@@ -54,7 +54,7 @@ def test_the_hub_is_asked_once_and_without_it_a_line_says_what_to_fetch(tmp_path
 
 
 REFUSED = {
-    "two pictures": ({"data": {"input_images": 2}}, "data.input_images is 2"),
+    "two images": ({"data": {"input_images": 2}}, "data.input_images is 2"),
     "embedded cameras": ({"cam_embd": {"embedding": "pose"}}, "cam_embd.embedding is pose"),
     "another network": ({"model": {"name": "TwoUNets"}}, "model.name is TwoUNets"),
     "no harmonics": ({"model": {"max_sh_degree": 0}}, "model.max_sh_degree is 0"),

@@ -24,7 +24,7 @@ def test_they_are_small_and_complete():
     assert locate(NAME).parent == SHIPPED / NAME
 
 
-def test_samples_fit_the_picture_they_are_drawn_for(tmp_path, monkeypatch):
+def test_samples_fit_the_image_they_are_drawn_for(tmp_path, monkeypatch):
     """Two scenes of another seed than training's: the reference view is met, the naive answers are beaten."""
     monkeypatch.setattr(os, "cpu_count", lambda: 1)  # so that no process has to be started
     size = {"scenes": 20, "frames": 4, "image_size": 64}

@@ -41,14 +41,14 @@ def test_the_installed_wheel_predicts_sweeps_and_writes_a_page_from_an_empty_fol
     run = partial(installed.run, tmp_path, "completesplat")
     place = installed.run(tmp_path, "python", "-c", "import completesplat; print(completesplat.__file__)")
     assert place.startswith(str(installed.environment))
-    picture = next(toy_root.glob("*/*/images/*.jpg"))
-    run("predict", f"image={picture}", "samples=1", "steps=2", "frames=2", "out=SCENES")
-    scenes = tmp_path / "SCENES" / picture.stem
+    image = next(toy_root.glob("*/*/images/*.jpg"))
+    run("predict", f"image={image}", "samples=1", "steps=2", "frames=2", "out=SCENES")
+    scenes = tmp_path / "SCENES" / image.stem
     assert {path.name for path in scenes.iterdir()} == {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json"}
     brief = [f"data.root={toy_root}", *SMALL, "callbacks.images=null", "test=false"]
     run("fit", "-m", "experiment=toy_var", *brief, "seed=0,1", "out=SWEEP")
     assert [strict_json(tmp_path / f"SWEEP/seed-{seed}/metrics.json")["steps"] for seed in (0, 1)] == [2, 2]
     run("report", "html", "runs=.", "out=PAGE")
     (page,) = (tmp_path / "PAGE").glob("*.html")
-    assert picture.stem in page.read_text()
+    assert image.stem in page.read_text()
     assert "seed-1" in page.read_text()

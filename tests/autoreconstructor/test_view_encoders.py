@@ -76,14 +76,14 @@ def test_poses_matter_and_the_order_of_the_views_does_not(model):
     assert not torch.allclose(mean(model, shuffled), mean(model, seen), atol=1e-4)
 
 
-def test_with_the_reference_alone_the_posterior_is_the_pictures(model):
+def test_with_the_reference_alone_the_posterior_is_the_images(model):
     seen, model = views(), trained(model)
     own, _ = model.encoder(seen.images[:, 0])
     assert torch.equal(mean(model, seen[:, :1]), own.mean)
 
 
 def test_a_sweep_finds_the_colours_of_points_where_other_views_see_them():
-    """One other picture, whose colours are its own pixels' coordinates: it is all that either side sees."""
+    """One other image, whose colours are its own pixels' coordinates: it is all that either side sees."""
     seen = views()[:, [0, 1]]
     columns = (torch.arange(SIZE) + 0.5).expand(SIZE, SIZE) / SIZE
     seen = replace(seen, images=torch.stack([columns, columns.T, torch.zeros_like(columns)]).expand(1, 2, 3, -1, -1))

@@ -19,7 +19,7 @@ def codes_of(model: AutoDecoder, *keys: tuple[str, int]) -> torch.Tensor:
     return model.codes_of(tuple(name for name, _ in keys), torch.tensor([frame for _, frame in keys]))
 
 
-def test_a_picture_keeps_its_code_until_the_table_is_full():
+def test_an_image_keeps_its_code_until_the_table_is_full():
     model = decoder()
     first = codes_of(model, ("a", 0), ("b", 0), ("a", 1))
     again = codes_of(model, ("a", 1), ("a", 0), ("c", 0), ("b", 0), ("a", 0))

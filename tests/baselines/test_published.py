@@ -1,7 +1,7 @@
 """Splatter Image's published weights: the network equals upstream's, and other files are refused.
 
 Numbers of upstream are those of its own `GaussianSplatPredictor` and `eval_sh`, run at commit 78a6ad0 of
-szymanowiczs/splatter-image on the CPU with the weights of `published_weights.tensors`, and pictures and cameras as
+szymanowiczs/splatter-image on the CPU with the weights of `published_weights.tensors`, and images and cameras as
 below.
 """
 
@@ -17,7 +17,7 @@ from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 PICKS = [0, 37, 200]
-# Of the second picture: Gaussians 0, 37 and 200.
+# Of the second image: Gaussians 0, 37 and 200.
 UPSTREAM = {
     "hydrants": {
         "means": [[-0.350282, -1.00824, 2.834701], [0.313312, -0.722214, 3.012812], [1.092185, -0.1653, 3.179528]],
@@ -34,7 +34,7 @@ OPACITIES = [0.444734, 0.554385, 0.408983]
 SCALES = [[0.94823, 1.345353, 1.587147], [1.053286, 1.027022, 1.659711], [2.214608, 0.794766, 2.734411]]
 ROTATIONS = [[0.736375, 0.354048, 0.207043, 0.538084], [-0.156861, 0.21924, -0.70281, 0.658321]]
 ROTATIONS += [[0.240327, 0.534756, -0.23621, -0.774909]]
-# Mean sizes of all values of both pictures, which leaves no pixel out.
+# Mean sizes of all values of both images, which leaves no pixel out.
 MEAN_SIZES = {"means": {"hydrants": [1.110143, 1.279431], "objaverse": [1.041324, 1.054789]}}
 MEAN_SIZES |= {"quaternions": [0.421106, 0.42302], "scales": [1.52006, 1.56831], "opacities": [0.474545, 0.475816]}
 
@@ -83,9 +83,9 @@ def test_cameras_and_backgrounds_come_with_the_weights(tmp_path):
     of_captures, of_objects = (PublishedSplatterImage(str(write_published(tmp_path, name))) for name in UPSTREAM)
     assert (of_captures.fov_degrees, of_captures.background, of_captures.image_size) == (None, 0, 16)
     assert (of_objects.fov_degrees, of_objects.background) == (pytest.approx(49.1343, abs=1e-3), 1)
-    picture = torch.zeros(3, 16, 16)
-    picture[:, 4:12, 5:9] = 0.5  # 8 pixels high: 1.14 units at focal length 16 are 2.28 away
-    assert of_captures.object_distance(picture, focal_length=16) == pytest.approx(2.28)
+    image = torch.zeros(3, 16, 16)
+    image[:, 4:12, 5:9] = 0.5  # 8 pixels high: 1.14 units at focal length 16 are 2.28 away
+    assert of_captures.object_distance(image, focal_length=16) == pytest.approx(2.28)
     assert of_captures.object_distance(torch.zeros(3, 16, 16), focal_length=16) == pytest.approx(1.14)  # fills it
 
 

@@ -135,10 +135,10 @@ def test_what_cannot_be_begun_is_refused(command, own, given, said):
 def test_an_installed_wheel_does_what_the_documents_say_in_every_process(installed, own, toy_root):
     """Two training processes, worker processes that load data, and a job in a process of submitit's."""
     run = partial(installed.run, own, "completesplat")
-    run("new", "dataset", "pictures")
-    installed.run(own, "python", "-c", "import test_dataset_pictures as t; t.write('DATA')")
-    pictures = ["data=pictures", "data.root=DATA", "data.image_size=32"]
-    run("data", "check", *pictures, "workers=2", "out=CHECK")
+    run("new", "dataset", "images")
+    installed.run(own, "python", "-c", "import test_dataset_images as t; t.write('DATA')")
+    images = ["data=images", "data.root=DATA", "data.image_size=32"]
+    run("data", "check", *images, "workers=2", "out=CHECK")
     quick = ["callbacks.images=null", "test=false"]
     own_fit = ["experiment=toy_var", *OWN_TERM, f"data.root={toy_root}", *SMALL, *quick]
     processes = ["trainer.devices=2", "trainer.strategy=ddp", "rasterizer=reference", "data.workers=1"]

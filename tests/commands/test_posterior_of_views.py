@@ -91,12 +91,12 @@ def test_several_images_with_their_cameras_give_one_scene(runs, command, tmp_pat
 
 def test_images_that_cannot_be_taken_together_are_refused(runs, tiny_weights, tmp_path):
     write_capture(tmp_path, 6)
-    pictures = f"image=[{tmp_path / 'frame0.png'},{tmp_path / 'frame1.png'}]"
+    photos = f"image=[{tmp_path / 'frame0.png'},{tmp_path / 'frame1.png'}]"
     cameras = f"cameras={tmp_path / 'transforms.json'}"
     weights = f"weights={runs / 'diffusion/weights'}"
     assert "two images or more" in refused("predict", f"image={tmp_path / 'frame0.png'}", cameras, weights)
-    assert "box does not go with cameras" in refused("predict", pictures, cameras, weights, "box=[0,0,1,0.5]")
-    assert "trained with posterior=image" in refused("predict", pictures, cameras, f"weights={tiny_weights}")
+    assert "box does not go with cameras" in refused("predict", photos, cameras, weights, "box=[0,0,1,0.5]")
+    assert "trained with posterior=image" in refused("predict", photos, cameras, f"weights={tiny_weights}")
 
 
 @pytest.mark.parametrize(

@@ -173,9 +173,9 @@ def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
         assert (given["removed"], settings.get("background")) == (removed, "remove" if removed else None)
 
 
-def test_a_picture_that_fails_is_named_and_does_not_stop_the_others(predict, tmp_path):
+def test_an_image_that_fails_is_named_and_does_not_stop_the_others(predict, tmp_path):
     save(tmp_path / "x/a.png")
-    (tmp_path / "x/b.jpg").write_text("no picture")
+    (tmp_path / "x/b.jpg").write_text("no image")
     finished = predict(f"[{tmp_path / 'x'},nowhere.png,{save(tmp_path / 'y/a.png', 'blue')}]")
     assert finished.status == 2
     broken, missing, summary = finished.err.splitlines()

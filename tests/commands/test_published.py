@@ -18,9 +18,9 @@ from completesplat.generator import CompleteSplat
 
 def cut_out(path, size=(60, 40)):
     """An orange rectangle of 20 x 10 pixels, transparent around it."""
-    picture = Image.new("RGBA", size, (0, 0, 255, 0))
-    picture.paste((255, 128, 0, 255), (5, 8, 25, 18))
-    picture.save(path)
+    photo = Image.new("RGBA", size, (0, 0, 255, 0))
+    photo.paste((255, 128, 0, 255), (5, 8, 25, 18))
+    photo.save(path)
     return path
 
 
@@ -81,15 +81,15 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
 def test_a_photograph_of_an_object_becomes_a_scene_without_its_background(rembg, command, tmp_path):
     weights = write_published(tmp_path / "objects", "objaverse", size=40)
     Image.new("RGB", (120, 80), "red").save(tmp_path / "a.png")
-    with Image.open(tmp_path / "a.png") as picture:
-        picture.paste((0, 128, 255), (5, 8, 25, 18))
-        picture.save(tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as photo:
+        photo.paste((0, 128, 255), (5, 8, 25, 18))
+        photo.save(tmp_path / "a.png")
     given = [f"image={tmp_path / 'a.png'}", f"weights={weights}", f"out={tmp_path / 'out'}", "video=[]"]
     finished = command("predict", *given, "background=remove")
     assert finished.status == 0, finished.err
     model = CompleteSplat.from_pretrained(weights)
-    with Image.open(tmp_path / "a.png") as picture:
-        seen = model.read(picture, remove_background=True)
+    with Image.open(tmp_path / "a.png") as photo:
+        seen = model.read(photo, remove_background=True)
     blue = seen.image[0] < 0.5
     assert blue.sum() == pytest.approx(26 * 13, rel=0.1)
     assert (seen.image[:, ~blue] > 0.5).all()  # no red is left

@@ -20,7 +20,7 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def pictures(*shape: int, seed: int = 0) -> Tensor:
+def noise(*shape: int, seed: int = 0) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
 
 
@@ -30,15 +30,15 @@ def scene() -> SceneBatch:
     poses = look_at(eyes, torch.tensor([0.0, 0, 3]), torch.tensor([0.0, -1, 0]))
     intrinsics = pinhole(60, SIZE).repeat(4, 1, 1)
     intrinsics[:, 0, 2] += torch.tensor([0, 3.0, -2, 1])
-    views = Views(pictures(4, 3, SIZE, SIZE), Cameras(poses, intrinsics, (SIZE, SIZE)), pictures(4, 1, SIZE, SIZE))
+    views = Views(noise(4, 3, SIZE, SIZE), Cameras(poses, intrinsics, (SIZE, SIZE)), noise(4, 1, SIZE, SIZE))
     visible = torch.ones(1, SIZE, SIZE)
     return SceneBatch(views[0], views[1:], torch.tensor([1.0, 5.0]), visible, torch.tensor(0), "one")
 
 
 def test_a_mirrored_scene_shows_mirrored_points_at_mirrored_pixels() -> None:
-    before = replace(scene(), visible=pictures(1, SIZE, SIZE).round())
+    before = replace(scene(), visible=noise(1, SIZE, SIZE).round())
     after = mirrored(before)
-    points = torch.tensor([0, 0, 3.0]) + pictures(20, 3)
+    points = torch.tensor([0, 0, 3.0]) + noise(20, 3)
     pixels, depth = project(before.all_views().cameras, points)
     mirrored_pixels, mirrored_depth = project(after.all_views().cameras, points * torch.tensor([-1.0, 1, 1]))
     expected = torch.stack([SIZE - pixels[..., 0], pixels[..., 1]], dim=-1)
@@ -107,7 +107,7 @@ def test_reference_and_targets_get_the_same_jitter_and_the_rest_stays() -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_one_color_becomes_one_color_in_all_views_within_bounds(seed: int) -> None:
-    images = torch.cat([pictures(1, 3, 8, 8) * 0.3, 0.7 + pictures(1, 3, 8, 8) * 0.3])
+    images = torch.cat([noise(1, 3, 8, 8) * 0.3, 0.7 + noise(1, 3, 8, 8) * 0.3])
     images[:, :, 2, 3] = torch.tensor([0.2, 0.5, 0.6])
     jittered = STRONG(images, rng(seed))
     assert not torch.allclose(jittered[0, :, 2, 3], images[0, :, 2, 3], atol=1e-3)
@@ -116,7 +116,7 @@ def test_one_color_becomes_one_color_in_all_views_within_bounds(seed: int) -> No
 
 
 def test_brightness_alone_multiplies_by_a_factor_within_its_range() -> None:
-    images = 0.1 + 0.4 * pictures(2, 3, 5, 5)
+    images = 0.1 + 0.4 * noise(2, 3, 5, 5)
     factors = []
     for seed in range(60):
         ratio = ColorJitter(0.5, 0, 0, 0)(images, rng(seed)) / images
@@ -128,7 +128,7 @@ def test_brightness_alone_multiplies_by_a_factor_within_its_range() -> None:
 
 def test_hue_rotates_colors_up_to_their_complement_and_keeps_grey_grey() -> None:
     """Of all angles within half a turn, the farthest from red is cyan; some draw comes near it, none beyond."""
-    images = pictures(2, 1, 5, 5).repeat(1, 3, 1, 1)
+    images = noise(2, 1, 5, 5).repeat(1, 3, 1, 1)
     images[:, :, 0, 0] = torch.tensor([1.0, 0, 0])
     jittered = [ColorJitter(0, 0, 0, 0.5)(images, rng(seed)) for seed in range(100)]
     torch.testing.assert_close(jittered[1][:, :, 1:], images[:, :, 1:])
@@ -150,7 +150,7 @@ def test_changes_in_any_order_are_kornias() -> None:
         enhance.adjust_hue,
     )
     for seed in range(30):
-        draw, images = rng(seed), pictures(3, 3, 7, 9, seed=seed)
+        draw, images = rng(seed), noise(3, 3, 7, 9, seed=seed)
         images[:, :, :3] = (4 * images[:, :, :3]).round() / 4  # equal channels, greys, black and white
         order, factors = draw.permutation(4), [*draw.uniform(0.4, 1.6, 3), draw.uniform(0, 6)]
         tall = torch.cat([*images], dim=1)

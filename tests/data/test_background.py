@@ -14,7 +14,7 @@ from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.errors import CompleteSplatError, ImageError
 
 
-def picture(path: Path, background: str = "red") -> Path:
+def photo(path: Path, background: str = "red") -> Path:
     """A blue square in the upper left quarter of what EXIF says is upside down."""
     image = Image.new("RGB", (32, 32), background)
     image.paste("blue", (0, 0, 16, 16))
@@ -25,7 +25,7 @@ def picture(path: Path, background: str = "red") -> Path:
 
 
 def test_the_object_stands_on_white_the_right_way_up(rembg, tmp_path):
-    found = read_photograph(picture(tmp_path / "a.png"), 32, remove_background=True).image
+    found = read_photograph(photo(tmp_path / "a.png"), 32, remove_background=True).image
     expected = torch.ones(3, 32, 32)
     expected[:2, 16:, 16:] = 0
     assert torch.equal(found, expected)
@@ -47,7 +47,7 @@ def test_the_object_is_sought_in_all_of_the_image_and_fills_its_share_of_the_squ
     assert torch.equal(found, expected)
 
 
-def test_an_object_as_long_as_a_image_may_be_is_reduced_before_its_square_is_made(tmp_path):
+def test_an_object_as_long_as_an_image_may_be_is_reduced_before_its_square_is_made(tmp_path):
     Image.new("RGBA", (100_000, 8), (0, 0, 255, 254)).save(tmp_path / "a.png")
     found = read_photograph(tmp_path / "a.png", 16, object_share=1.0).image
     assert found[0, 0].min() > 0.9  # white above the line
@@ -57,7 +57,7 @@ def test_an_object_as_long_as_a_image_may_be_is_reduced_before_its_square_is_mad
 
 
 def test_without_rembg_or_its_network_it_is_said_what_to_do(rembg, tmp_path, monkeypatch):
-    picture(tmp_path / "a.png")
+    photo(tmp_path / "a.png")
 
     def offline(name):
         raise OSError("no route to host\nand more")
@@ -88,8 +88,8 @@ def test_data_say_what_weights_are_to_know_of_them(toys):
     assert facts["box_masks"] == 0.25
     store = toys.store("train")
     sequences = [toys.source("train").read(name) for name in store.names]
-    pictures = torch.stack([store.image(s, frame) for s in sequences for frame in range(4)]).double() / 255
-    features = image_features(pictures)
+    photos = torch.stack([store.image(s, frame) for s in sequences for frame in range(4)]).double() / 255
+    features = image_features(photos)
     assert facts["picture_mean"] == pytest.approx(features.mean(0).tolist())
     assert facts["picture_std"] == pytest.approx(features.std(0, correction=0).clamp(min=1e-3).tolist())
 

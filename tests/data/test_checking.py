@@ -26,14 +26,14 @@ def damaged() -> dict[str, Source]:
     shared = MissingFile("no such file", "shared.txt")
     train = Source(
         {"a": (1, 2, 3), "b": (10, 20, 30), "c": (5, 6), "d": (7, 8), "e": (9,)},
-        broken_pictures={("a", 2), ("c", 6)},
+        broken_images={("a", 2), ("c", 6)},
         broken_sequences={"d"},
         refused=[shared],
         left_out={"score below 0.5": ["x", "y"]},
     )
     val = Prepared(
         {"b": (20, 30, 40, 50), "f": (1, 2)},
-        broken_pictures={("b", 50)},
+        broken_images={("b", 50)},
         refused=[MissingFile("no such file", "shared.txt")],
         changed=[ChangedFile("not its SHA-256", "shard-0")],
     )
@@ -76,10 +76,10 @@ def test_every_planted_fault_is_found_once_written_and_shown(tmp_path: Path, cap
     assert shown.splitlines()[-1] == "usable sequences: 3, their usable frames: 8 (train 2 and 5, val 2 and 5)"
 
 
-def test_pictures_in_several_splits_are_read_once(tmp_path: Path) -> None:
+def test_images_in_several_splits_are_read_once(tmp_path: Path) -> None:
     log = tmp_path / "log"
-    train = Source({"a": (1, 2, 3), "b": (1, 2)}, broken_pictures={("a", 3)}, log=log)
-    val = Source({"a": (2, 3, 4)}, broken_pictures={("a", 3)}, log=log)
+    train = Source({"a": (1, 2, 3), "b": (1, 2)}, broken_images={("a", 3)}, log=log)
+    val = Source({"a": (2, 3, 4)}, broken_images={("a", 3)}, log=log)
     findings = check_quietly(train=train, val=val)
     assert sorted(log.read_text().splitlines()) == ["a 1", "a 2", "a 3", "a 4", "b 1", "b 2"]
     assert places(findings) == {("unusable image", "a", 3)}
@@ -91,7 +91,7 @@ def test_splits_are_read_by_themselves_and_too_few_frames_reported_only_where_no
     findings = check_quietly(train=Source({"a": (1, 2)}, broken_sequences={"a"}), val=Source({"a": (3, 4)}))
     assert places(findings) == {("malformed annotation", "a", None)}
     assert findings.splits == {"train": {"sequences": 0, "frames": 0}, "val": {"sequences": 1, "frames": 2}}
-    findings = check_quietly(train=Source({"a": (1, 2), "b": (1,)}, broken_pictures={("a", 1)}))
+    findings = check_quietly(train=Source({"a": (1, 2), "b": (1,)}, broken_images={("a", 1)}))
     assert places(findings) == {("unusable image", "a", 1), ("too few frames", "b", None)}
     assert (findings.sequences, findings.frames) == (0, 0)
     with pytest.raises(ZeroDivisionError, match="a mistake in the reader"):

@@ -143,8 +143,8 @@ def test_the_fingerprint_tells_other_annotations_and_lists(tmp_path):
 
 
 def test_without_targets_one_image_of_a_scene_is_read_and_the_references_are_the_same(toy_root, monkeypatch):
-    read, picture = [], SceneStore._read
-    monkeypatch.setattr(SceneStore, "_read", lambda *given: read.append(given) or picture(*given))
+    read, original = [], SceneStore._read
+    monkeypatch.setattr(SceneStore, "_read", lambda *given: read.append(given) or original(*given))
     settings = {"references_per_sequence": 4, "horizontal_flip": True, "box_masks": {"probability": 0.5}}
     without = epoch(module(toy_root, targets=0, **settings).train_dataloader(), 0)
     assert len(read) == sum(len(batch.names) for batch in without) == 8

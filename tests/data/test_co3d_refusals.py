@@ -212,7 +212,7 @@ def unknown_depth(category: Path) -> None:
 
 # name: (damage, kind, file, frame), of sequence a.
 DAMAGES: dict[str, tuple[Callable[[Path], object], type[DataError], str | None, int | None]] = {
-    "image_is_text": (lambda category: (category / IMAGE).write_text("picture"), BadImage, IMAGE, 1),
+    "image_is_text": (lambda category: (category / IMAGE).write_text("image"), BadImage, IMAGE, 1),
     "missing_mask": (lambda category: (category / MASK).unlink(), MissingFile, MASK, 1),
     "image_is_a_pipe": (replaced(IMAGE, os.mkfifo), MissingFile, IMAGE, 1),
     "missing_cloud": (lambda category: (category / CLOUD).unlink(), MissingFile, CLOUD, None),

@@ -77,8 +77,8 @@ def test_depths_are_unknown_where_only_other_scenes_of_a_batch_have_them(data):
 
 
 @pytest.mark.parametrize("shape", [(8, 12), (4, 6), (16, 24)])
-def test_maps_of_any_size_are_cut_as_the_picture_is(monkeypatch, shape):
-    """A picture of 8 x 12; the square of 4 x 4 at (left 6, top 2), in 2 x 2 pixels, has centres at columns 7 and 9."""
+def test_maps_of_any_size_are_cut_as_the_image_is(monkeypatch, shape):
+    """An image of 8 x 12; the square of 4 x 4 at (left 6, top 2), in 2 x 2 pixels, has centres at columns 7 and 9."""
     columns = (torch.arange(shape[1]) + 0.5) * 12 / shape[1]
     depth = columns.expand(1, *shape)
     monkeypatch.setattr(source, "read_depth", lambda *_: depth)

@@ -109,9 +109,9 @@ def test_without_a_usable_focal_length_the_default_stands(tmp_path, tags):
 def test_a_damaged_inner_record_leaves_the_orientation(tmp_path):
     # Two entries: orientation 3, and an inner record at a position beyond the end.
     entries = struct.pack(">HHHIHHHHII", 2, 0x0112, 3, 1, 3, 0, 0x8769, 4, 1, 60_000)
-    picture = np.zeros((SIZE, SIZE), np.uint8)
-    picture[0] = 255
-    Image.fromarray(picture).save(tmp_path / "a.png", exif=b"Exif\0\0MM\0*\0\0\0\x08" + entries + bytes(4))
+    levels = np.zeros((SIZE, SIZE), np.uint8)
+    levels[0] = 255
+    Image.fromarray(levels).save(tmp_path / "a.png", exif=b"Exif\0\0MM\0*\0\0\0\x08" + entries + bytes(4))
     photograph = read_photograph(tmp_path / "a.png", SIZE)
     assert photograph.image[:, -1].min() == 1
     assert photograph.fov_source == "default"

@@ -35,15 +35,15 @@ def drawn(loader: SceneLoader, number: int) -> list[list]:
 
 
 @pytest.mark.parametrize("references", [1, 3])
-def test_an_item_is_the_sequence_and_the_encoded_reference_that_pictures_give(root, cache, references):
+def test_an_item_is_the_sequence_and_the_encoded_reference_that_images_give(root, cache, references):
     settings = {"box_masks": BOXES, "references_per_sequence": references}
-    pictures = rooms(root, **settings).train_dataloader()
+    from_images = rooms(root, **settings).train_dataloader()
     cached = rooms(root, latent_cache=str(cache), **settings).train_dataloader()
-    assert [list(part) for part in cached.sampler.groups] == [list(part) for part in pictures.sampler.groups]
-    assert len(cached.dataset) == len(pictures.dataset) == SEQUENCES * references
+    assert [list(part) for part in cached.sampler.groups] == [list(part) for part in from_images.sampler.groups]
+    assert len(cached.dataset) == len(from_images.dataset) == SEQUENCES * references
     encoder = small_autoreconstructor().encoder
-    for key in [(number, index) for number in (0, 1) for index in range(len(pictures.dataset))]:
-        scene, drawn = cached.dataset[key].scenes, pictures.dataset[key].scenes
+    for key in [(number, index) for number in (0, 1) for index in range(len(from_images.dataset))]:
+        scene, drawn = cached.dataset[key].scenes, from_images.dataset[key].scenes
         assert (scene.names, scene.reference_frame.item()) == (drawn.names, drawn.reference_frame.item())
         assert torch.equal(scene.condition, drawn.reference.images * drawn.visible)
         with torch.no_grad():
@@ -67,7 +67,7 @@ def test_batches_are_stacked_items_and_a_resumed_epoch_continues_exactly(root, c
     assert drawn(resumed, 1) == expected[1:]
     workers = rooms(root, latent_cache=str(cache), box_masks=BOXES, workers=2).train_dataloader()
     assert drawn(workers, 1) == expected
-    # Validation reads pictures.
+    # Validation reads images.
     assert next(iter(data.val_dataloader())).targets.images.shape[-3:] == (3, 16, 16)
 
 
@@ -75,12 +75,12 @@ def test_where_few_frames_are_encoded_the_nearest_takes_the_references_place(tmp
     root = sound_rooms(tmp_path / "root")
     store = encode_training_set(small_autoreconstructor(), rooms(root), tmp_path / "cache", frames=2, progress=False)
     assert {sequence.stored for sequence in store.manifest.sequences} == {(1, 3)}
-    pictures = rooms(root).train_dataloader()
+    from_images = rooms(root).train_dataloader()
     cached = rooms(root, latent_cache=str(tmp_path / "cache")).train_dataloader()
     nearest = {0: 1, 1: 1, 2: 1, 3: 3, 4: 3}
     seen = set()
     for key in [(number, index) for number in range(6) for index in range(4)]:
-        drawn, scene = pictures.dataset[key].scenes, cached.dataset[key].scenes
+        drawn, scene = from_images.dataset[key].scenes, cached.dataset[key].scenes
         assert scene.names == drawn.names
         assert scene.reference_frame.item() == nearest[drawn.reference_frame.item()]
         seen.add(drawn.reference_frame.item())
@@ -91,7 +91,7 @@ def test_where_few_frames_are_encoded_the_nearest_takes_the_references_place(tmp
 
 
 class Halves(torch.nn.Module):
-    """A frozen conditioning: the mean of each quarter of a picture."""
+    """A frozen conditioning: the mean of each quarter of an image."""
 
     frozen = True
 
@@ -102,8 +102,8 @@ class Halves(torch.nn.Module):
 def test_features_are_given_as_they_were_stored_and_cannot_be_changed(tmp_path):
     root, out = sound_rooms(tmp_path / "root"), tmp_path / "cache"
     encode_training_set(small_autoreconstructor(), rooms(root), out, conditioning=Halves(), progress=False)
-    pictures, cached = rooms(root).train_dataloader(), rooms(root, latent_cache=str(out)).train_dataloader()
-    expected = Halves()(pictures.dataset[0, 1].scenes.reference.images)
+    from_images, cached = rooms(root).train_dataloader(), rooms(root, latent_cache=str(out)).train_dataloader()
+    expected = Halves()(from_images.dataset[0, 1].scenes.reference.images)
     torch.testing.assert_close(cached.dataset[0, 1].scenes.condition, expected)
     for changes in ({"color_jitter": dict.fromkeys(STRENGTHS, 0.1)}, {"horizontal_flip": True}):
         with pytest.raises(CompleteSplatError, match=r"data\.color_jitter=null"):

@@ -20,7 +20,7 @@ AUGMENTED = {
 
 @pytest.fixture(scope="module", params=FORMS)
 def root(request, tmp_path_factory) -> Path:
-    """Nine clips, one of which has a picture that cannot be read."""
+    """Nine clips, one of which has an image that cannot be read."""
     clips = [make_clip(f"c{i}", frames=3) for i in range(9)]
     clips[5].images[1] = b"<html>"
     return write_tree(tmp_path_factory.mktemp("root"), request.param, clips, clips[:2])

@@ -11,10 +11,10 @@ from completesplat.errors import CompleteSplatError, DataError
 KEYS = [f"c{i}" for i in range(9)]
 
 
-def make_tree(root: Path, pictures: list[str], cameras: list[str] = ()) -> Path:
-    """Clips of which some have broken pictures, others broken cameras."""
+def make_tree(root: Path, broken_images: list[str], cameras: list[str] = ()) -> Path:
+    """Clips of which some have broken images, others broken cameras."""
     clips = {key: make_clip(key, frames=3) for key in KEYS}
-    for key in pictures:
+    for key in broken_images:
         clips[key].images[1:] = [b"<html>", b"<html>"]
     for key in cameras:
         clips[key].rows[1, 0] = 0

@@ -12,7 +12,7 @@ SHIPPED = (0.25, 0.5, 0.75, 1.0)
 
 
 @pytest.fixture
-def pictures(tmp_path):
+def photos(tmp_path):
     """Two photographs (width, height) that differ in a box of their central square, and a mask of that box."""
 
     def write(width: int, height: int) -> tuple[Path, Path, Path]:
@@ -34,8 +34,8 @@ def pictures(tmp_path):
 
 @pytest.mark.parametrize("form", ["box", "mask"])
 @pytest.mark.parametrize("size", [(32, 32), (100, 80), (61, 97), (20, 24)])
-def test_no_visible_pixel_holds_anything_hidden(pictures, size, form):
-    first, second, mask = pictures(*size)
+def test_no_visible_pixel_holds_anything_hidden(photos, size, form):
+    first, second, mask = photos(*size)
     visible = outside_of_box(first, SHIPPED, 32) if form == "box" else outside_of_mask(first, mask, 32)
     images = [read_photograph(path, 32).image for path in (first, second)]
     assert torch.equal(images[0] * visible, images[1] * visible)
@@ -43,18 +43,18 @@ def test_no_visible_pixel_holds_anything_hidden(pictures, size, form):
     assert visible.unique().tolist() == [0, 1]
 
 
-def test_a_picture_of_the_right_size_is_hidden_to_the_pixel_and_others_three_pixels_more_at_most(pictures):
+def test_an_image_of_the_right_size_is_hidden_to_the_pixel_and_others_three_pixels_more_at_most(photos):
     expected, grown = torch.ones(2, 1, 32, 32)
     expected[:, 16:, 8:24] = 0
     grown[:, 13:, 5:27] = 0
-    first, _, mask = pictures(32, 32)
+    first, _, mask = photos(32, 32)
     assert torch.equal(outside_of_box(first, SHIPPED, 32), expected)
     assert torch.equal(outside_of_mask(first, mask, 32), expected)
-    assert torch.equal(outside_of_box(pictures(640, 640)[0], SHIPPED, 32), grown)
+    assert torch.equal(outside_of_box(photos(640, 640)[0], SHIPPED, 32), grown)
 
 
-def test_boxes_and_masks_that_are_none_are_refused(pictures, tmp_path):
-    first = pictures(32, 32)[0]
+def test_boxes_and_masks_that_are_none_are_refused(photos, tmp_path):
+    first = photos(32, 32)[0]
     for box in ((0, 0, 1), (0, 0, 0, 1), (0.5, 0, 0.4, 1), (-0.1, 0, 1, 1), (0, 0, 1, 1.1)):
         with pytest.raises(CompleteSplatError, match="box="):
             outside_of_box(first, box, 32)

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
-from packed_sequences import SIZE, ListedSource, make_sequence, smooth_picture
+from packed_sequences import SIZE, ListedSource, make_sequence, smooth_image
 from PIL import Image
 
 from completesplat.data.packed.manifest import is_packed, read_manifest, settings_must_match
@@ -94,9 +94,9 @@ def test_one_store_serves_smaller_images_as_pillow_makes_them(tmp_path: Path) ->
 
 
 def test_masks_of_some_frames_only_stay_with_them() -> None:
-    image, mask = smooth_picture(1, True)
-    pictures = [EncodedImage(encode(image, "png"), content) for content in (None, encode(mask, "png"))]
-    read = from_row(to_row(make_sequence("s", frames=2), [0, 1], pictures), "file", "s").read
+    image, mask = smooth_image(1, True)
+    images = [EncodedImage(encode(image, "png"), content) for content in (None, encode(mask, "png"))]
+    read = from_row(to_row(make_sequence("s", frames=2), [0, 1], images), "file", "s").read
     assert read(0).mask is None
     assert torch.equal(read(1).mask, mask)
 
@@ -205,12 +205,12 @@ def test_a_row_that_does_not_fit_is_refused_with_its_place(column: str, value: o
     assert (caught.value.file, caught.value.sequence) == ("shard.arrow", "s")
 
 
-def test_bytes_that_are_not_the_picture_are_refused_with_their_place() -> None:
-    image = encode(smooth_picture(0, True).image, "jpeg")
+def test_bytes_that_are_not_the_image_are_refused_with_their_place() -> None:
+    image = encode(smooth_image(0, True).image, "jpeg")
     # Where the checksum is that of the wrong bytes, decoding them has to notice.
-    for wrong in (image[: len(image) // 2], encode(smooth_picture(0, True, size=SIZE + 1).image, "png")):
-        pictures = [EncodedImage(image, None), EncodedImage(wrong, None)]
-        sequence = from_row(to_row(make_sequence("s", frames=2), [0, 1], pictures), "shard.arrow", "s")
+    for wrong in (image[: len(image) // 2], encode(smooth_image(0, True, size=SIZE + 1).image, "png")):
+        images = [EncodedImage(image, None), EncodedImage(wrong, None)]
+        sequence = from_row(to_row(make_sequence("s", frames=2), [0, 1], images), "shard.arrow", "s")
         sequence.read(0)
         with pytest.raises(BadImage) as caught:
             sequence.read(1)

@@ -14,7 +14,7 @@ from completesplat.errors import ImageError
 SIZE = 16
 
 
-def picture(seed=0):
+def photo(seed=0):
     """Random bytes, 16 x 16: read with size 16 nothing is resampled, so every pixel can be compared."""
     return np.random.default_rng(seed).integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8)
 
@@ -74,7 +74,7 @@ def grey(values):
     return values[..., None].repeat(3, -1)
 
 
-RGB, ALPHA = picture(), picture(1)[..., :1]
+RGB, ALPHA = photo(), photo(1)[..., :1]
 GREY, INKS = RGB[..., 0], np.concatenate([RGB, ALPHA // 2], -1)
 SMOOTH = Image.fromarray(RGB).resize((4, 4)).resize((SIZE, SIZE), Image.Resampling.BICUBIC)
 DEEP = np.linspace(0, 65535, SIZE * SIZE).astype(np.uint16).reshape(SIZE, SIZE)
@@ -82,7 +82,7 @@ TWELVE = DEEP // 16
 DEEP_COLOR = np.random.default_rng(0).integers(0, 65536, (SIZE, SIZE, 4))
 FLOAT = np.random.default_rng(0).random((SIZE, SIZE)).astype(np.float32)
 INDEX = np.arange(SIZE * SIZE, dtype=np.uint8).reshape(SIZE, SIZE)
-COLORS = picture(2).reshape(256, 3)
+COLORS = photo(2).reshape(256, 3)
 PALETTE = Image.fromarray(INDEX, "P")
 PALETTE.putpalette(COLORS.tobytes())
 ONE = np.arange(SIZE * SIZE).reshape(SIZE, SIZE) == 53
@@ -165,7 +165,7 @@ def test_an_embedded_profile_is_converted_to_srgb(tmp_path):
 
 def test_the_largest_square_is_cut_from_the_centre_of_any_shape(tmp_path):
     wide = np.zeros((32, 96, 3), np.uint8)
-    wide[:, 32:64] = picture().repeat(2, 0).repeat(2, 1)
+    wide[:, 32:64] = photo().repeat(2, 0).repeat(2, 1)
     for image in (wide, wide.transpose(1, 0, 2)):
         middle = image[32:64] if image.shape[0] > 32 else image[:, 32:64]
         assert np.array_equal(read_back(tmp_path, Image.fromarray(image), size=32), np.float32(middle) / 255)
@@ -184,7 +184,7 @@ def test_resizing_is_antialiased_and_tiny_images_are_enlarged(tmp_path):
 
 
 SIDE = 48
-PICTURE = Image.fromarray(RGB.repeat(3, 0).repeat(3, 1))
+PHOTO = Image.fromarray(RGB.repeat(3, 0).repeat(3, 1))
 
 
 def refuse(path, match):
@@ -208,14 +208,14 @@ def test_what_is_no_photograph_is_refused(tmp_path, monkeypatch):
         Image.new("RGB", size).save(tmp_path / "a.png")
         refuse(tmp_path / "a.png", "at least 8")
     monkeypatch.setattr(files, "MOST_PIXELS", SIDE**2 - 1)
-    PICTURE.save(tmp_path / "a.png")
+    PHOTO.save(tmp_path / "a.png")
     refuse(tmp_path / "a.png", "2,303 pixels")
 
 
 @pytest.mark.parametrize("name", ["p.jpg", "a.png", "a.gif", "lzw.tif", "a.jp2"])
 def test_truncated_files_are_refused_or_complete(tmp_path, name):
     options = {"p.jpg": {"progressive": True}, "lzw.tif": {"compression": "tiff_lzw"}}.get(name, {})
-    PICTURE.save(tmp_path / name, **options)
+    PHOTO.save(tmp_path / name, **options)
     whole = read_photograph(tmp_path / name, SIDE).image
     data = (tmp_path / name).read_bytes()
     for length in [*range(1, len(data) - 24, max(1, len(data) // 40)), *range(len(data) - 24, len(data))]:

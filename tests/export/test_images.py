@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from picture_sheets import cells
+from image_sheets import cells
 
 from completesplat.export.images import (
     NOTHING,

@@ -67,15 +67,15 @@ def screenshot(path, requests: list[str], drag: int = 0) -> torch.Tensor:
             page.mouse.down()
             page.mouse.move(WIDTH / 2 + drag, HEIGHT / 2, steps=8)
             page.mouse.up()
-        picture = torch.zeros(HEIGHT, WIDTH, 3)
+        screenshot = torch.zeros(HEIGHT, WIDTH, 3)
         for _ in range(60):
             page.wait_for_timeout(1000)
             data = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-            earlier, picture = picture, torch.tensor(list(data.getdata())).view(HEIGHT, WIDTH, 3) / 255
-            if picture.std() > 0.05 and torch.equal(picture, earlier):  # something is drawn, and has come to rest
+            earlier, screenshot = screenshot, torch.tensor(list(data.getdata())).view(HEIGHT, WIDTH, 3) / 255
+            if screenshot.std() > 0.05 and torch.equal(screenshot, earlier):  # something is drawn, and has come to rest
                 break
         browser.close()
-    return picture
+    return screenshot
 
 
 def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path):
@@ -106,8 +106,8 @@ def test_dragging_turns_the_page_s_camera_about_the_object_also_within_walls(tmp
     assert (before - after).abs().mean() > 0.001  # walls, and what is before what
 
 
-def place(picture: torch.Tensor, color: torch.Tensor) -> float:
+def place(screenshot: torch.Tensor, color: torch.Tensor) -> float:
     """The mean column, as a share of the width, of what is nearly of this colour."""
-    seen = ((picture - color).abs() < 0.45).all(-1)
+    seen = ((screenshot - color).abs() < 0.45).all(-1)
     assert seen.any()
     return seen.nonzero()[:, 1].float().mean().item() / WIDTH

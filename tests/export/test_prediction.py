@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from fake_converter import install
-from picture_sheets import cells
+from image_sheets import cells
 from PIL import Image
 from support import some_gaussians, strict_json
 

@@ -63,7 +63,7 @@ def test_ssim_is_computed_in_full_precision_and_a_training_may_follow_a_test(pai
 
 @pytest.mark.parametrize("size", [16, 64])
 def test_kl_weighs_as_in_stable_diffusion_at_every_image_size(size):
-    """There, sum of errors + 1e-6 * KL; divided by the 3 * H * W values of a picture, mean error + our term."""
+    """There, sum of errors + 1e-6 * KL; divided by the 3 * H * W values of an image, mean error + our term."""
     first, second = torch.rand(2, 1, 2, 3, size, size)
     mean, log_variance = torch.randn(2, 1, 4, size // 8, size // 8)
     terms = {
@@ -74,7 +74,7 @@ def test_kl_weighs_as_in_stable_diffusion_at_every_image_size(size):
     total, values = WeightedSum(terms)(prediction(first, Posterior(mean, log_variance)), views(second))
     theirs = DiagonalGaussianDistribution(torch.cat([mean, log_variance], dim=1)).kl().sum()
     assert set(values) == {"mse", "kl"}
-    errors = (first - second).square().sum() / 2  # of one picture
+    errors = (first - second).square().sum() / 2  # of one image
     assert total.item() == pytest.approx(((errors + 1e-6 * theirs) / (3 * size * size)).item(), rel=1e-5)
     assert KullbackLeibler()(prediction(first), views(second)).item() == 0  # without a posterior
 

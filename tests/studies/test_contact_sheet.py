@@ -34,13 +34,13 @@ def test_images_are_evenly_spaced_in_time(orbit, tmp_path):
 
 
 def test_an_image_is_shown_upright_and_unmirrored_with_the_outline_of_its_mask(orbit, tmp_path):
-    picture, mask = (torch.rand(3, SIZE, SIZE) * 255).byte(), torch.zeros(1, SIZE, SIZE, dtype=torch.uint8)
+    image, mask = (torch.rand(3, SIZE, SIZE) * 255).byte(), torch.zeros(1, SIZE, SIZE, dtype=torch.uint8)
     mask[:, :, : SIZE // 4], mask[:, :, SIZE // 4 : SIZE // 3] = 255, 100  # it crosses one half
-    shown = cells(sheet_of([orbit(1, read=lambda i: MaskedImage(picture, mask))], tmp_path, 1), 1, 1)[0, 0]
+    shown = cells(sheet_of([orbit(1, read=lambda i: MaskedImage(image, mask))], tmp_path, 1), 1, 1)[0, 0]
     yellow = (shown == MASK).all(-1)
     assert set(np.flatnonzero(yellow.any(0))) == {CELL // 4 - 1}
     assert yellow[:, CELL // 4 - 1].mean() > 0.9
-    large = picture.permute(1, 2, 0).numpy().repeat(CELL // SIZE, axis=0).repeat(CELL // SIZE, axis=1)
+    large = image.permute(1, 2, 0).numpy().repeat(CELL // SIZE, axis=0).repeat(CELL // SIZE, axis=1)
     for rows in (slice(None, 40), slice(-40, None)):  # above and below the cross
         assert ((shown == large).all(-1) | yellow)[rows].all()
 

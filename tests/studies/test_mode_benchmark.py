@@ -46,7 +46,7 @@ BY_NAME = {scene.scene.names[0]: scene for scene in SCENES}
 
 
 def renders(scene: SceneBatch, modes: list[int]) -> torch.Tensor:
-    """The true pictures, with one mode after the other where they can be seen."""
+    """The true images, with one mode after the other where they can be seen."""
     images = scene.targets.images[0].repeat(SAMPLES, 1, 1, 1, 1)
     images[:, 1:] = BY_NAME[scene.names[0]].truths[(modes * SAMPLES)[:SAMPLES]]
     return images
@@ -107,7 +107,7 @@ def test_scenes_of_no_use_are_counted():
 
 
 def flat(gaussians: Gaussians, cameras: Cameras) -> Rendering:
-    """Pictures of one colour, the Gaussians' mean colour: all that is needed to tell samples apart."""
+    """Images of one colour, the Gaussians' mean colour: all that is needed to tell samples apart."""
     shape = (*cameras.world_to_camera.shape[:2], 3, SIZE, SIZE)
     color = gaussians.colors.mean(1)[:, None, :, None, None].expand(shape)
     return Rendering(color, color[:, :, :1], torch.ones_like(color[:, :, :1]))

@@ -13,7 +13,7 @@ BLUE, ORANGE = (31, 119, 180), (255, 127, 14)
 
 
 def never_read(index):
-    raise AssertionError("statistics need no pictures")
+    raise AssertionError("statistics need no images")
 
 
 def only(*sequences):
@@ -40,7 +40,7 @@ def test_a_path_is_measured_between_all_its_cameras(walk):
         assert alone[key] == {"min": 0, "median": 0, "max": 0}
 
 
-def test_a_field_of_view_ends_at_the_borders_of_the_picture(orbit):
+def test_a_field_of_view_ends_at_the_borders_of_the_image(orbit):
     sequence = orbit(3)
     intrinsics = sequence.cameras.intrinsics.clone()
     intrinsics[:, 0, 0], intrinsics[:, 0, 2] = 24.0, 0.0  # the axis goes through the left border: atan(24 / 24)

@@ -1,4 +1,4 @@
-"""Stage 2 from the latent cache against stage 2 from pictures, by the command line."""
+"""Stage 2 from the latent cache against stage 2 from images, by the command line."""
 
 from pathlib import Path
 

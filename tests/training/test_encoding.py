@@ -37,7 +37,7 @@ def cache(root, tmp_path_factory) -> LatentCache:
 
 
 class Means(nn.Module):
-    """A conditioning: the mean of each quarter of a picture, times a weight."""
+    """A conditioning: the mean of each quarter of an image, times a weight."""
 
     def __init__(self, weight: float = 1.0, frozen: bool = True) -> None:
         super().__init__()
@@ -102,11 +102,11 @@ def test_a_draw_from_the_cache_is_the_draw_on_the_fly(tmp_path):
 @pytest.mark.parametrize(("value", "precision"), [(float("nan"), "float32"), (1e30, "float16")])
 def test_encodings_that_are_not_finite_are_refused_with_their_place(root, tmp_path, value, precision):
     sequence = rooms(root).source("train").read("c2")
-    picture, model = sequence.read(3).image / 255, small_autoreconstructor()
+    expected_image, model = sequence.read(3).image / 255, small_autoreconstructor()
 
     def change(_: nn.Module, inputs: tuple, output: tuple) -> tuple:
         posterior, features = output
-        hit = torch.tensor([torch.allclose(image, picture, atol=1e-6) for image in inputs[0]])
+        hit = torch.tensor([torch.allclose(image, expected_image, atol=1e-6) for image in inputs[0]])
         factor = torch.where(hit, value, 1.0).view(-1, 1, 1, 1)
         return Posterior(posterior.mean * factor, posterior.log_variance), features
 

@@ -6,7 +6,7 @@ import pandas
 import pytest
 import torch
 from hydra.utils import instantiate
-from picture_sheets import cells
+from image_sheets import cells
 from PIL import Image
 from scenes_for_training import SIZE, scene_batch
 from support import SMALL, compose_config

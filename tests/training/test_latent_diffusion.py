@@ -17,7 +17,7 @@ BATCH, SIZE = 2, 32
 
 
 def scenes(share: float = 1.0) -> SceneBatch:
-    """Of whose reference pictures only the left part is visible."""
+    """Of whose reference images only the left part is visible."""
     batch = scene_batch(BATCH, targets=1, size=SIZE)
     batch.visible[..., round(share * SIZE) :] = 0
     return batch
@@ -134,8 +134,8 @@ def test_encoded_scenes_train_the_same(monkeypatch):
         if cached:
             with torch.no_grad():
                 posterior, _ = parts.autoreconstructor.encoder(batch.reference.images)
-            picture = batch.reference.images * batch.visible
-            inputs = CachedScene(posterior.mean, posterior.log_variance, picture, batch.reference_frame, batch.names)
+            image = batch.reference.images * batch.visible
+            inputs = CachedScene(posterior.mean, posterior.log_variance, image, batch.reference_frame, batch.names)
         torch.manual_seed(5)
         module.training_step(inputs, 0).backward()
         found.append((logged, gradients(module)))

@@ -56,8 +56,8 @@ def psnr_of_training_views(run) -> torch.Tensor:
 def test_one_scene_is_learned_by_heart(command, tmp_path):
     """Above 28 dB on its training views after 1,000 steps: what is in the way of that is a bug, not the data.
 
-    A clip through a room, of which one picture shows nearly all that the others do: all around an object, a single
-    picture's Gaussians would first have to travel to its far side.
+    A clip through a room, of which one image shows nearly all that the others do: all around an object, a single
+    image's Gaussians would first have to travel to its far side.
     """
     one_scene = [
         "data=toy_rooms",

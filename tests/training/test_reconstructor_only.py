@@ -13,13 +13,13 @@ def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
     run = tmp_path / "run"
     assert command("fit", *SETTINGS, f"data.root={toy_root}", f"out={run}").status == 0
     first = read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"]
-    # Only training pictures: validation and test have taken none.
+    # Only training images: validation and test have taken none.
     data = instantiate(compose_config("fit", *SETTINGS, f"data.root={toy_root}").data, _convert_="all")
     source = data.source("train")
     assert {name for name, _ in first["model._extra_state"]} <= set(source.names)
-    pictures = sum(len(source.read(name).frames) for name in source.names)
-    assert len(first["model.codes"]) == pictures == 8  # a row for every training picture
-    assert 2 <= len(first["model._extra_state"]) <= 4  # two steps of two pictures
+    frame_count = sum(len(source.read(name).frames) for name in source.names)
+    assert len(first["model.codes"]) == frame_count == 8  # a row for every training image
+    assert 2 <= len(first["model._extra_state"]) <= 4  # two steps of two images
     resume = [
         f"ckpt_path={run / 'checkpoints/last.ckpt'}",
         "trainer.max_steps=4",

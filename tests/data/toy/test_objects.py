@@ -26,7 +26,7 @@ def annotations_of(root: Path) -> list[dict]:
 
 
 def read_depth(root: Path, annotation: dict) -> np.ndarray:
-    """As CO3D's `load_16big_png_depth` does it: the bits of a 16-bit picture are float16."""
+    """As CO3D's `load_16big_png_depth` does it: the bits of a 16-bit image are float16."""
     with Image.open(root / annotation["depth"]["path"]) as png:
         bits = np.frombuffer(np.array(png, dtype=np.uint16), dtype=np.float16)
         return bits.astype(np.float32).reshape(png.size[::-1]) * annotation["depth"]["scale_adjustment"]
@@ -39,9 +39,9 @@ def test_bytes_depend_on_the_seed_and_not_on_the_workers(tmp_path):
         write_objects(tmp_path / name, scenes=3, frames=2, size=16, seed=seed, workers=workers, progress=False)
         trees[name] = files_of(tmp_path / name)
     assert trees["one"] == trees["two"]
-    pictures = [path for path in trees["one"] if path.endswith("frame000001.jpg")]
-    assert len(pictures) == 3
-    assert not {trees["one"][path] for path in pictures} & set(trees["other"].values())
+    first_frames = [path for path in trees["one"] if path.endswith("frame000001.jpg")]
+    assert len(first_frames) == 3
+    assert not {trees["one"][path] for path in first_frames} & set(trees["other"].values())
 
 
 def test_an_interrupted_set_is_made_anew_a_complete_one_kept_and_other_content_refused(tmp_path, capsys):

@@ -89,9 +89,9 @@ def test_a_wall_point_has_the_same_color_in_two_frames_by_the_numbers_in_the_tex
     assert seen.sum() > 60
 
     def colors(frame: int, pose: int) -> np.ndarray:
-        picture = np.asarray(Image.open(text.with_suffix("") / f"{lines[frame][0]}.jpg")) / 255
+        rendered = np.asarray(Image.open(text.with_suffix("") / f"{lines[frame][0]}.jpg")) / 255
         places, _ = pinhole(rows[pose], height, width)(world[seen])
-        return at(picture, np.clip(places, 1, [width - 1, height - 1]))
+        return at(rendered, np.clip(places, 1, [width - 1, height - 1]))
 
     right, wrong = (np.abs(colors(0, 0) - colors(last, pose)).mean(axis=1) for pose in (last, 0))
     assert np.median(right) < 0.02
@@ -150,8 +150,8 @@ def test_bare_white_walls_follow_lamberts_law():
     lamp = full.light.place - points
     cosine = (normals * lamp).sum(axis=1) / np.linalg.norm(lamp, axis=1)
     expected = full.light.ambient * (0.85 + 0.15 * normals[:, 1]) + (1 - full.light.ambient) * cosine
-    picture, _ = render_room_frame(empty, frame, height, width)
-    gap = np.abs(picture.reshape(-1, 3) - expected[:, None]).max(axis=1)
+    rendered, _ = render_room_frame(empty, frame, height, width)
+    gap = np.abs(rendered.reshape(-1, 3) - expected[:, None]).max(axis=1)
     assert np.mean(gap < 2e-3) > 0.9  # the others are pixels on the room's edges
     assert np.ptp(expected) > 0.1
 
@@ -205,7 +205,7 @@ def test_the_camera_walks_smoothly_through_free_space(index):
     assert steps.max() < 1.2 * steps.min()
     turns = np.degrees(np.arccos((forward[1:] * forward[:-1]).sum(axis=1).clip(-1, 1)))
     assert turns.max() < 3.5
-    assert (poses[:, 1, 1] < -0.9).all()  # the pictures' down is the room's down
+    assert (poses[:, 1, 1] < -0.9).all()  # the images' down is the room's down
     assert np.abs(poses[:, 1, 0]).max() < 1e-9  # and their rows are level
     along = np.diff(centers, axis=0) / steps[:, None]
     assert ((along * forward[1:]).sum(axis=1) > 0.6).all()

@@ -53,5 +53,5 @@ def test_the_clips_are_as_published(rooms, split):
         assert np.linalg.det(rotation) == pytest.approx(1, abs=1e-6)
         assert sorted(int(path.stem) for path in (folder / key).iterdir()) == times
         for path in (folder / key).iterdir():
-            with Image.open(path) as picture:
-                assert (picture.size, picture.format) == ((32, 18), "JPEG")
+            with Image.open(path) as image:
+                assert (image.size, image.format) == ((32, 18), "JPEG")

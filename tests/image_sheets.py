@@ -1,4 +1,4 @@
-"""The pictures of a sheet (`completesplat.export.images`) that has no title, as they were before it was drawn."""
+"""The images of a sheet (`completesplat.export.images`) that has no title, as they were before it was drawn."""
 
 import numpy as np
 import torch
