@@ -32,10 +32,10 @@ def shapes(size: int, network: dict) -> dict[str, list[int]]:
     """Names and sizes of all tensors in a file of weights; `test_published` compares them with upstream's."""
     with torch.device("meta"):
         net = SongUNet(size, 3, 24, network["base_dim"], network["num_blocks"], network["attention_resolutions"])
-    found = {f"network_with_offset.encoder.{name}": list(value.shape) for name, value in net.state_dict().items()}
-    found |= {"network_with_offset.out.weight": [24, 24, 1, 1], "network_with_offset.out.bias": [24]}
-    found["ray_dirs"] = [1, 3, size, size]
-    return found | {key: [1, 3, 3] for key in ("v_to_sh_transform", "sh_to_v_transform")}
+    result = {f"network_with_offset.encoder.{name}": list(value.shape) for name, value in net.state_dict().items()}
+    result |= {"network_with_offset.out.weight": [24, 24, 1, 1], "network_with_offset.out.bias": [24]}
+    result["ray_dirs"] = [1, 3, size, size]
+    return result | {key: [1, 3, 3] for key in ("v_to_sh_transform", "sh_to_v_transform")}
 
 
 def tensors(name: str, size: int = 16, network: dict = SMALL) -> dict[str, torch.Tensor]:

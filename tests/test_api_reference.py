@@ -15,8 +15,8 @@ PDOC = [sys.executable, "-m", "pdoc", "--docformat", "google", "completesplat", 
 def test_every_module_has_a_page_whose_links_lead_somewhere(tmp_path: Path) -> None:
     made = subprocess.run([*PDOC, tmp_path], capture_output=True, text=True)
     # Before Python 3.12 a TypedDict does not tell which one it comes from.
-    said = [line for line in made.stderr.splitlines() if not line.startswith("Warn: Cannot determine where")]
-    assert (made.returncode, said) == (0, [])
+    message = [line for line in made.stderr.splitlines() if not line.startswith("Warn: Cannot determine where")]
+    assert (made.returncode, message) == (0, [])
     pages = {path.resolve(): path.read_text() for path in tmp_path.rglob("*.html")}
     model = pages[(tmp_path / "completesplat/generator.html").resolve()]
     assert 'id="CompleteSplat.from_pretrained"' in model

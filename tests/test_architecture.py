@@ -53,11 +53,11 @@ def imports(tree: ast.AST, path: str) -> Iterator[tuple[str, list[str]]]:
 
 def imported_files(tree: ast.AST, path: str, known: Collection[str]) -> set[str]:
     """Which of the known modules are imported, by their own names or as names of their packages."""
-    found = set()
+    result = set()
     for module, names in imports(tree, path):
         full = {f"{module}.{name}" for name in names}
-        found |= full if full and full <= set(known) else {module, *full}
-    return found & set(known)
+        result |= full if full and full <= set(known) else {module, *full}
+    return result & set(known)
 
 
 def module_name(path: str) -> str:
@@ -66,16 +66,16 @@ def module_name(path: str) -> str:
 
 
 def upward_imports(trees: Mapping[str, ast.AST]) -> list[str]:
-    found, known = [], {module_name(path) for path in FILES}
+    result, known = [], {module_name(path) for path in FILES}
     for path, tree in trees.items():
         own = floor(path)
         for module in imported_files(tree, path, known):
             other = floor(module)
             if other in FLOORS and own in FLOORS and FLOORS.index(other) > FLOORS.index(own):
-                found.append(f"{path} imports {module}")
+                result.append(f"{path} imports {module}")
             if own == "diffusion" and other in LATENTS_ONLY:
-                found.append(f"{path} imports {module}, but diffusion knows latents only")
-    return found
+                result.append(f"{path} imports {module}, but diffusion knows latents only")
+    return result
 
 
 def import_circle(trees: Mapping[str, ast.AST]) -> list[str]:
@@ -101,24 +101,24 @@ def shared_class_names(trees: Mapping[str, ast.AST]) -> dict[str, list[str]]:
 
 def unsafe_calls(tree: ast.AST, path: str) -> list[str]:
     modules = {m for m, _ in imports(tree, path) if (path, m) not in FOR_OWN_CHILDREN}
-    found = [f"import of {m}" for m in sorted(modules) if m.split(".")[0] in FORBIDDEN_MODULES]
+    result = [f"import of {m}" for m in sorted(modules) if m.split(".")[0] in FORBIDDEN_MODULES]
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call):
             continue
         name = ast.unparse(node.func)
         keywords = {k.arg: k.value for k in node.keywords}
         if name in FORBIDDEN_CALLS:
-            found.append(f"line {node.lineno}: {name}")
+            result.append(f"line {node.lineno}: {name}")
         for keyword in ("shell", "allow_pickle"):
             value = keywords.get(keyword)
             if value is not None and not (isinstance(value, ast.Constant) and value.value is False):
-                found.append(f"line {node.lineno}: {keyword} may be true")
+                result.append(f"line {node.lineno}: {keyword} may be true")
         only = keywords.get("weights_only")
         if name == "torch.load" and not (isinstance(only, ast.Constant) and only.value is True):
-            found.append(f"line {node.lineno}: torch.load without weights_only=True")
+            result.append(f"line {node.lineno}: torch.load without weights_only=True")
     if any(module == "torch" and "load" in names for module, names in imports(tree, path)):
-        found.append("torch.load under another name")
-    return found
+        result.append("torch.load under another name")
+    return result
 
 
 def docstrings(tree: ast.AST) -> set[int]:
@@ -161,11 +161,11 @@ def test_no_file_breaks_the_rule(rule: Callable[[Mapping[str, ast.AST]], Collect
 
 def test_no_code_is_loaded_or_run_no_function_long_and_datasets_are_named_in_data_only() -> None:
     """Kernels, which are written by hand for a machine, may be longer."""
-    assert {path: found for path, tree in TREES.items() if (found := unsafe_calls(tree, path))} == {}
+    assert {path: result for path, tree in TREES.items() if (result := unsafe_calls(tree, path))} == {}
     elsewhere = {path: tree for path, tree in TREES.items() if floor(path) != "data"}
-    assert {path: found for path, tree in elsewhere.items() if (found := dataset_names(tree))} == {}
+    assert {path: result for path, tree in elsewhere.items() if (result := dataset_names(tree))} == {}
     written = {path: tree for path, tree in TREES.items() if not path.startswith("rasterizers/kernels")}
-    assert {path: found for path, tree in written.items() if (found := long_functions(tree))} == {}
+    assert {path: result for path, tree in written.items() if (result := long_functions(tree))} == {}
 
 
 def test_files_stay_short_and_few() -> None:

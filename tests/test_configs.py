@@ -217,8 +217,8 @@ def is_marked(file: str, key: str) -> bool:
     lines = (CONF / f"{file}.yaml").read_text().splitlines()
     number = next(number for number, line in enumerate(lines) if line.strip().startswith(f"{key}:"))
     above = takewhile(lambda line: line.strip().startswith("#"), reversed(lines[:number]))
-    said = " ".join([*above, lines[number].partition("#")[2]])
-    return re.search("not state|states? neither|states? nothing", said) is not None
+    message = " ".join([*above, lines[number].partition("#")[2]])
+    return re.search("not state|states? neither|states? nothing", message) is not None
 
 
 def test_what_the_paper_does_not_state_is_marked() -> None:

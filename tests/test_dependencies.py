@@ -58,15 +58,15 @@ def imported(folder: str) -> dict[str, set[str]]:
     # All of hydra's plugins share a namespace, and hydra finds them by itself.
     own = {"completesplat", "hydra_plugins", *(path.stem for path in (ROOT / "tests").glob("*.py"))}
     others = names - own - set(sys.stdlib_module_names)
-    return {name: {canonicalize_name(found) for found in DISTRIBUTIONS.get(name, [name])} for name in others}
+    return {name: {canonicalize_name(result) for result in DISTRIBUTIONS.get(name, [name])} for name in others}
 
 
 def test_what_is_declared_is_imported_or_has_a_reason_and_nothing_else_is_imported() -> None:
     needed, developers = declared(PROJECT["dependencies"]), declared(EXTRAS["dev"])
     optional = declared(line for name, lines in EXTRAS.items() if name != "dev" for line in lines)
     package, tests = imported("completesplat"), imported("tests")
-    assert {name: found for name, found in package.items() if not found & (needed | optional)} == {}
-    assert {name: found for name, found in tests.items() if not found & (needed | developers)} == {}
+    assert {name: result for name, result in package.items() if not result & (needed | optional)} == {}
+    assert {name: result for name, result in tests.items() if not result & (needed | developers)} == {}
     used = set().union(*package.values())
     assert needed | optional <= used | NEVER_IMPORTED.keys()
     used |= set().union(*tests.values())
@@ -121,27 +121,27 @@ def licences(name: str) -> set[str]:
 
 def tree(lines: Iterable[str]) -> set[str]:
     """The distributions that are installed with these requirements, theirs included."""
-    found: set[tuple[str, str]] = set()
+    result: set[tuple[str, str]] = set()
     waiting = [Requirement(line) for line in lines]
     while waiting:
         requirement = waiting.pop()
         name = canonicalize_name(requirement.name)
-        for extra in {"", *requirement.extras} - {extra for known, extra in found if known == name}:
-            found.add((name, extra))
+        for extra in {"", *requirement.extras} - {extra for known, extra in result if known == name}:
+            result.add((name, extra))
             try:
                 needed = [Requirement(line) for line in distribution(name).requires or ()]
             except PackageNotFoundError:  # of an extra that is not installed here
                 continue
             waiting += [one for one in needed if one.marker is None or one.marker.evaluate({"extra": extra})]
-    return {name for name, _ in found}
+    return {name for name, _ in result}
 
 
 def refused_licences(names: Iterable[str]) -> dict[str, set[str]]:
-    found = {}
+    result = {}
     for name in names:
         with suppress(PackageNotFoundError):
-            found[name] = licences(name) - ALLOWED
-    return {name: others for name, others in found.items() if others}
+            result[name] = licences(name) - ALLOWED
+    return {name: others for name, others in result.items() if others}
 
 
 def test_everything_that_the_wheel_brings_has_a_licence_that_goes_with_its_own() -> None:
@@ -167,6 +167,6 @@ def test_the_lock_file_pins_what_is_declared_with_hashes_and_names_no_place() ->
     assert "torch" not in versions
     for requirement in map(Requirement, [*PROJECT["dependencies"], *EXTRAS["dev"]]):
         if requirement.name != "torch":
-            found = versions[canonicalize_name(requirement.name)]
-            assert found, requirement.name
-            assert all(requirement.specifier.contains(version) for version in found), requirement.name
+            result = versions[canonicalize_name(requirement.name)]
+            assert result, requirement.name
+            assert all(requirement.specifier.contains(version) for version in result), requirement.name

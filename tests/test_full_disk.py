@@ -221,11 +221,11 @@ def test_prepared_data_and_latents_that_do_not_fit(command, pipeline, packed_toy
 def test_a_folder_that_cannot_be_made_is_named_whoever_makes_it(tmp_path, number):
     error = Exception("Error in call to target")
     error.__cause__ = OSError(number, os.strerror(number), str(tmp_path / "new"))
-    said = refusal(error) or ""
-    assert said.startswith(f"{tmp_path}/new: ")
-    assert os.strerror(number) in said
+    message = refusal(error) or ""
+    assert message.startswith(f"{tmp_path}/new: ")
+    assert os.strerror(number) in message
     assert exit_status(error) == 1
-    assert (re.search(rf"{AMOUNT} are free on this disk", said) is None) == (number == errno.EROFS)
+    assert (re.search(rf"{AMOUNT} are free on this disk", message) is None) == (number == errno.EROFS)
     # What is not there, or may not be read, is a fault of its own; and a file without a name is better shown with all.
     assert refusal(FileNotFoundError(errno.ENOENT, "no such file", "x")) is None
     assert refusal(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))) is None

@@ -151,7 +151,7 @@ def test_ply(tmp_path):
         st.sampled_from([*HEADER.split(b"\n"), *HEADER.split(), *splats[:600].split(b"\n"), b"\n", b" ", b"\n" * 3]),
         max_size=30,
     )
-    fuzz(damaged(seeds) | words.map(lambda found: b"ply\n" + b"\n".join(found)), read_plys, examples=60)
+    fuzz(damaged(seeds) | words.map(lambda result: b"ply\n" + b"\n".join(result)), read_plys, examples=60)
 
 
 def test_annotations(tmp_path):

@@ -144,11 +144,11 @@ def calls_of(model, **settings) -> dict[str, list[int]]:
 def test_an_image_is_encoded_once_for_all_samples_and_steps_and_only_as_far_as_skips_reach(
     model, guidance_weight, passes
 ):
-    found = calls_of(model, samples=2, steps=1, skip_weight=0.0)
-    assert found == {"conditioning": [1], "denoiser": [2], "reconstructor": [2]}
-    found = calls_of(model, samples=20, steps=4, guidance_weight=guidance_weight)
+    actual = calls_of(model, samples=2, steps=1, skip_weight=0.0)
+    assert actual == {"conditioning": [1], "denoiser": [2], "reconstructor": [2]}
+    actual = calls_of(model, samples=20, steps=4, guidance_weight=guidance_weight)
     once = {"conditioning": [1], "first level": [1], "skip": [20], "reconstructor": [20]}
-    assert found == {**once, "denoiser": [20 * passes] * 4}
+    assert actual == {**once, "denoiser": [20 * passes] * 4}
 
 
 def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(model, photo, monkeypatch):

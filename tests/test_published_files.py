@@ -66,9 +66,9 @@ REFUSED = {
 
 @pytest.mark.parametrize("kind", REFUSED)
 def test_other_settings_than_those_of_published_weights_are_refused(kind, tmp_path):
-    settings, said = REFUSED[kind]
+    settings, message = REFUSED[kind]
     path = write_published(tmp_path, "hydrants", settings=settings)
-    with pytest.raises(WeightsError, match=rf"config_hydrants.yaml: {re.escape(said)}"):
+    with pytest.raises(WeightsError, match=rf"config_hydrants.yaml: {re.escape(message)}"):
         find(str(path))
 
 
@@ -85,13 +85,13 @@ def test_files_are_read_as_data_only(tmp_path, monkeypatch):
     torch.save({"model_state_dict": {"ray_dirs": Called()}}, path)
     with pytest.raises(WeightsError, match=r"model_hydrants.pth: damaged, or not plain numbers"):
         read_tensors(path)
-    for content, said in (
+    for content, message in (
         ("model: !!python/object/apply:pathlib.Path.touch [called]", "not readable as YAML"),
         ("a: &a [1, 2]\nb: [*a, *a]", "has aliases"),
         ("just text", "data.training_resolution is None"),
     ):
         (tmp_path / "config_hydrants.yaml").write_text(content)
-        with pytest.raises(WeightsError, match=f"config_hydrants.yaml: {said}"):
+        with pytest.raises(WeightsError, match=f"config_hydrants.yaml: {message}"):
             find(str(path))
     assert not Path("called").exists()
     # What else the file holds (the optimizer, `_target_`s) is not looked at.

@@ -93,14 +93,14 @@ def _served(program: list[str], folder) -> subprocess.CompletedProcess[str]:
     """A page is served until it is stopped: until its address is printed."""
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     process = subprocess.Popen(program, cwd=folder, env=os.environ | {"PYTHONUNBUFFERED": "1"}, **streams)
-    said = []
+    message = []
     for line in process.stdout:
-        said.append(line)
+        message.append(line)
         if "http://127.0.0.1" in line:
             process.send_signal(signal.SIGINT)
             process.wait(timeout=LIMIT)
             return subprocess.CompletedProcess(program, 0)
-    return subprocess.CompletedProcess(program, process.wait(), stderr="".join(said))
+    return subprocess.CompletedProcess(program, process.wait(), stderr="".join(message))
 
 
 @pytest.mark.slow

@@ -155,9 +155,9 @@ def test_settings_of_the_working_folder_do_not_widen_what_a_run_may_name(run, tm
 
 
 def test_what_the_user_changes_may_name_anything_and_what_the_package_offers_needs_no_trust(run, elsewhere):
-    found = configuration(run, "model.loss=null", "model.rasterizer._target_=anything.At", "data.root=${oc.env:HOME}")
-    assert found.model.rasterizer._target_ == "anything.At"
-    assert found.data.root == os.environ["HOME"]
+    result = configuration(run, "model.loss=null", "model.rasterizer._target_=anything.At", "data.root=${oc.env:HOME}")
+    assert result.model.rasterizer._target_ == "anything.At"
+    assert result.data.root == os.environ["HOME"]
     name(run, {"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.1}, "model.optimizer")
     assert configuration(run).model.optimizer.lr == 0.1
     with_targets = {path.parent.name for path in conf_folder().glob("*/*.yaml") if "_target_: " in path.read_text()}
@@ -166,7 +166,7 @@ def test_what_the_user_changes_may_name_anything_and_what_the_package_offers_nee
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ("data.batch_size=-1", "data.batch_size=-1: must be at least 1"),
         ("data.rot=x", "ToyObjectsDataModule has no setting rot (data.rot); did you mean root?"),
@@ -176,8 +176,8 @@ def test_what_the_user_changes_may_name_anything_and_what_the_package_offers_nee
         ("seed=3", "seed: no setting of a run's model or data"),
     ],
 )
-def test_changes_are_held_to_what_fit_takes(run, change, said):
-    with pytest.raises(CompleteSplatError, match=re.escape(said)):
+def test_changes_are_held_to_what_fit_takes(run, change, message):
+    with pytest.raises(CompleteSplatError, match=re.escape(message)):
         configuration(run, change)
 
 

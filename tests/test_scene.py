@@ -33,11 +33,11 @@ def test_the_reference_comes_first_with_and_without_a_batch_axis() -> None:
     views = make_scene(2).all_views()
     assert (views.cameras.intrinsics.shape, views.cameras.image_size) == ((4, 3, 3), SIZE)
     expected = torch.tensor([20.0, 21, 22, 23])
-    for found in (views, batch.all_views()[1]):
-        assert torch.equal(found.images[:, 0, 0, 0], expected)
-        assert torch.equal(found.cameras.world_to_camera[:, 0, 3], expected)
-        assert torch.equal(found.masks[:, 0, 0, 0], expected / 100)
-        assert torch.equal(found.depths[:, 0, 0, 0], expected + 1)
+    for result in (views, batch.all_views()[1]):
+        assert torch.equal(result.images[:, 0, 0, 0], expected)
+        assert torch.equal(result.cameras.world_to_camera[:, 0, 3], expected)
+        assert torch.equal(result.masks[:, 0, 0, 0], expected / 100)
+        assert torch.equal(result.depths[:, 0, 0, 0], expected + 1)
 
 
 def test_scenes_with_different_image_sizes_do_not_collate_and_wrong_shapes_are_refused() -> None:

@@ -23,8 +23,8 @@ class OfflineRun:
 
     def only(self, kind: str) -> Any:
         """The one record of a kind (`run`, `exit`)."""
-        (found,) = (getattr(record, kind) for record in self.records if record.WhichOneof("record_type") == kind)
-        return found
+        (result,) = (getattr(record, kind) for record in self.records if record.WhichOneof("record_type") == kind)
+        return result
 
     @property
     def history(self) -> list[dict[str, Any]]:

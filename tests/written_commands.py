@@ -38,9 +38,9 @@ def inline_commands(document: Path) -> list[str]:
 
 def document_commands() -> list[str]:
     """All complete commands of all documents, each once."""
-    found = [command for document in DOCUMENTS for command in block_commands(document)]
-    found += [command for document in DOCUMENTS for command in inline_commands(document) if "=" in command]
-    return list(dict.fromkeys(found))
+    result = [command for document in DOCUMENTS for command in block_commands(document)]
+    result += [command for document in DOCUMENTS for command in inline_commands(document) if "=" in command]
+    return list(dict.fromkeys(result))
 
 
 def help_commands() -> list[str]:

@@ -56,9 +56,9 @@ def mean(model, seen):
 def test_at_step_0_the_posterior_is_the_papers(model):
     seen = views()
     own, _ = model.encoder(seen.images[:, 0])
-    found, _ = model.posterior(seen.images[:, 0], seen, DEPTHS)
-    assert torch.equal(found.mean, own.mean)
-    assert torch.equal(found.log_variance, own.log_variance)
+    result, _ = model.posterior(seen.images[:, 0], seen, DEPTHS)
+    assert torch.equal(result.mean, own.mean)
+    assert torch.equal(result.log_variance, own.log_variance)
 
 
 def test_what_another_view_shows_moves_the_posterior(model):
@@ -87,7 +87,7 @@ def test_a_sweep_finds_the_colours_of_points_where_other_views_see_them():
     seen = views()[:, [0, 1]]
     columns = (torch.arange(SIZE) + 0.5).expand(SIZE, SIZE) / SIZE
     seen = replace(seen, images=torch.stack([columns, columns.T, torch.zeros_like(columns)]).expand(1, 2, 3, -1, -1))
-    found = sweep(seen, DEPTHS, planes=3)
+    result = sweep(seen, DEPTHS, planes=3)
     # The middle plane lies at the harmonic mean of near and far, 1.6; its point (3, 4) between pixels 6 and 7, 8 and 9.
     ray = torch.tensor([(7 - SIZE / 2), (9 - SIZE / 2), seen.cameras.intrinsics[0, 0, 0, 0]])
     point = 1.6 * ray / ray[2]
@@ -96,8 +96,8 @@ def test_a_sweep_finds_the_colours_of_points_where_other_views_see_them():
     toward = point - seen.cameras.centers[0, 1]
     cosine = torch.nn.functional.cosine_similarity(point, toward, dim=0)
     for side in (0, 1):
-        torch.testing.assert_close(found[0, 1, side, :2, 4, 3], place / SIZE * 2 - 1, atol=1e-4, rtol=1e-4)
-        torch.testing.assert_close(found[0, 1, side, 3, 4, 3], cosine, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(result[0, 1, side, :2, 4, 3], place / SIZE * 2 - 1, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(result[0, 1, side, 3, 4, 3], cosine, atol=1e-4, rtol=1e-4)
 
 
 def test_the_sides_of_a_sweep_are_of_views_along_the_ray_and_against_it():
@@ -107,7 +107,7 @@ def test_the_sides_of_a_sweep_are_of_views_along_the_ray_and_against_it():
     poses = torch.cat([reference.world_to_camera[None], others])[None]
     cameras = Cameras(poses, reference.intrinsics.expand(1, 3, 3, 3), (SIZE, SIZE))
     images = torch.tensor([0.5, 0.0, 1.0])[None, :, None, None, None].expand(1, 3, 3, SIZE, SIZE)
-    found = sweep(Views(images, cameras, torch.ones(1, 3, 1, SIZE, SIZE)), DEPTHS, planes=3)
-    along, against = found[0, 1, :, 0, SIZE // 4, SIZE // 4]
+    result = sweep(Views(images, cameras, torch.ones(1, 3, 1, SIZE, SIZE)), DEPTHS, planes=3)
+    along, against = result[0, 1, :, 0, SIZE // 4, SIZE // 4]
     assert along < -0.99
     assert against > 0.99

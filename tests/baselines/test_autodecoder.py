@@ -49,8 +49,8 @@ def test_new_codes_are_small_and_decided_by_the_seed_and_optimized_to_the_minimu
     assert one.std().item() == pytest.approx(0.01, rel=0.1)
     target = torch.linspace(-1, 1, 16).reshape(1, 4, 2, 2)
     with torch.inference_mode():
-        found = optimize_codes(torch.zeros(1, 4, 2, 2), lambda x: (x - target.clone()).square().sum(), 200, 0.05)
-    torch.testing.assert_close(found, target, atol=0.01, rtol=0)
+        result = optimize_codes(torch.zeros(1, 4, 2, 2), lambda x: (x - target.clone()).square().sum(), 200, 0.05)
+    torch.testing.assert_close(result, target, atol=0.01, rtol=0)
 
 
 def test_skips_and_sizes_that_do_not_fit_are_refused():

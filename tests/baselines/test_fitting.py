@@ -61,9 +61,9 @@ def test_the_seed_decides_everything_where_autograd_is_off_too(views):
     torch.testing.assert_close(vars(one), vars(again), atol=0, rtol=0)
     assert not torch.equal(one.means, other.means)
     with torch.inference_mode():
-        found = fit(views.map(torch.clone), 0, settings)
-    assert torch.equal(found.means, one.means)
-    assert not found.means.requires_grad
+        result = fit(views.map(torch.clone), 0, settings)
+    assert torch.equal(result.means, one.means)
+    assert not result.means.requires_grad
 
 
 def test_the_start_lies_on_rays_of_pixels_and_has_their_colors(views):

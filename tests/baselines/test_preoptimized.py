@@ -28,8 +28,8 @@ def at(points: list[tuple[float, float, float]], opacities: list[float]) -> Gaus
     return Gaussians(means, normalize_quaternion(rotations * 2 - 1), 0.01 + scales, torch.tensor([opacities]), colors)
 
 
-def assert_equal(found: Gaussians, expected: Gaussians) -> None:
-    torch.testing.assert_close(vars(found), vars(expected), atol=1e-5, rtol=1e-4)
+def assert_equal(result: Gaussians, expected: Gaussians) -> None:
+    torch.testing.assert_close(vars(result), vars(expected), atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("layer_depths", ["independent", "incremental"])
@@ -53,10 +53,10 @@ def test_of_several_in_a_pixel_the_most_opaque_stay(layers, layer_depths):
     gaussians = at([(1.2, 2.9, 1.1), (1.5, 2.5, 2.0), (1.7, 2.1, 2.5), (1.5, 2.2, 9.0)], [0.2, 0.3, 0.9, 0.6])
     parameterization = Parameterization(layers=layers, layer_depths=layer_depths)
     image, empty = project_to_splatter_image(gaussians, ONE, RANGE, parameterization)
-    found = image.gaussians(ONE, RANGE)
+    result = image.gaussians(ONE, RANGE)
     pixel = torch.arange(layers) * HEIGHT * WIDTH + 2 * WIDTH + 1
-    assert_equal(found[:, pixel], gaussians[:, torch.tensor([2, 3, 1])[:layers]])
-    assert (found.opacities > 1e-12).sum() == layers
+    assert_equal(result[:, pixel], gaussians[:, torch.tensor([2, 3, 1])[:layers]])
+    assert (result.opacities > 1e-12).sum() == layers
     assert empty.sum() == HEIGHT * WIDTH - 1
     assert not empty[0, 2, 1]
 
@@ -76,7 +76,7 @@ def test_scenes_of_a_batch_stay_apart():
     both = Gaussians(*(torch.cat(pair) for pair in zip(vars(one).values(), vars(other).values(), strict=True)))
     image, empty = project_to_splatter_image(both, CAMERAS, DEPTH_RANGE, Parameterization(layers=1))
     assert image.raw.isfinite().all()  # for full opacity too
-    found = image.gaussians(CAMERAS, DEPTH_RANGE)
-    assert_equal(found[:1, :1], one)
-    assert_equal(found[1:, [WIDTH + 2]], other)
+    result = image.gaussians(CAMERAS, DEPTH_RANGE)
+    assert_equal(result[:1, :1], one)
+    assert_equal(result[1:, [WIDTH + 2]], other)
     assert empty.sum(dim=(1, 2)).tolist() == [HEIGHT * WIDTH - 1] * 2

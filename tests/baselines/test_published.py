@@ -54,8 +54,8 @@ def reconstruct(name, folder):
 def test_the_network_equals_upstreams(name, tmp_path):
     gaussians, expected = reconstruct(name, tmp_path), UPSTREAM[name]
 
-    def equal(found, numbers):
-        torch.testing.assert_close(found, torch.tensor(numbers), atol=2e-5, rtol=2e-5)
+    def equal(result, numbers):
+        torch.testing.assert_close(result, torch.tensor(numbers), atol=2e-5, rtol=2e-5)
 
     second = gaussians[1][PICKS]
     equal(second.means, expected["means"])
@@ -65,8 +65,8 @@ def test_the_network_equals_upstreams(name, tmp_path):
     equal(second.colors, expected["from the camera"])
     equal(second.seen_from(torch.tensor([1.0, -0.5, 0.3])).colors, expected["from aside"])
     for part, sizes in MEAN_SIZES.items():
-        found = getattr(gaussians, part).abs().flatten(1).mean(1)
-        equal(found, sizes[name] if part == "means" else sizes)
+        result = getattr(gaussians, part).abs().flatten(1).mean(1)
+        equal(result, sizes[name] if part == "means" else sizes)
 
 
 @pytest.mark.parametrize(("size", "attention", "digest"), [
@@ -122,7 +122,7 @@ CHANGED = {
 
 @pytest.mark.parametrize("kind", CHANGED)
 def test_every_tensor_is_matched(kind, tmp_path):
-    changed, said = CHANGED[kind]
+    changed, message = CHANGED[kind]
     path = write_published(tmp_path, "hydrants", **changed)
-    with pytest.raises(WeightsError, match=rf"model_hydrants.pth: .*{said}"):
+    with pytest.raises(WeightsError, match=rf"model_hydrants.pth: .*{message}"):
         PublishedSplatterImage(str(path))

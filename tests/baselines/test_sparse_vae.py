@@ -80,11 +80,11 @@ def test_raw_values_of_empty_places_are_neither_seen_nor_compared(measured):
 
 def test_errors_are_those_of_single_places(measured):
     image = sparse_image()
-    found = image.raw.clone()
-    found[:, :, 0] += 3 * measured.std[:, 0]  # depth, everywhere
-    found[:, :, 12] += 2 * measured.std[:, 12]  # the first of three colours
-    found[:, :, 4] = 0.0
-    errors = measured.errors(SplatterImage(found, image.parameterization), image)
+    result = image.raw.clone()
+    result[:, :, 0] += 3 * measured.std[:, 0]  # depth, everywhere
+    result[:, :, 12] += 2 * measured.std[:, 12]  # the first of three colours
+    result[:, :, 4] = 0.0
+    errors = measured.errors(SplatterImage(result, image.parameterization), image)
     assert errors["depth"].item() == pytest.approx(9, rel=1e-4)
     assert errors["color"].item() == pytest.approx(4 / 3, rel=1e-4)
     assert [errors[name].item() for name in ("offset", "scale", "rotation")] == [0, 0, 0]

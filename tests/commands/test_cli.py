@@ -59,19 +59,19 @@ def test_help_shows_all_verbs_and_the_settings_of_each(command):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["report", "controls"], "ckpt is needed: give ckpt=VALUE"),
         (["test", "ckpt=nowhere/checkpoints/last.ckpt"], "no such checkpoint"),
         (["data", "toy", "kind=nonsense"], "no toy data of kind 'nonsense'"),
     ],
 )
-def test_refusals_are_one_line_and_status_two(command, arguments, said):
+def test_refusals_are_one_line_and_status_two(command, arguments, message):
     finished = command(*arguments)
     assert finished.status == 2
     assert finished.err.startswith("error: ")
     assert finished.err.count("\n") == 1
-    assert said in finished.err
+    assert message in finished.err
 
 
 @pytest.mark.processes

@@ -34,7 +34,7 @@ def signalled(monkeypatch):
     return patch
 
 
-def said(finished, number):
+def message(finished, number):
     """The checkpoint that the last line names, if any, and the arguments of the command that it says."""
     line = finished.err.splitlines()[-1]
     before, command = line.split(" with: ")
@@ -51,7 +51,7 @@ def test_fit_goes_on_with_the_command_that_it_says(command, toy_root, tmp_path, 
     signalled(ReconstructionModule, "training_step", signal.SIGINT, lambda self: self.global_step == 2)
     finished = command("fit", *FIT, f"data.root={toy_root}", f"out={tmp_path / 'run'}")
     assert finished.status == 130, finished.err
-    checkpoint, again = said(finished, signal.SIGINT)
+    checkpoint, again = message(finished, signal.SIGINT)
     assert checkpoint == f"{tmp_path}/run/checkpoints/last.ckpt"
     assert read_checkpoint(checkpoint)["global_step"] == 3
     assert not (tmp_path / "run/metrics.json").exists()
@@ -65,7 +65,7 @@ def test_a_sweep_ends_with_the_job_that_gets_the_signal(command, toy_root, tmp_p
     given = ["-m", *FIT, f"data.root={toy_root}", "seed=1,2"]
     finished = command("fit", *given, f"out={tmp_path / 'sweep'}")
     assert finished.status == 129
-    checkpoint, again = said(finished, signal.SIGHUP)
+    checkpoint, again = message(finished, signal.SIGHUP)
     assert checkpoint == f"{tmp_path}/sweep/seed-1/checkpoints/last.ckpt"
     assert again == ["fit", *given, f"out={tmp_path / 'sweep'}"]
     assert not (tmp_path / "sweep/seed-2").exists()
@@ -76,7 +76,7 @@ def test_test_does_not_end_as_if_all_was_well(command, pipeline, tmp_path, signa
     given = [f"ckpt={pipeline.var}/checkpoints/last.ckpt", "trust=true", "trainer.accelerator=cpu"]
     finished = command("test", *given, f"out={tmp_path / 'test'}")
     assert finished.status == 143, finished.err
-    assert said(finished, signal.SIGTERM) == ("", ["test", *given, f"out={tmp_path / 'test'}"])
+    assert message(finished, signal.SIGTERM) == ("", ["test", *given, f"out={tmp_path / 'test'}"])
     assert not (tmp_path / "test/metrics.json").exists()
 
 
@@ -87,7 +87,7 @@ def test_latents_leave_no_half_store(command, pipeline, packed_toys, tmp_path, s
     finished = command("data", *given)
     assert finished.status == 143, finished.err
     assert not list((tmp_path / "latents").glob("*.npy"))
-    finished = command(*said(finished, signal.SIGTERM)[1])
+    finished = command(*message(finished, signal.SIGTERM)[1])
     assert finished.status == 0, finished.err
 
 
@@ -136,5 +136,5 @@ def test_a_signal_while_the_run_s_own_files_are_written_leaves_none_of_them_half
     monkeypatch.setattr("completesplat.commands.jobs._record", record)
     finished = command("fit", *FIT, f"data.root={toy_root}", f"out={tmp_path / 'run'}")
     assert finished.status == 143
-    assert said(finished, signal.SIGTERM)[0] == ""
+    assert message(finished, signal.SIGTERM)[0] == ""
     assert {path.name for path in (tmp_path / "run").iterdir()} <= {"config.yaml", ".lock", "commands.log", "fit.log"}

@@ -70,9 +70,9 @@ def test_scenes_of_stage_one_are_those_that_its_test_scores(pipeline, run):
     batch = next(iter(data.test_dataloader()))
     with torch.no_grad():
         expected = module.eval().reconstruct(batch)
-        found = model.generate(batch.reference.images, batch.reference.cameras, batch.depth_range)
+        result = model.generate(batch.reference.images, batch.reference.cameras, batch.depth_range)
     for name, values in vars(expected).items():
-        torch.testing.assert_close(getattr(found, name), values)
+        torch.testing.assert_close(getattr(result, name), values)
     camera = data.typical_camera()
     assert model.fov_degrees.item() == pytest.approx(camera.fov_degrees)
     assert model.depth_range.tolist() == pytest.approx(camera.depth_range)
@@ -97,7 +97,7 @@ def test_weights_of_stage_one_are_scored_as_its_checkpoint_is(command, pipeline,
     finished = command("test", f"weights={pipeline.var}", *data, f"out={tmp_path / 'test'}")
     assert finished.status == 0, finished.err
     scores, own = (strict_json(path / "metrics.json") for path in (tmp_path / "test", pipeline.var))
-    novel, expected = (found["model"]["full"]["novel"] for found in (scores, own["test"]))
+    novel, expected = (result["model"]["full"]["novel"] for result in (scores, own["test"]))
     assert novel["psnr"] == pytest.approx(expected["psnr"], abs=1e-3)
 
 

@@ -45,5 +45,5 @@ def test_optuna_finds_the_better_of_two_settings(command, toy_root, tmp_path):
     finished = command("fit", *sweep, *settings, "out=SEARCH")
     assert finished.status == 0, finished.err
     best = OmegaConf.load(tmp_path / "SEARCH/optimization_results.yaml")
-    found = [strict_json(path)["val/psnr_novel"] for path in tmp_path.glob("SEARCH/*/metrics.json")]
-    assert best.best_value == max(found)
+    result = [strict_json(path)["val/psnr_novel"] for path in tmp_path.glob("SEARCH/*/metrics.json")]
+    assert best.best_value == max(result)

@@ -114,7 +114,7 @@ def test_what_is_begun_runs_as_it_is_written(command, own):
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         (["loss"], "name is needed: give name=VALUE"),
         (["thing", "mine"], "kind=thing: choose one of loss, rasterizer, dataset, ablation, experiment"),
@@ -124,10 +124,10 @@ def test_what_is_begun_runs_as_it_is_written(command, own):
         (["loss", "a", "b"], "give one kind and one name"),
     ],
 )
-def test_what_cannot_be_begun_is_refused(command, own, given, said):
+def test_what_cannot_be_begun_is_refused(command, own, given, message):
     refused = command("new", *given, "out=OUT")
     assert refused.status == 2
-    assert refused.err.startswith(f"error: {said}")
+    assert refused.err.startswith(f"error: {message}")
     assert {path.name for path in own.iterdir()} <= {"mine.py", "conf", "OUT"}
 
 

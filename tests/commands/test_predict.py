@@ -102,14 +102,14 @@ def test_pixels_in_a_box_have_no_influence(predict, tmp_path):
     one = rng.integers(0, 256, (100, 120, 3), dtype=np.uint8)
     other = one.copy()
     other[:, 60:110] = 255 - one[:, 60:110]  # the box, in the central square's pixels 10 to 110
-    found = []
+    result = []
     for name, pixels in (("one", one), ("other", other)):
         image = tmp_path / name / "photo.png"
         image.parent.mkdir()
         Image.fromarray(pixels).save(image)
-        found.append(predict(SHIPPED, "video=[]", image=image, out=f"{name}/out"))
-    assert files(found[0]) == files(found[1])
-    scene = strict_json(found[0] / "scene.json")["settings"]
+        result.append(predict(SHIPPED, "video=[]", image=image, out=f"{name}/out"))
+    assert files(result[0]) == files(result[1])
+    scene = strict_json(result[0] / "scene.json")["settings"]
     assert (scene["box"], scene["mask"], scene["skip_weight"]) == ([0.5, 0, 1, 1], None, 0)
 
 

@@ -184,8 +184,8 @@ def test_an_image_that_fails_is_named_and_does_not_stop_the_others(predict, tmp_
     assert summary == f"error: 2 of 4 images failed (b.jpg, nowhere.png); the others are in {tmp_path / 'out'}"
     done = [line.partition(":")[0] for line in finished.out.splitlines() if "/4 " in line]
     assert done == ["1/4 a.png", "4/4 a.png"]
-    found = [(path.parent.name, path.name) for path in (tmp_path / "out").glob("*/*")]
-    assert sorted(found) == [(a, name) for a in ("a", "a_2") for name in ("sample_00.ply", "scene.json", "sheet.png")]
+    result = [(path.parent.name, path.name) for path in (tmp_path / "out").glob("*/*")]
+    assert sorted(result) == [(a, name) for a in ("a", "a_2") for name in ("sample_00.ply", "scene.json", "sheet.png")]
     assert (tmp_path / "out/a/sample_00.ply").read_bytes() != (tmp_path / "out/a_2/sample_00.ply").read_bytes()
 
 
@@ -225,13 +225,13 @@ def test_a_converter_that_is_missing_is_told_before_the_model_is_loaded(predict,
 
 
 def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_path):
-    for setting, said in (
+    for setting, message in (
         ("formats=[ply,obj]", "formats=obj: choose from ply, splat, glb, spz, sog, html"),
         ("video=zoom", "video=zoom: choose from orbit, swipe, wobble"),
         ("mask=x.png", "mask=FILE belongs to one image"),
     ):
         config = compose_config("predict", "image=[a.png,b.png]", "weights=nowhere", setting)
-        with pytest.raises(CompleteSplatError, match=re.escape(said)):
+        with pytest.raises(CompleteSplatError, match=re.escape(message)):
             run(config, tmp_path)
 
 
@@ -255,7 +255,7 @@ def test_gaussians_that_are_not_finite_reach_no_file(predict, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize(
-    ("own", "trained", "said"),
+    ("own", "trained", "message"),
     [
         (69.0, 50.0, None),  # tan 34.5 / tan 25 = 1.47
         (90.0, 2 * 26.565051, "about 2.0 times too flat"),  # tan 45 = 2 tan 26.57
@@ -263,6 +263,6 @@ def test_gaussians_that_are_not_finite_reach_no_file(predict, tmp_path, monkeypa
         (20.0, 50.0, "the field of view is 20 degrees (from EXIF; fov=DEGREES overrides it), 50 in training"),
     ],
 )
-def test_a_field_of_view_far_from_trainings_is_told_with_what_it_does(own, trained, said):
+def test_a_field_of_view_far_from_trainings_is_told_with_what_it_does(own, trained, message):
     warning = unusual_field_of_view(Photograph(torch.zeros(3, 8, 8), own, "exif"), trained)
-    assert (warning is None) if said is None else (said in warning)
+    assert (warning is None) if message is None else (message in warning)

@@ -65,13 +65,13 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
     scene = model(image)[0]
     assert type(scene) is Gaussians  # which every rasterizer takes
     torch.testing.assert_close(read_ply(folder / "sample_00.ply").colors, scene.colors, atol=1e-5, rtol=0)
-    for settings, said in (
+    for settings, message in (
         (["fov=40"], "image as of 49 degrees"),
         (["sampler=dpm20"], "these weights draw no samples: leave out sampler"),
     ):
         refused = command("predict", *given, *settings)
         assert (refused.status, len(refused.err.splitlines())) == (2, 1)
-        assert said in refused.err
+        assert message in refused.err
     with pytest.raises(CompleteSplatError, match="samples=2: this model draws none"):
         model(image, samples=2)
     with pytest.raises(WeightsError, match="copy these"):
@@ -126,11 +126,11 @@ def test_a_test_sees_objects_only_at_their_depths_and_its_figures_stand_apart(co
     scenes = next(iter(data.test_dataloader()))
     scenes = getattr(scenes, "scenes", scenes)
     assert (scenes.reference.images * (scenes.reference.masks == 0)).max() == 0
-    found = module.eval().reconstruct(scenes)
+    result = module.eval().reconstruct(scenes)
     depths = module.model.depths.range(scenes.depth_range)
     torch.testing.assert_close(depths[:, 1] - depths[:, 0], torch.full((len(depths),), 4.0))
     torch.testing.assert_close(depths[:, 1], scenes.depth_range[:, 1])
-    assert found.means.shape == (len(depths), 32 * 32, 3)
+    assert result.means.shape == (len(depths), 32 * 32, 3)
 
 
 def test_what_is_trained_on_is_predicted_with_from_its_run(command, toy_root, tmp_path):

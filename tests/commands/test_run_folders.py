@@ -131,11 +131,11 @@ def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tm
 
     refused = command(*given)
     assert refused.status == 2
-    said = f"{root}: not the training data that this run had before (2 sequences then, 5 now)"
-    assert refused.err == f"error: {said}; data.allow_changed=true goes on with these\n"
+    message = f"{root}: not the training data that this run had before (2 sequences then, 5 now)"
+    assert refused.err == f"error: {message}; data.allow_changed=true goes on with these\n"
     went_on = command(*given, "data.allow_changed=true")
     assert went_on.status == 0, went_on.err
-    assert said in (run / "commands.log").read_text()
+    assert message in (run / "commands.log").read_text()
     assert strict_json(run / "metrics.json")["steps"] == 2
     assert OmegaConf.load(run / "config.yaml").data.allow_changed
     assert "finished before" in command(*given).out

@@ -46,12 +46,12 @@ def test_what_a_path_stands_for(tmp_path):
 
 def test_what_cannot_be_shown_is_refused(tmp_path):
     folder(tmp_path / "several", "a/sample_00.ply", "b/sample_00.ply")
-    for path, said in (
+    for path, message in (
         ("nowhere.ply", "nowhere.ply: no such file or folder"),
         (".", "neither weights (config.json, model.safetensors, here or in weights/) nor a prediction"),
         ("several", "2 predictions: give one of them"),
     ):
-        with pytest.raises(CompleteSplatError, match=re.escape(said)):
+        with pytest.raises(CompleteSplatError, match=re.escape(message)):
             settings_of(tmp_path / path)
 
 
@@ -86,7 +86,7 @@ def test_what_a_run_writes_is_shown_when_it_is_new(tmp_path, capsys):
     run, shown = run_in_training(tmp_path / "run"), []
     view = SimpleNamespace(samples=newest_scenes(run)[0])
     page = SimpleNamespace(
-        view=view, show=lambda samples, said: (shown.append(said), setattr(view, "samples", samples))
+        view=view, show=lambda samples, message: (shown.append(message), setattr(view, "samples", samples))
     )
     show_newest(page, run)
     assert shown == []

@@ -25,10 +25,10 @@ def photo(path: Path, background: str = "red") -> Path:
 
 
 def test_the_object_stands_on_white_the_right_way_up(rembg, tmp_path):
-    found = read_photograph(photo(tmp_path / "a.png"), 32, remove_background=True).image
+    result = read_photograph(photo(tmp_path / "a.png"), 32, remove_background=True).image
     expected = torch.ones(3, 32, 32)
     expected[:2, 16:, 16:] = 0
-    assert torch.equal(found, expected)
+    assert torch.equal(result, expected)
     read_photograph(tmp_path / "a.png", 16, remove_background=True)
     assert rembg.sessions == ["u2net"]  # loaded once, and not rembg's own choice
     assert read_photograph(tmp_path / "a.png", 32).image[0, 0, 0] == 1
@@ -41,16 +41,16 @@ def test_the_object_is_sought_in_all_of_the_image_and_fills_its_share_of_the_squ
     image.save(tmp_path / "a.png")
     with pytest.raises(ImageError, match="leaves nothing"):
         read_photograph(tmp_path / "a.png", 24, remove_background=True)
-    found = read_photograph(tmp_path / "a.png", 24, remove_background=True, background=0.0, object_share=0.5).image
+    result = read_photograph(tmp_path / "a.png", 24, remove_background=True, background=0.0, object_share=0.5).image
     expected = torch.zeros(3, 24, 24)
     expected[2, 9:15, 6:18] = 1
-    assert torch.equal(found, expected)
+    assert torch.equal(result, expected)
 
 
 def test_an_object_as_long_as_an_image_may_be_is_reduced_before_its_square_is_made(tmp_path):
     Image.new("RGBA", (100_000, 8), (0, 0, 255, 254)).save(tmp_path / "a.png")
-    found = read_photograph(tmp_path / "a.png", 16, object_share=1.0).image
-    assert found[0, 0].min() > 0.9  # white above the line
+    result = read_photograph(tmp_path / "a.png", 16, object_share=1.0).image
+    assert result[0, 0].min() > 0.9  # white above the line
     deep = Image.fromarray(np.full((16, 16), 40_000, np.uint16))
     deep.save(tmp_path / "deep.png", transparency=40_000)
     assert read_photograph(tmp_path / "deep.png", 16, object_share=0.5).image.min() == 1

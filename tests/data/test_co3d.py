@@ -130,16 +130,16 @@ def test_the_fingerprint_tells_other_annotations_and_lists(tmp_path):
     def fingerprint() -> str:
         return CO3DDataModule(str(tmp_path), CATEGORY, image_size=8).source("train").fingerprint()
 
-    found = [fingerprint()]
-    assert fingerprint() == found[0]
+    result = [fingerprint()]
+    assert fingerprint() == result[0]
     for file, edit in (
         (SEQUENCES, lambda entries: entries[0].update(viewpoint_quality_score=0.5)),
         (FRAMES, lambda entries: entries[0]["viewpoint"].update(focal_length=[3, 3.1])),
         (SET_LIST, lambda splits: splits["val"].clear()),
     ):
         change(category / file, edit)
-        found.append(fingerprint())
-    assert len(set(found)) == 4
+        result.append(fingerprint())
+    assert len(set(result)) == 4
 
 
 def test_without_targets_one_image_of_a_scene_is_read_and_the_references_are_the_same(toy_root, monkeypatch):

@@ -99,12 +99,12 @@ R, FOCAL, CENTER = ((CAMERA, key) for key in ("R", "focal_length", "principal_po
 )
 def test_a_bad_frame_is_refused_with_its_place(category, keys, value, kind, part):
     change(category / FRAMES, put(*keys, value=value))
-    found = read(category)
-    (error,) = found.refused
+    result = read(category)
+    (error,) = result.refused
     assert place(error) == (kind, str(category / FRAMES), "a", 2)
     assert part in error.reason
     assert str(error) == f"{category / FRAMES}, a, frame 2: {error.reason}"
-    left = {name: [frame.number for frame in frames] for name, frames in found.splits["train"].frames.items()}
+    left = {name: [frame.number for frame in frames] for name, frames in result.splits["train"].frames.items()}
     assert left == {"a": [0, 1, 3], "b": [0, 1, 2, 3]}
 
 
@@ -136,11 +136,11 @@ BAD_ENTRIES: dict[str, tuple[str, Edit, type[DataError], str | None, int | None,
 def test_a_bad_entry_takes_away_no_more_than_what_it_is_of(name, category):
     file, edit, kind, sequence, frame, part, gone, count = BAD_ENTRIES[name]
     change(category / file, edit)
-    found = read(category)
-    assert place(found.refused[0]) == (kind, str(category / file), sequence, frame)
-    assert part in found.refused[0].reason
-    assert len(found.refused) == count
-    left = {(name, frame.number) for name, frames in found.splits["train"].frames.items() for frame in frames}
+    result = read(category)
+    assert place(result.refused[0]) == (kind, str(category / file), sequence, frame)
+    assert part in result.refused[0].reason
+    assert len(result.refused) == count
+    left = {(name, frame.number) for name, frames in result.splits["train"].frames.items() for frame in frames}
     assert left == {(name, number) for name in "ab" for number in range(4)} - {("a", number) for number in gone}
 
 
@@ -183,14 +183,14 @@ def test_what_nobody_reads_may_be_broken(category):
     """NaN in a number that is not used (Python's `json`, which wrote CO3D, writes it); frames that no list names."""
     change(category / FRAMES, put("mask", "mass", value=NAN))
     change(category / FRAMES, put(*SCALE, value=2))
-    found = read(category)
-    assert found.refused == []
-    assert found.splits["train"].frames["a"][2].depth.scale_adjustment == 2.0
+    result = read(category)
+    assert result.refused == []
+    assert result.splits["train"].frames["a"][2].depth.scale_adjustment == 2.0
     change(category / SET_LIST, lambda splits: splits["train"].remove(next(m for m in splits["train"] if m[1] == 2)))
     change(category / FRAMES, put(CAMERA, value=None))
-    found = read(category)
-    assert [frame.number for frame in found.splits["train"].frames["a"]] == [0, 1, 3]
-    assert found.refused == []
+    result = read(category)
+    assert [frame.number for frame in result.splits["train"].frames["a"]] == [0, 1, 3]
+    assert result.refused == []
 
 
 IMAGE, MASK, DEPTH = (f"a/{part}/frame000002.png" for part in ("images", "masks", "depths"))

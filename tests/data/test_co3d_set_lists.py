@@ -69,13 +69,13 @@ def test_validation_leaves_out_what_is_trained_on(tmp_path):
 @pytest.mark.parametrize("val", ["", "ab"])
 def test_a_seeded_part_of_training_validates_where_nothing_else_does(tmp_path, caplog, val):
     write_tree(tmp_path, COUNTS, APART | {"val": val})
-    found = [names(module(tmp_path, val_fraction=0.4, split_seed=seed)) for seed in (0, 0, 1)]
-    assert found[0] == found[1] != found[2]
-    for taken in found:
+    result = [names(module(tmp_path, val_fraction=0.4, split_seed=seed)) for seed in (0, 0, 1)]
+    assert result[0] == result[1] != result[2]
+    for taken in result:
         assert taken["val"]
         assert sorted(taken["train"] + taken["val"]) == list("abcdef")
         assert taken["test"] == ["h"]
-    assert f"{len(found[0]['val'])} of 6 training sequences validate" in caplog.text
+    assert f"{len(result[0]['val'])} of 6 training sequences validate" in caplog.text
     assert "validates" in module(tmp_path).describe()["split"]
 
 

@@ -63,7 +63,7 @@ def test_what_a_list_leaves_out_is_counted_and_named(root, tmp_path, caplog):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         ({"test0": {**PAIR, "overlap": 0.5}}, "test0: neither null"),
         ({"test0": 3}, "test0: neither null"),
@@ -78,11 +78,11 @@ def test_what_a_list_leaves_out_is_counted_and_named(root, tmp_path, caplog):
         ("test0\ntest1\n", "data.scene_list"),
     ],
 )
-def test_what_is_not_understood_is_refused_with_its_place(root, tmp_path, content, said):
+def test_what_is_not_understood_is_refused_with_its_place(root, tmp_path, content, message):
     with pytest.raises(DataError) as refusal:
         data_of(root, content, tmp_path).store("test")
     assert str(refusal.value).startswith(str(tmp_path / "list"))
-    assert said in str(refusal.value)
+    assert message in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
 

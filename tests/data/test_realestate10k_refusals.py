@@ -241,15 +241,15 @@ def test_entries_of_an_index_that_lead_elsewhere_are_refused(tmp_path, caplog):
     bad = {"b": "../0.torch", "c": str(tmp_path / "0.torch"), "d": "link.torch", "e": ""}
     index = json.loads((folder / "index.json").read_text())
     (folder / "index.json").write_text(json.dumps({**index, **bad}))
-    found = ChunkedClips(folder)
-    assert (found.keys, found.missing) == ([BAD, *INTACT], [])
-    for error, key in zip(found.refused, bad, strict=True):
+    result = ChunkedClips(folder)
+    assert (result.keys, result.missing) == ([BAD, *INTACT], [])
+    for error, key in zip(result.refused, bad, strict=True):
         assert_refusal(error, OutsidePath, folder / "index.json", key, None)
     with pytest.raises(OutsidePath):
         module(tmp_path, on_bad="raise").setup("fit")
     module(tmp_path, on_bad="skip").setup("fit")
     (message,) = {record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING}
-    assert message == f"4 annotations cannot be used; the first: {found.refused[0]}"
+    assert message == f"4 annotations cannot be used; the first: {result.refused[0]}"
 
 
 @pytest.fixture
@@ -271,11 +271,11 @@ def loads(monkeypatch):
 
 def test_two_chunks_in_memory_and_each_read_once_an_epoch(tmp_path, loads):
     names, counts = loads
-    found = ChunkedClips(write(tmp_path / "few"))
+    result = ChunkedClips(write(tmp_path / "few"))
     for key in (BAD, *INTACT[:1], BAD, INTACT[1], BAD, INTACT[0]):
-        found.clip(key)
+        result.clip(key)
     assert names == [f"{number:06}.torch" for number in (0, 1, 2, 1)]  # The chunk of the longest ago went.
-    del found
+    del result
     for split in ("train", "test"):
         write_chunk_form(tmp_path / split, [make_clip(f"{i:02}", frames=3) for i in range(18)], clips_per_chunk=3)
     data = RE10KDataModule(

@@ -59,9 +59,9 @@ def test_an_exact_denoiser_gives_the_data_distribution(ancestral):
     drawn = sampler(velocity, noise, noise).flatten()
     left = drawn < -0.5
     assert left.double().mean().item() == pytest.approx(0.25, abs=0.015)
-    for mode, found in zip(modes, (drawn[left], drawn[~left]), strict=True):
-        assert found.mean().item() == pytest.approx(mode.item(), abs=0.01)
-        assert found.std().item() == pytest.approx(std, abs=0.01)
+    for mode, result in zip(modes, (drawn[left], drawn[~left]), strict=True):
+        assert result.mean().item() == pytest.approx(mode.item(), abs=0.01)
+        assert result.std().item() == pytest.approx(std, abs=0.01)
 
 
 def test_renewed_noise_depends_on_the_first_alone():

@@ -49,8 +49,8 @@ def test_a_perfect_denoiser_takes_ddim_back_to_the_latent(kind, steps):
         left = (noisy - bar.sqrt() * latent) / (1 - bar).sqrt()
         return target(sampler.scheduler, latent, left, timestep)
 
-    found = sampler(perfect, start, torch.zeros(3, 1, 2, 5))
-    torch.testing.assert_close(found, latent, atol=5e-5, rtol=0)
+    result = sampler(perfect, start, torch.zeros(3, 1, 2, 5))
+    torch.testing.assert_close(result, latent, atol=5e-5, rtol=0)
 
 
 def test_another_prediction_type_is_refused_with_the_known_ones():

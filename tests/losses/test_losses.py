@@ -95,8 +95,8 @@ class Constant:
 def test_a_term_takes_part_from_its_start_step(pair, step, total, names):
     late = Constant(3.0)
     terms = {"a": {"weight": 0.5, "term": Constant(1.0)}, "b": {"weight": 2.0, "term": late, "start_step": 10}}
-    found, values = WeightedSum(terms)(prediction(pair[0]), views(pair[1]), step)
-    assert found.item() == pytest.approx(total)
+    result, values = WeightedSum(terms)(prediction(pair[0]), views(pair[1]), step)
+    assert result.item() == pytest.approx(total)
     assert set(values) == names
     assert late.calls == ("b" in names)
 

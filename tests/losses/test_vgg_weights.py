@@ -46,7 +46,7 @@ class Malicious:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    ("key", "value", "text"),
     [
         ("features.28.bias", None, "features.28.bias is missing there"),
         ("features.0.weight", torch.zeros(64, 1, 3, 3), "features.0.weight is [64, 1, 3, 3] there"),
@@ -54,6 +54,6 @@ class Malicious:
         ("features.34.weight", torch.zeros(1), "features.34.weight has no place here"),
     ],
 )
-def test_weights_of_another_layout_are_refused(key, value, said, tmp_path):
+def test_weights_of_another_layout_are_refused(key, value, text, tmp_path):
     changed = {name: tensor for name, tensor in (blank() | {key: value}).items() if tensor is not None}
-    assert said in refusal(saved(changed, tmp_path / "changed.pth"))
+    assert text in refusal(saved(changed, tmp_path / "changed.pth"))

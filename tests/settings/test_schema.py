@@ -33,7 +33,7 @@ GOOD: dict[str, Any] = {
 
 
 @pytest.mark.parametrize(
-    ("setting", "value", "said"),
+    ("setting", "value", "message"),
     [
         ("count", 0, "must be at least 1"),
         ("count", 1.5, "must be a whole number"),
@@ -50,10 +50,10 @@ GOOD: dict[str, Any] = {
         ("by_name", [1], "must be a mapping"),
     ],
 )
-def test_what_does_not_fit_is_named_with_what_it_may_be(setting, value, said):
+def test_what_does_not_fit_is_named_with_what_it_may_be(setting, value, message):
     with pytest.raises(CompleteSplatError) as caught:
         check_settings(task, GOOD | {setting: value})
-    assert str(caught.value) == f"{setting}={value}: {said}"
+    assert str(caught.value) == f"{setting}={value}: {message}"
 
 
 def test_what_fits_is_accepted_and_what_lies_deeper_is_named_with_its_place():

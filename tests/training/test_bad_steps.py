@@ -214,7 +214,7 @@ def test_a_run_with_one_bad_step_says_so_in_json_that_is_valid(command, toy_root
 
     monkeypatch.setattr(ReconstructionModule, "render", failing)
     assert fit(command, toy_root, tmp_path / "run").status == 0
-    found = strict_json(tmp_path / "run/metrics.json")
-    assert found["train/bad_steps"] == 1
-    assert found["train/loss"] is None
-    assert "train/loss: nan" in found["not_finite"]
+    result = strict_json(tmp_path / "run/metrics.json")
+    assert result["train/bad_steps"] == 1
+    assert result["train/loss"] is None
+    assert "train/loss: nan" in result["not_finite"]

@@ -151,11 +151,11 @@ def test_a_finished_store_is_kept_and_not_written_over(root, cache, tmp_path, ca
 
 
 def test_settings_without_a_meaning_and_a_full_disk_are_refused(root, tmp_path, monkeypatch):
-    for options, said in (
+    for options, text in (
         ({"conditioning": Means(frozen=False)}, "needs images"),
         ({"root": root.with_name("raw")}, "run `completesplat data prepare` first"),
     ):
-        with pytest.raises(CompleteSplatError, match=said):
+        with pytest.raises(CompleteSplatError, match=text):
             encode(**{"root": root, "out": tmp_path / "cache"} | options)
     assert not (tmp_path / "cache").exists()
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))

@@ -90,14 +90,14 @@ def test_a_run_that_is_continued_is_bit_equal(settings, whole, tmp_path, monkeyp
     assert any("current_model_state" in name for name in weights(tmp_path / "run")) == (stage != "var")
 
 
-def must_be_equal(whole, found) -> None:
+def must_be_equal(whole, result) -> None:
     """Weights, the rows of `metrics.csv` and the figures in `metrics.json`."""
-    expected, continued = weights(whole), weights(found)
+    expected, continued = weights(whole), weights(result)
     assert expected.keys() == continued.keys()
     same = {name: value == continued[name] for name, value in expected.items()}
     assert [name for name, equal in same.items() if not (equal.all() if isinstance(equal, Tensor) else equal)] == []
-    pandas.testing.assert_frame_equal(rows(whole), rows(found), check_exact=True)
-    assert results(whole) == results(found)
+    pandas.testing.assert_frame_equal(rows(whole), rows(result), check_exact=True)
+    assert results(whole) == results(result)
 
 
 def results(run) -> dict:
@@ -111,8 +111,8 @@ def test_drawing_images_and_samples_does_not_change_training(settings, whole, tm
         kept = [setting for setting in settings[stage] if not setting.startswith(("callbacks.im", "callbacks.sam"))]
         off = [f"callbacks.{name}=null" for name in drawn]
         assert call(monkeypatch, *kept, *off, f"out={tmp_path / stage}") == 0
-        expected, found = (weights(run) for run in (whole(stage), tmp_path / stage))
-        assert all(torch.equal(v, found[k]) for k, v in expected.items() if isinstance(v, Tensor))
+        expected, result = (weights(run) for run in (whole(stage), tmp_path / stage))
+        assert all(torch.equal(v, result[k]) for k, v in expected.items() if isinstance(v, Tensor))
         for name in drawn:
             assert not (tmp_path / stage / name).exists()
             images = sorted(path.name for path in (whole(stage) / name).glob("step_*"))

@@ -188,19 +188,19 @@ def some_drawings(samples: int = 2, views: int = 3) -> SceneDrawings:
     return SceneDrawings(images[0], images[1:], torch.ones(1, views, 1, SIDE, SIDE))
 
 
-def assert_shows(found: torch.Tensor, expected: torch.Tensor) -> None:
-    torch.testing.assert_close(found, expected, atol=0.5 / 255 + 1e-5, rtol=0)
+def assert_shows(result: torch.Tensor, expected: torch.Tensor) -> None:
+    torch.testing.assert_close(result, expected, atol=0.5 / 255 + 1e-5, rtol=0)
 
 
 def test_rows_are_true_images_samples_and_depths_scene_by_scene():
     drawn = [some_drawings(), some_drawings(views=2)]
-    found = cells(samples_sheet(drawn), SIDE, SIDE)
-    assert found.shape[:2] == (8, 3)
+    result = cells(samples_sheet(drawn), SIDE, SIDE)
+    assert result.shape[:2] == (8, 3)
     for top, scene in zip((0, 4), drawn, strict=True):
         views = len(scene.true)
-        assert_shows(found[top, :views], scene.true)
-        assert_shows(found[top + 1 : top + 3, :views], scene.samples)
-    assert (found[4:, 2] == 1).all()
+        assert_shows(result[top, :views], scene.true)
+        assert_shows(result[top + 1 : top + 3, :views], scene.samples)
+    assert (result[4:, 2] == 1).all()
 
 
 def test_scores_are_of_novel_views():
@@ -223,10 +223,10 @@ def test_a_run_writes_samples_and_their_scores(pipeline):
     data.setup("fit")
     # One validation scene with two targets, four samples.
     (scene,) = fixed_scenes(data.val_dataloader(), 2, 8)
-    found = cells(Image.open(run / "samples/step_000002.png"), SIDE, SIDE)
-    assert found.shape[:2] == (1 + 4 + 1, 3)
-    assert_shows(found[0, 0], scene.reference.images)
-    assert_shows(found[0, 1:], scene.targets.images)
+    result = cells(Image.open(run / "samples/step_000002.png"), SIDE, SIDE)
+    assert result.shape[:2] == (1 + 4 + 1, 3)
+    assert_shows(result[0, 0], scene.reference.images)
+    assert_shows(result[0, 1:], scene.targets.images)
     table = pandas.read_csv(run / "metrics.csv")
     columns = [column for column in table if column.startswith("samples/")]
     (row,) = table[["step", *columns]].dropna().to_dict("records")

@@ -125,7 +125,7 @@ def test_the_buckets_losses_average_to_the_total(monkeypatch):
 
 
 def test_encoded_scenes_train_the_same(monkeypatch):
-    batch, found = scenes(0.5), []
+    batch, result = scenes(0.5), []
     for cached in (False, True):
         module, logged = module_of(monkeypatch)
         parts = module.completesplat
@@ -138,24 +138,24 @@ def test_encoded_scenes_train_the_same(monkeypatch):
             inputs = CachedScene(posterior.mean, posterior.log_variance, image, batch.reference_frame, batch.names)
         torch.manual_seed(5)
         module.training_step(inputs, 0).backward()
-        found.append((logged, gradients(module)))
-    (first, first_gradients), (second, second_gradients) = found
+        result.append((logged, gradients(module)))
+    (first, first_gradients), (second, second_gradients) = result
     assert first == second
     assert any(name.startswith("completesplat.conditioning") for name in first_gradients)
     torch.testing.assert_close(first_gradients, second_gradients, atol=0, rtol=0)
 
 
 def test_channels_last_is_the_same_training(monkeypatch):
-    found = []
+    result = []
     for channels_last in (False, True):
         module, logged = module_of(monkeypatch, channels_last=channels_last)
         weight = module.completesplat.denoiser.network.conv_in.weight
         assert weight.is_contiguous(memory_format=torch.channels_last) == channels_last
         torch.manual_seed(5)
         module.training_step(scenes(), 0).backward()
-        found.append((logged["train/loss"], gradients(module)))
-    assert found[0][0] == pytest.approx(found[1][0], rel=1e-5)
-    torch.testing.assert_close(found[1][1], found[0][1], atol=1e-4, rtol=1e-3)
+        result.append((logged["train/loss"], gradients(module)))
+    assert result[0][0] == pytest.approx(result[1][0], rel=1e-5)
+    torch.testing.assert_close(result[1][1], result[0][1], atol=1e-4, rtol=1e-3)
 
 
 def test_a_compiled_denoiser_keeps_its_keys_and_runs_what_the_compiler_returns(monkeypatch):

@@ -63,10 +63,10 @@ def test_the_decoder_is_all_that_the_test_sees(toy_root):
     data.setup("test")
     scenes = next(iter(data.test_dataloader()))
     with torch.inference_mode():
-        found = module.reconstruct(scenes)
+        result = module.reconstruct(scenes)
         decoded = module.vae(module.splatter_image(scenes)).splatter_image
-    assert torch.equal(found.means, decoded.gaussians(scenes.reference.cameras, scenes.depth_range).means)
-    assert found.count == 2 * 32 * 32
+    assert torch.equal(result.means, decoded.gaussians(scenes.reference.cameras, scenes.depth_range).means)
+    assert result.count == 2 * 32 * 32
 
 
 @pytest.fixture

@@ -62,9 +62,9 @@ def test_a_signal_loses_nothing_of_the_steps_before_it(whole, tmp_path, number):
     assert rows(tmp_path) == rows(whole)[: len(rows(tmp_path))]
     fit(tmp_path, every=NEVER)
     assert rows(tmp_path) == rows(whole)
-    expected, found = saved(whole), saved(tmp_path)
-    assert all(torch.equal(found["state_dict"][name], value) for name, value in expected["state_dict"].items())
-    assert found["global_step"] == expected["global_step"] == STEPS
+    expected, result = saved(whole), saved(tmp_path)
+    assert all(torch.equal(result["state_dict"][name], value) for name, value in expected["state_dict"].items())
+    assert result["global_step"] == expected["global_step"] == STEPS
 
 
 def test_a_signal_waits_for_the_end_of_a_step_of_several_batches(tmp_path):

@@ -64,11 +64,11 @@ def run(pipeline, tmp_path_factory):
 @pytest.mark.parametrize("kind", [STAGE1, STAGE2, TEST, MODES])
 def test_a_run_logs_all_that_is_listed_and_nothing_else(run, kind):
     values = run(kind)[0].merged()
-    found = {keys: logged(values, keys, of) for of, runs, names in LOGGED for keys in names.split() if kind in runs}
-    assert [keys for keys, matching in found.items() if not matching] == []
+    result = {keys: logged(values, keys, of) for of, runs, names in LOGGED for keys in names.split() if kind in runs}
+    assert [keys for keys, matching in result.items() if not matching] == []
     media = [key.removesuffix("_type") for key in values if key.endswith("/_type")]
     rest = {key for key in values if not key.startswith(("_", *media))}
-    assert rest - set().union(*found.values()) <= {"epoch", "trainer/global_step", *UNNAMED}
+    assert rest - set().union(*result.values()) <= {"epoch", "trainer/global_step", *UNNAMED}
 
 
 @pytest.mark.slow
