@@ -78,7 +78,7 @@ def test_a_configuration_names_nothing_but_parts_of_a_model(folder, trap, place,
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "text"),
+    ("place", "value", "output"),
     [
         ("denoiser._target_", "mine.Mine", "denoiser names mine.Mine, which is no part of a model; allowed are comp"),
         ("denoiser._target_", "\x1b[2J", r"denoiser names \x1b[2J, which is no part"),
