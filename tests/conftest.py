@@ -137,7 +137,7 @@ class Installed(NamedTuple):
     environment: Path
 
     def run(self, folder: Path, *arguments: str | Path) -> str:
-        """What a program of the environment prints, which must succeed, in a folder."""
+        """Run a program of the environment in a folder, check that it succeeds, and return what it prints."""
         outside = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         command = [self.environment / "bin" / arguments[0], *arguments[1:]]
         done = subprocess.run(command, cwd=folder, env=outside, capture_output=True, text=True)

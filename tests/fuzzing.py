@@ -102,7 +102,7 @@ def fuzz(
 
 @st.composite
 def damaged(draw: Any, seeds: Sequence[bytes], edits: int = 6) -> bytes:
-    """One of some files with up to so many edits: other bytes and numbers, parts left out, repeated, or of another."""
+    """Draw a file with up to `edits` edits: bytes and numbers changed; parts removed, repeated or swapped in."""
     content = bytearray(draw(st.sampled_from(seeds)))
     for _ in range(draw(st.integers(1, edits))):
         place = draw(st.integers(0, len(content)))
@@ -138,7 +138,7 @@ ODD += ["é\u202e\x1b[2J", "1e5", [], {}, [None], [[]], {"": {}}, DEEP, [0] * 10
 
 @st.composite
 def damaged_json(draw: Any, seeds: Sequence[Any], edits: int = 4) -> Any:
-    """A value with up to so many others in it: odd ones, of another place, missing or double."""
+    """Draw a JSON value in which up to `edits` values are odd, from another place, missing or double."""
     content: Any = [copy.deepcopy(draw(st.sampled_from(seeds)))]  # in a list, so that all of it may be another
     scraps = st.sampled_from(ODD) | st.floats() | st.integers() | st.text(max_size=8)
     for _ in range(draw(st.integers(1, edits))):
@@ -168,7 +168,7 @@ def damaged_json(draw: Any, seeds: Sequence[Any], edits: int = 4) -> Any:
 
 
 def json_bytes(content: Any) -> bytes:
-    """As Python writes it, NaN included."""
+    """Return the content as Python's JSON, which may hold NaN."""
     return json.dumps(content).encode()
 
 

@@ -37,7 +37,7 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def parts(config: Any) -> dict[str, Any]:
-    """What a model is built from; `model` refers to it."""
+    """Return the config groups that `model` refers to."""
     resolved = OmegaConf.to_container(config, resolve=True)
     return flat({name: resolved[name] for name in ("autoreconstructor", "loss", "data", "optimizer", "trainer")})
 

@@ -106,7 +106,7 @@ OF_ANOTHER_BUILD = ("nvidia-", "cuda-")
 
 
 def licences(name: str) -> set[str]:
-    """Those of an installed distribution, all of which must be allowed; by SPDX's names where they are known."""
+    """Return the licences of an installed distribution, by their SPDX names where these are known."""
     metadata = distribution(name).metadata
     given = metadata.get("License-Expression") or metadata.get("License") or "UNKNOWN"
     if given == "UNKNOWN" or "\n" in given.strip() or len(given) > 100:  # the text of the licence

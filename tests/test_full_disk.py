@@ -45,7 +45,7 @@ NOISE = torch.rand(4, 3, 64, 64, generator=torch.Generator().manual_seed(0))  # 
 
 @contextmanager
 def quota(most: int) -> Iterator[None]:
-    """No file of this process, and of those that it starts, grows beyond so many bytes.
+    """Keep files of this process and its children from growing beyond `most` bytes.
 
     None keeps compiled modules: Python does not see that they were cut short, and no process could import them again.
     """

@@ -267,7 +267,7 @@ def test_colmap(tmp_path):
         read_all(tmp_path)
 
     def claimed(name: str, place: int, size: int) -> tuple[str, bytes]:
-        """A file that says it has as many of something as numbers of so many bytes can say."""
+        """Return a file whose count at this place is the largest number of `size` bytes."""
         return name, files[name][:place] + b"\xff" * size + files[name][place + size :]
 
     read_models(("", b""))

@@ -78,7 +78,7 @@ def test_a_configuration_names_nothing_but_parts_of_a_model(folder, trap, place,
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "output"),
+    ("place", "value", "reason"),
     [
         ("denoiser._target_", "mine.Mine", "denoiser names mine.Mine, which is no part of a model; allowed are comp"),
         ("denoiser._target_", "\x1b[2J", r"denoiser names \x1b[2J, which is no part"),
@@ -95,16 +95,16 @@ def test_a_configuration_names_nothing_but_parts_of_a_model(folder, trap, place,
         ("training", {"picture_mean": [0.5] * 7}, "must have 8 entries"),
     ],
 )
-def test_settings_are_of_their_kinds_and_within_bounds(folder, place, value, output):
+def test_settings_are_of_their_kinds_and_within_bounds(folder, place, value, reason):
     change(folder, place, value)
     message = refusal(folder)
     assert message.startswith(f"{folder / CONFIG_FILE}: ")
-    assert output in message
+    assert reason in message
     assert len(message) < 1000
 
 
 def test_what_is_no_configuration_at_all_is_refused(folder):
-    for text, output in (
+    for text, reason in (
         ("", "not readable as JSON"),
         ("[" * 100_000, "not readable as JSON"),
         ('{"image_size": ' + "9" * 5000 + "}", "not readable as JSON"),
@@ -113,7 +113,7 @@ def test_what_is_no_configuration_at_all_is_refused(folder):
         (" " * LARGEST_TEXT + "{}", f"{LARGEST_TEXT} are plenty"),
     ):
         (folder / CONFIG_FILE).write_text(text)
-        assert output in refusal(folder)
+        assert reason in refusal(folder)
 
 
 @pytest.mark.parametrize(

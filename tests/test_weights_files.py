@@ -58,7 +58,7 @@ def hub(tmp_path, monkeypatch):
 
 @pytest.fixture
 def url(file):
-    """Of the file's folder."""
+    """Serve the file's folder at this address."""
     handler = partial(SimpleHTTPRequestHandler, directory=str(file.parent))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         Thread(target=partial(server.serve_forever, poll_interval=0.01), daemon=True).start()

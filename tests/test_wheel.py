@@ -15,7 +15,7 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
 def files(folder: str) -> set[str]:
-    """Of the repository, as the wheel names them."""
+    """Return the files of a folder of the repository under the names that they have in the wheel."""
     paths = [path for path in (ROOT / folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
     return {f"{FOLDERS[folder]}/{path.relative_to(ROOT / folder).as_posix()}" for path in paths}
 

@@ -70,7 +70,7 @@ def raw_records(data: bytes) -> Iterator[bytes]:
 
 
 def logged(values: dict[str, Any], keys: str, kind: str) -> set[str]:
-    """Those of the values that have such a key (`*` stands for anything) and are of this kind."""
+    """Return the keys of this kind that match the pattern `keys` (`*` stands for anything)."""
     if kind == "number":
         return {key for key, x in values.items() if fnmatchcase(key, keys) and isinstance(x, float | int)}
     types = {key.removesuffix("/_type"): x for key, x in values.items() if key.endswith("/_type")}

@@ -40,7 +40,7 @@ def scenes(toy_root) -> SceneBatch:
 
 
 def loss(module: ReconstructionModule, scenes: SceneBatch) -> Tensor:
-    """Of every output, with the same posterior noise, skip dropout and dropout in each call."""
+    """Return a loss of every output; posterior noise, skip dropout and dropout are the same in each call."""
     torch.manual_seed(1)
     reconstruction = module(scenes)
     kl = 0.0 if reconstruction.posterior is None else reconstruction.posterior.kl().mean()

@@ -41,7 +41,7 @@ def model():
 
 
 def trained(model):
-    """As after some training: nothing is zero any more."""
+    """Make no parameter of the view encoder zero, as after some training."""
     with torch.no_grad():
         for parameter in model.view_encoder.parameters():
             parameter.add_(0.1 * torch.randn(parameter.shape))

@@ -19,7 +19,7 @@ SHAPE = {"channels": (16, 32), "layers_per_block": 1, "norm_groups": 8}
 
 
 def sparse_image(seed: int = 0, batch: int = 1) -> SplatterImage:
-    """Of random Gaussians, all in view."""
+    """Return a splatter image of random Gaussians, all in view."""
     draws = torch.Generator().manual_seed(seed)
     sizes = (1, 2, 4, 3, 1, 3)
     depths, places, rotations, scales, opacities, colors = (torch.rand(batch, COUNT, n, generator=draws) for n in sizes)

@@ -9,7 +9,7 @@ from completesplat.cli import VERBS
 
 
 def python(program: str, **settings) -> str:
-    """What a program prints in a process of its own."""
+    """Run a program in a new process and return what it prints."""
     started = [sys.executable, "-c", program]
     return subprocess.run(started, capture_output=True, text=True, check=True, **settings).stdout
 
@@ -35,7 +35,7 @@ def test_a_reader_that_goes_away_is_no_fault_of_the_program():
 @pytest.mark.processes
 @pytest.mark.parametrize("given", [None, "7"])
 def test_torch_is_loaded_with_short_waits_of_its_threads(given):
-    """In a process of its own, which ends where torch would be loaded: what counts is the setting at that moment."""
+    """The setting counts at the moment when torch is loaded, so a new process prints it there and ends."""
     program = "import os, sys; sys.argv = ['completesplat', 'data', '--help']; from completesplat.cli import main\n"
     program += "class Watch:\n    def find_spec(self, name, *_):\n        if name == 'torch':\n"
     program += "            print('torch with', os.environ.get('GOMP_SPINCOUNT'), flush=True); os._exit(0)\n"

@@ -86,7 +86,7 @@ def test_images_of_any_name_are_written_below_out(predict, tmp_path, monkeypatch
 
 @pytest.mark.processes
 def test_names_that_are_no_utf_8_are_printed_by_a_process_that_prints_utf_8(tmp_path, tiny_weights):
-    """What pytest puts in the place of the streams prints anything."""
+    """A new process is needed, because pytest's own streams print any name."""
     name, out = os.fsdecode(b"\xff.png"), os.fsdecode(b"out\xff")
     (tmp_path / name).write_bytes(save(tmp_path / "x.png").read_bytes())
     program = "from completesplat.cli import main; main()"

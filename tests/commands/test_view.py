@@ -118,7 +118,7 @@ def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path)
 
 @pytest.mark.processes
 def test_the_page_is_there_before_torch_and_says_that_it_is_loading(tmp_path):
-    """In a process of its own, in which torch is a module that never comes to an end."""
+    """The page runs in a new process, in which importing torch never ends."""
     viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
     from viser.infra import _infra
     from websockets.sync.client import connect

@@ -90,7 +90,7 @@ def test_no_part_depends_on_whether_the_others_are_switched_on(seed: int) -> Non
 
 
 def test_every_other_scene_is_mirrored() -> None:
-    """Of 100 draws, 4 standard deviations to either side."""
+    """The number among 100 draws lies within 4 standard deviations of its mean."""
     count = sum(was_mirrored(augment(scene(), rng(seed), None, None, horizontal_flip=True)) for seed in range(100))
     assert abs(count - 50) < 4 * (100 * 0.25) ** 0.5
 
@@ -142,7 +142,7 @@ def test_hue_rotates_colors_up_to_their_complement_and_keeps_grey_grey() -> None
 
 
 def test_changes_in_any_order_are_kornias() -> None:
-    """As if all views were one image, because the mean grey level is that of all."""
+    """Kornia gets all views as one image, because the mean grey level is that of all views."""
     functions = (
         enhance.adjust_brightness_accumulative,
         enhance.adjust_contrast_with_mean_subtraction,
@@ -196,7 +196,7 @@ def test_a_single_box_is_a_rectangle_with_sides_in_the_stated_range() -> None:
 
 
 def test_images_are_masked_with_the_stated_probability() -> None:
-    """Of 300 draws, 4 standard deviations to either side."""
+    """The number among 300 draws lies within 4 standard deviations of its mean."""
     for probability in (0.5, 0.2, 0.0):
         masked = sum(bool((BoxMasks(probability)(8, 8, rng(seed)) == 0).any()) for seed in range(300))
         assert abs(masked - 300 * probability) <= 4 * (300 * probability * (1 - probability)) ** 0.5

@@ -96,7 +96,7 @@ def test_data_say_what_weights_are_to_know_of_them(toys):
 
 @pytest.mark.slow
 def test_photographs_lie_far_from_toy_objects_and_other_toy_objects_near(tmp_path):
-    """Of 60 toy objects never seen none may be called far; of photographs all are."""
+    """None of 60 unseen toy objects is called far, and every photograph is."""
     size = {"scenes": 200, "frames": 4, "image_size": 64, "make": True}
     toys = ToyObjectsDataModule(str(tmp_path), **size)
     toys.prepare_data()

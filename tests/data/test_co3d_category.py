@@ -104,7 +104,7 @@ def test_unknown_subsets_and_missing_and_outside_categories_are_refused(tmp_path
 
 
 def test_the_single_sequence_form_divides_the_frames_of_one_sequence(tmp_path):
-    """It has lists for many views only, each of one sequence whose frames are divided."""
+    """This form has only many-view lists. Each list divides the frames of one sequence."""
     category = write_tree(tmp_path, {"one": 9, "two": 3}, None)
     parts = {"train": [0, 1, 3, 4], "val": [2, 5], "test": [6, 7, 8]}
     listed = {split: [["one", i, f"{CATEGORY}/one/images/x"] for i in part] for split, part in parts.items()}

@@ -84,7 +84,7 @@ def test_cameras_on_a_sphere_see_its_centre_and_half_their_field_of_view(layout,
 
 
 def test_a_square_around_an_off_centre_principal_point_is_smaller_and_axes_must_meet_in_front():
-    """It lies 0.25 of half the height above the centre."""
+    """The principal point lies 0.25 of half the height above the centre."""
     eyes = orbit(5, radius=4.0)
     frames = [frame(look(CENTER + eye, CENTER, principal_point=[0, 0.25])) for eye in eyes]
     assert from_cameras([frame.camera for frame in frames]).half_size == pytest.approx(0.75 * 4 / 3)

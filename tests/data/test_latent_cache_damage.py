@@ -52,7 +52,7 @@ def read_all(folder: Path) -> None:
 
 
 def test_every_changed_byte_of_every_file_is_refused(copy):
-    """As the manifest's standard deviations, which are read as any others."""
+    """Changed standard deviations in the manifest are refused too."""
     read_all(copy)
     chance = random.Random(0)
     for path in sorted(copy.iterdir()):

@@ -34,7 +34,7 @@ def loader(root: Path, workers: int = 0, **settings) -> SceneLoader:
 
 @pytest.fixture(scope="module")
 def epochs(root) -> list[list[SceneBatch]]:
-    """What is to come in two epochs."""
+    """The expected batches of two epochs."""
     expected = loader(root)
     batches = [epoch(expected, 0), epoch(expected, 1)]
     assert [len(part) for part in batches] == [3, 3]

@@ -64,7 +64,7 @@ def test_cameras_alone_can_be_differentiated() -> None:
 
 
 def test_neighbours_with_equal_depth_in_float32_keep_their_order() -> None:
-    """As in any large scene. The one behind comes first, so that equal keys would leave it in front."""
+    """The rear Gaussian comes first in the list, so equal sort keys would leave it in front."""
     gaussians, _ = scenes(6, 1, 1, (9, 9), CONSTANTS, count=2)
     gaussians.means[0] = torch.tensor([[1.5e-8, 0.0, 2.5], [0.0, 0.0, 2.5]])
     pose = torch.tensor([[0.8, 0, -0.6, 1.5], [0, 1, 0, 0], [0.6, 0, 0.8, 0], [0, 0, 0, 1]])

@@ -33,7 +33,7 @@ def spoilt(weight: torch.Tensor, value: float) -> torch.Tensor:
 
 
 class Faulty(BoringModel):
-    """Has a fault in the batches that it is told, and keeps its weights after every batch."""
+    """A module that has a fault in the given batches and stores its weights after every batch."""
 
     def __init__(self, fault=None, batches=()) -> None:
         super().__init__()

@@ -54,7 +54,7 @@ class Sleeper(BoringModel):
 
 
 def speeds(module: Sleeper, nap: float = 0, **options) -> list[dict[str, float]]:
-    """Rows of an epoch of eight batches of two scenes, each of which takes a nap to load."""
+    """Return the logged rows of one epoch of eight batches of two scenes. Loading a batch takes `nap` seconds."""
     memory = MagicMock(spec=Logger)
     surroundings = {"logger": memory, "callbacks": [Throughput()], "log_every_n_steps": 2, "num_sanity_val_steps": 0}
     trainer = Trainer(max_epochs=1, **surroundings, **QUIET, **options)
@@ -98,7 +98,7 @@ def test_memory_is_that_of_a_process_with_torch(clock):
 
 
 class Drawer(BoringModel):
-    """Draws a number in every step, and before it as many others as it is told."""
+    """A module that draws a random number in every step, after `others` further draws."""
 
     def __init__(self, others: int = 0) -> None:
         super().__init__()
@@ -113,7 +113,7 @@ class Drawer(BoringModel):
 
 
 def drawn(seed: int, others: int = 0) -> list[float]:
-    """Of three epochs of four batches, of which two share an optimizer step."""
+    """Return the numbers of three epochs of four batches; two batches share an optimizer step."""
     module = Drawer(others)
     trainer = Trainer(max_epochs=3, accumulate_grad_batches=2, logger=False, callbacks=[StepSeeds(seed)], **QUIET)
     trainer.fit(module, DataLoader(range(4), generator=torch.Generator()))

@@ -17,7 +17,7 @@ BATCH, SIZE = 2, 32
 
 
 def scenes(share: float = 1.0) -> SceneBatch:
-    """Of whose reference images only the left part is visible."""
+    """Return scenes of whose reference images only the left `share` is visible."""
     batch = scene_batch(BATCH, targets=1, size=SIZE)
     batch.visible[..., round(share * SIZE) :] = 0
     return batch

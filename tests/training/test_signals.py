@@ -120,7 +120,7 @@ def test_outside_of_training_the_first_signal_ends_at_once_in_training_the_secon
 
 
 def test_a_signal_that_is_ignored_as_by_nohup_stays_ignored():
-    """Of two signals that are not ignored, the one with the lower number would be handled first: SIGHUP."""
+    """SIGHUP has the lower number, so it would be handled first if it were not ignored."""
     with process("signal.signal(signal.SIGHUP, signal.SIG_IGN)") as one:
         one.send_signal(signal.SIGHUP)
         one.send_signal(signal.SIGTERM)
@@ -151,7 +151,7 @@ def test_a_program_ends_whose_workers_nobody_has_ended():
 
 
 def test_numbers_of_signals_are_written_to_a_socket_that_is_open_and_to_nothing_else():
-    """Whatever has the number of a closed one, a checkpoint for one, would get a byte with each signal."""
+    """A file that gets a closed socket's number, such as a checkpoint, would get a byte with each signal."""
     with stopped_together():
         launcher._launch_process_observer([])
         assert signal.set_wakeup_fd(-1) == -1

@@ -36,7 +36,7 @@ class Trained(NamedTuple):
 
 
 def train(root: Path, folder: Path, devices: int, *settings: str, dtype: torch.dtype = torch.float32) -> Trained:
-    """In a process of its own: forks of this one, in which threads of any test may have computed, could crash."""
+    """Train in a spawned process, because forks of this one could crash: threads of other tests may have run in it."""
     folder.mkdir()
     multiprocessing.spawn(train_here, (root, folder, devices, settings, dtype))
     with (folder / "metrics.csv").open(newline="") as file:

@@ -218,7 +218,7 @@ def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):
 
 @pytest.fixture
 def space(tiny_weights):
-    """The address of a Space on this machine, in a process of its own."""
+    """The address of a Space that a new process serves on this machine."""
     program = [sys.executable, "-m", "completesplat.viewer.space", str(tiny_weights)]
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(program, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)

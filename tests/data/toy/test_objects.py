@@ -106,7 +106,7 @@ def test_both_families_and_all_patch_colors_occur():
 
 
 def nose_is_dark(scene):
-    """By what is seen: the nose is the only grey thing on the object."""
+    """Return whether the rendered nose is dark. It is the only grey thing on the object."""
     image, coverage, _ = render_frame(scene, 0, 64)
     pixels = image[coverage > 0.99]
     grey = pixels[np.ptp(pixels, axis=-1) < 0.03 * pixels.max(-1)]
