@@ -22,7 +22,7 @@ $(READY): pyproject.toml $(if $(LOCKED),requirements.lock)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
 	@touch $(READY)
 
-# The scenes have another seed than those of the weights' training. The held-out image is the first frame of the last one.
+# The scenes have another seed than those of the weights' training. The held-out image is the first frame of the last scene.
 demo: $(READY) ## Complete two images with the weights in the package, and score them (CPU, minutes)
 	rm -rf $(DEMO)
 	$(BIN)/completesplat data toy kind=objects scenes=$(DEMO_SCENES) seed=1000 out=$(DEMO)/data

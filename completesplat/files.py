@@ -75,10 +75,10 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(path: Path, size: int = 0, temporary: Path | None = None) -> Iterator[None]:
-    """Raise DiskError if the operating system refuses what the block writes to `path`, `size` bytes at least.
+    """Raise DiskError if the operating system refuses to let the block write `path`, of at least `size` bytes.
 
-    If `temporary` is given, a file or folder that is to become `path`, a test write to it finds the reason of an
-    exception that names none.
+    `temporary` is the file or folder that will become `path`. If an exception gives no reason, a test write to
+    `temporary` finds it.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""The images of a sheet (`completesplat.export.images`) that has no title, as they were before it was drawn."""
+"""Reader of the images on an untitled sheet of `completesplat.export.images`, at their original size."""
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ MARGIN, LINE, GAP, READABLE_SIDE = 12, 20, 6, 144
 
 
 def cells(sheet: Image.Image, height: int, width: int) -> torch.Tensor:
-    """[row column 3 height width], in [0, 1]: every pixel is a square of one colour."""
+    """Return [row column 3 height width] in [0, 1]; check that the sheet shows each pixel as a square of one colour."""
     factor = round(READABLE_SIDE / max(height, width))
     tall, wide = height * factor, width * factor
     pixels = np.asarray(sheet)[MARGIN + LINE : GAP - MARGIN or None, MARGIN : GAP - MARGIN or None]

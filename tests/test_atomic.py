@@ -8,7 +8,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.files import atomic_path, file_refusal, make_folder, write_text
 
 
-def test_a_file_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
+def test_a_written_file_replaces_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "x.txt"
     for text in ("one", "two ±"):
         write_text(path, text)
@@ -16,7 +16,7 @@ def test_a_file_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_after_an_exception_the_old_file_is_as_it_was_and_nothing_lies_beside_it(tmp_path: Path) -> None:
+def test_an_exception_leaves_the_old_file_unchanged_and_no_unfinished_one(tmp_path: Path) -> None:
     path = tmp_path / "x.txt"
     path.write_text("old")
     with pytest.raises(ZeroDivisionError) as caught, atomic_path(path) as temporary:
@@ -27,7 +27,7 @@ def test_after_an_exception_the_old_file_is_as_it_was_and_nothing_lies_beside_it
 
 
 @pytest.mark.parametrize("name", ["x.txt", ".x.txt.unfinished"])
-def test_a_link_in_the_place_of_a_file_or_of_its_unfinished_one_is_replaced(tmp_path: Path, name: str) -> None:
+def test_a_link_at_the_path_of_a_file_or_of_its_unfinished_version_is_replaced(tmp_path: Path, name: str) -> None:
     target = tmp_path / "target"
     target.write_text("kept")
     (tmp_path / name).symlink_to(target)
@@ -44,7 +44,7 @@ def test_a_folder_that_is_a_link_is_refused(tmp_path: Path) -> None:
         make_folder(tmp_path / "folder")
 
 
-def test_only_errors_that_name_a_bad_file_name_are_refusals(tmp_path: Path) -> None:
+def test_only_errors_about_unusable_file_names_become_refusals(tmp_path: Path) -> None:
     for name, message in (("x" * 5000, "name too long"), (f"{tmp_path}", "exists"), (f"{__file__}/x", "Not a dir")):
         with pytest.raises(OSError, match=message) as caught:
             Path(name).mkdir()

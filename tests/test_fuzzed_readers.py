@@ -1,7 +1,7 @@
-"""Damaged files, for every reader of files that strangers make: it returns or refuses, in bounded memory and time.
+"""Fuzzing of every reader of untrusted files: it must return or refuse, in bounded memory and time.
 
-`make fuzz` gives each reader as long as it is told; here it gets a few files, the same every time. What broke one is
-kept beside it.
+`make fuzz` fuzzes each reader for a given time. The tests give it a few damaged files, the same ones every time.
+Files that broke a reader are added to its test as `cases`.
 """
 
 import copy
@@ -55,11 +55,11 @@ pytestmark = [
 ]
 PIXELS = np.random.default_rng(0).integers(0, 256, (12, 16, 4), dtype=np.uint8)
 COMPRESSIONS = (None, "tiff_lzw", "tiff_adobe_deflate", "jpeg", "packbits")
-MOST_MEMORY_OF_A_PHOTO = 2**31  # of 50 million pixels, which are allowed
+MOST_MEMORY_OF_A_PHOTO = 2**31  # for the largest allowed photo, of 50 million pixels
 
 
 def each(*reads: Any) -> None:
-    """Call readers of the same file, whichever of them refuse it."""
+    """Call all readers of a file, even if some of them refuse it."""
     for read in reads:
         with suppress(CompleteSplatError):
             read()
@@ -72,7 +72,7 @@ def encoded(pixels: np.ndarray, form: str, mode: str | None = None, **options: A
 
 
 def photos() -> dict[str, list[bytes]]:
-    """Small files of all formats and most modes, by format."""
+    """Return small image files of all formats and most modes, by format."""
     rgb, grey, alpha = PIXELS[..., :3], PIXELS[..., 0], PIXELS[..., 3].astype(np.uint16) * 200
     record = Image.Exif()
     record[ORIENTATION] = 6
@@ -267,7 +267,7 @@ def test_colmap(tmp_path):
         read_all(tmp_path)
 
     def claimed(name: str, place: int, size: int) -> tuple[str, bytes]:
-        """Return a file whose count at this place is the largest number of `size` bytes."""
+        """Return a file whose count of `size` bytes at `place` claims the largest possible number of entries."""
         return name, files[name][:place] + b"\xff" * size + files[name][place + size :]
 
     read_models(("", b""))

@@ -18,14 +18,14 @@ from completesplat.data.packed.rows import CODECS
 from completesplat.data.packed.writing import prepare
 from completesplat.settings.schema import Entries, Natural, OneOf, Positive
 
-MakeData = Callable[..., SceneDataModule]  # takes the settings that are still open (root, workers)
+MakeData = Callable[..., SceneDataModule]  # takes the remaining settings, such as root and workers
 
 
 class Objects(TypedDict):
     """Objects in the layout of CO3D.
 
-    `write` (out) makes the scenes, `data` (settings) their data module. `references_per_sequence` holds the number of
-    items of each training sequence in an epoch, for the forms `raw` and `prepared`.
+    `write(out=...)` writes the scenes, and `data(...)` makes their data module. `references_per_sequence` gives, for
+    the forms `raw` and `prepared`, how many items of an epoch come from each training sequence.
     """
 
     write: Callable[..., object]
@@ -34,7 +34,7 @@ class Objects(TypedDict):
 
 
 class Rooms(TypedDict):
-    """Clips in the layout of RealEstate10K: `write` (out) makes them, `data` (settings) their data module."""
+    """Clips in the layout of RealEstate10K: `write(out=...)` writes them, and `data(...)` makes their data module."""
 
     write: Callable[..., Path]
     data: MakeData
@@ -58,11 +58,11 @@ def run(
 
     Args:
         objects, rooms: makers of scenes and of their data modules; False skips the rooms.
-        workers: numbers of loading processes; everything is measured with each of them.
+        workers: numbers of loading processes; everything is measured once with each number.
         repeats: number of timed epochs of each form.
         codecs: codecs of the packed stores.
     """
-    # Dozens of data modules would log their numbers of sequences.
+    # Without this, each of dozens of data modules would log its number of sequences.
     logger = logging.getLogger("completesplat.data")
     level = logger.level
     logger.setLevel(logging.WARNING)
@@ -98,7 +98,7 @@ def _rooms(settings: Rooms, codecs: Sequence[str], folder: Path) -> dict[str, Ma
 
 
 def prepared(data: MakeData, folder: Path, codecs: Sequence[str]) -> dict[str, MakeData]:
-    """Prepare the training sequences of a data module once with each codec in `folder`.
+    """Pack the training sequences of a data module into `folder`, once with each codec.
 
     Returns:
         Makers of the modules that read the prepared forms, by name.
@@ -112,9 +112,9 @@ def prepared(data: MakeData, folder: Path, codecs: Sequence[str]) -> dict[str, M
 
 
 def rows(forms: Mapping[str, MakeData], workers: Sequence[int], repeats: int, tick: Callable[[str], None]) -> list[Row]:
-    """Return a row per number of workers and form: rates of batches, scenes and images, and speed-up to the first form.
+    """Return a row per number of workers and form: rates of batches, scenes and images, and speed-up over the first.
 
-    The forms take turns. The median of `repeats` epochs counts for each form, after an untimed one in which workers
+    The forms take turns. The time of a form is the median of `repeats` epochs, after an untimed epoch in which workers
     start and files come into memory.
     """
     result: list[Row] = []
@@ -143,7 +143,7 @@ def rows(forms: Mapping[str, MakeData], workers: Sequence[int], repeats: int, ti
 
 
 def read_epoch(loader: SceneLoader, number: int) -> Epoch:
-    """Read all batches of an epoch and do nothing with them."""
+    """Read all batches of an epoch, without using them, and time it."""
     if loader.sampler is not None:
         loader.sampler.set_epoch(number)
     batches = scenes = images = 0

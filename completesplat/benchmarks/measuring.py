@@ -15,7 +15,7 @@ WARM_UP = 2  # untimed calls
 
 
 def milliseconds(work: Work) -> float:
-    """Return the time of one call, until the GPU, if there is one, has finished it."""
+    """Return the time of one call in ms, including its work on the GPU."""
     start = now()
     work()
     return (now() - start) * 1e3
@@ -24,10 +24,10 @@ def milliseconds(work: Work) -> float:
 def report(
     path: Path, results: Mapping[str, object], tables: Mapping[str, Sequence[Row]], device: object = "cpu"
 ) -> None:
-    """Write results to a JSON file; print where they were measured, tables, and why others were not measured.
+    """Write results to a JSON file; print the machine, the tables, and the reasons for what was not measured.
 
     Args:
-        results: content of the file, with the reasons in `not_measured`, by name; by default it is from this machine.
+        results: content of the file; `not_measured` has reasons by name, and `machine` is by default this one.
         tables: rows by title.
         device: "cuda", or anything else for the processor.
     """

@@ -221,7 +221,7 @@ class WholeTraining(TypedDict):
 def cost(
     measured: str, trainings: Mapping[str, WholeTraining], gpus: Annotated[Sequence[Positive], Entries(1)], out: Path
 ) -> None:
-    """Write `cost.json`, and print the days that each training takes on each number of GPUs, by measured steps.
+    """Write `cost.json`, and print the days that each training takes on each number of GPUs, from measured steps.
 
     Raises:
         CompleteSplatError: `measured` is not a result of `bench paper`, or has no training steps.

@@ -27,7 +27,7 @@ Weights = Annotated[Sequence[Share], Entries(1)]
 
 
 class Run(TypedDict):
-    """A run of stage 2 (`Trained`), the number of its first test scenes, and the number of samples of each."""
+    """Run of stage 2 (`Trained`), how many of its first test scenes are used, and how many samples each scene gets."""
 
     ckpt: str
     overrides: Sequence[str]

@@ -1,4 +1,4 @@
-"""`completesplat view`: a page in the browser that shows scenes and draws new ones."""
+"""`completesplat view`: a page in the browser that shows scenes and samples new ones."""
 
 import time
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ def run(config: DictConfig, out: Path) -> None:
     from completesplat.viewer.access import start_server, stop_server
 
     config.update(settings_of(Path(config.path)) if config.path is not None else {})
-    if config.scene is None and config.watch is None and ":" not in config.weights:  # a colon: `splatter_image:NAME`
+    if config.scene is None and config.watch is None and ":" not in config.weights:  # as in `splatter_image:NAME`
         check_name(config.weights)
     background = 0.5 if config.background == REMOVE else config.background
     server = start_server(0 if config.export is not None else config.port, background)
@@ -89,7 +89,7 @@ def settings_of(path: Path) -> dict[str, str]:
 
 
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
-    """Create a server's page and fill it with what the settings name."""
+    """Create a server's page and fill it with the scenes or the model that the settings name."""
     with importing():
         import torch
         from hydra.utils import instantiate

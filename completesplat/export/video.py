@@ -27,7 +27,7 @@ def orbit_views(
     background: float,
     up: Float[Tensor, "3"],
 ) -> tuple[Frames, Float[Tensor, "frame 1 height width"]]:
-    """Call `render_views` for a full turn about the pivot and the direction up, starting at the reference camera."""
+    """Call `render_views` for a full turn around the upward axis through the pivot, from the reference camera on."""
     return render_views(rasterizer, gaussians, orbit(reference, pivot, up, frames), background)
 
 

@@ -15,8 +15,8 @@ def structural_similarity(
 ) -> Float[Tensor, "image channel height width"]:
     """Return the SSIM of each pixel (Wang et al. 2004), for values in [0, 1], in the images' precision.
 
-    The Gaussian window is applied as two products with banded matrices, three to five times as fast on a CPU as
-    convolutions. The image is mirrored beyond its border, so it must have more than 5 pixels a side.
+    The Gaussian window is applied as two products with banded matrices, which are three to five times as fast as
+    convolutions on a CPU. The image is mirrored beyond its border, so it must have more than 5 pixels a side.
     """
     with torch.autocast(first.device.type, enabled=False):
         rows, columns = (blur_matrix(size, first.dtype, first.device) for size in first.shape[-2:])
@@ -29,7 +29,7 @@ def structural_similarity(
 
 
 @cache
-@torch.inference_mode(False)  # the matrix of a test serves a training later, too
+@torch.inference_mode(False)  # because a training may use the matrix that a test has cached
 def blur_matrix(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "{size} {size}"]:
     """Return the matrix that applies the window along an axis: its rows sum to 1."""
     offsets = torch.arange(-RADIUS, RADIUS + 1)

@@ -1,4 +1,4 @@
-"""Loss terms of the reconstruction stage (paper, Eq. 1) without weights of their own."""
+"""Unweighted loss terms of the reconstruction stage (paper, Eq. 1)."""
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -16,7 +16,7 @@ class MeanSquaredError:
 
 
 class StructuralDissimilarity:
-    """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term, which may also mean half of it)."""
+    """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term; the paper may mean half of it)."""
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
         return 1 - structural_similarity(prediction.images.flatten(0, 1), truth.images.flatten(0, 1)).mean()

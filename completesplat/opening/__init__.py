@@ -1,7 +1,7 @@
-"""The door for models: what a name of weights means, and what may pass before anything is built (SECURITY.md).
+"""Opening of models: find the files that `weights` names, and check them before anything is built (SECURITY.md).
 
-Weights may name only the parts in `parts`. Configs of runs may name all parts of models and data in `conf/`, and the
-user's modules if the run is trusted (`check_names`).
+The config of weights may name only the parts in `parts`. The config of a run may name all parts of models and data in
+`conf/`, and the user's modules if the run is the user's or trusted (`check_names`).
 """
 
 import os
@@ -54,13 +54,13 @@ ONLY_FOR_TRAINING = (
     "model.completesplat.conditioning.pretrained",
     "model.loss.terms.lpips",
 )
-"""Weights that training reads before its first step or for its loss; a checkpoint holds what became of them."""
+"""Settings of weights that only training reads, for its start or its loss. Checkpoints hold the trained weights."""
 GROUPS = {"ablation", "autoreconstructor", "conditioning", "data", "denoiser", "experiment", "loss", "model"}
 GROUPS |= {"objective", "optimizer", "posterior", "rasterizer", "regressor", "sampler", "schedule"}
 """Groups of `conf/` that models and data are composed of."""
 TARGET = re.compile(r"_target_: *([\w.]+)")
 OPTIMIZER = re.compile(r"torch\.optim\.[A-Z]\w*")
-# For each stage of a run: the key of the model in its config and of the tensors in its checkpoints.
+# By class of a stage: the key of its model in a run's config, and the prefix of its tensors in checkpoints.
 STAGES = {
     "completesplat.training.latent_diffusion.LatentDiffusion": "completesplat",
     "completesplat.training.reconstruction.ReconstructionModule": "model",
@@ -68,15 +68,15 @@ STAGES = {
 
 
 def locate(weights: Path | str) -> Path:
-    """Return the file of tensors that `weights` means.
+    """Return the tensor file that `weights` stands for.
 
     Args:
         weights: a name of shipped weights, a folder of weights or of a run, a checkpoint, an id on the Hugging Face
-            hub, or published weights of Splatter Image (`is_published`). A run means its final weights, or before they
-            exist its newest checkpoint, even if there is none yet.
+            hub, or published weights of Splatter Image (`is_published`). A run stands for its final weights or, before
+            they exist, for its newest checkpoint, which may not exist yet either.
 
     Raises:
-        WeightsError: there is no such folder, files are missing, or one has another checksum.
+        WeightsError: there is no such folder, a file is missing, or its checksum differs.
     """
     name, path = str(weights), Path(weights).expanduser()
     if is_published(weights):
@@ -100,9 +100,9 @@ def locate(weights: Path | str) -> Path:
 
 
 def read_saved(file: Path) -> tuple[dict[str, Any], Mapping[str, Tensor]]:
-    """Read a model's checked config and its tensors by name, averaged ones if a run averages its weights.
+    """Read and check a model's config and its tensors by name; read averaged tensors if a run averages its weights.
 
-    The file is one from `locate`, and not Splatter Image's.
+    The file comes from `locate` and does not hold published weights of Splatter Image.
 
     Raises:
         WeightsError: the config or the tensors cannot be read, name parts that weights may not name, or do not belong
@@ -122,13 +122,13 @@ def read_saved(file: Path) -> tuple[dict[str, Any], Mapping[str, Tensor]]:
 
 
 def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -> Any:
-    """Return model and data of the config saved beside a checkpoint's folder, with changes that `fit` accepts.
+    """Return `model` and `data` of the config of a checkpoint's run, with `overrides`, which `fit` must accept.
 
-    The file may come from anyone (`check_names`); the changes may name anything.
+    The config may come from anyone, so `check_names` limits what it names. The overrides may name anything.
 
     Raises:
-        WeightsError: the checkpoint or its config is missing or not readable, or the config names something else.
-        CompleteSplatError: the changes cannot be read, or `fit` would refuse them, too.
+        WeightsError: the checkpoint or its config is missing or unreadable, or `check_names` refuses the config.
+        CompleteSplatError: the overrides cannot be read, or `fit` would refuse them, too.
     """
     if not checkpoint.is_file():
         raise WeightsError(f"{checkpoint}: no such checkpoint")
@@ -141,7 +141,7 @@ def architecture_of_run(checkpoint: Path) -> tuple[dict[str, Any], str]:
     """Return the config of a run's model, and the prefix of its tensors in the run's checkpoints.
 
     Raises:
-        WeightsError: the config cannot be read, its model makes no scene from an image, or as `check_architecture`.
+        WeightsError: the config cannot be read, its model makes no scene from an image, or `check_architecture` fails.
     """
     path, config = _read(checkpoint)
     plain = _plain(config)
@@ -162,7 +162,7 @@ def architecture_of_run(checkpoint: Path) -> tuple[dict[str, Any], str]:
 
 
 def _read(checkpoint: Path) -> tuple[Path, Any]:
-    """Return the path of the config of a checkpoint's run, and the config's model and data."""
+    """Return the path of the config of a checkpoint's run, and its sections `model` and `data`."""
     path = checkpoint.absolute().parent.parent / RUN_CONFIG_FILE
     if not path.is_file():
         raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
@@ -170,7 +170,7 @@ def _read(checkpoint: Path) -> tuple[Path, Any]:
         config = OmegaConf.masked_copy(OmegaConf.create(read_small(path)), SECTIONS)  # type: ignore[arg-type]
     except WeightsError:
         raise
-    except Exception as error:  # of YAML and of OmegaConf
+    except Exception as error:  # YAML and OmegaConf raise errors of many types
         raise WeightsError(f"{path}: not a run's configuration ({type(error).__name__})") from error
     if not all(isinstance(_plain(config).get(section), Mapping) for section in SECTIONS):
         raise WeightsError(f"{path}: not the configuration of a run of fit, which has {' and '.join(SECTIONS)}")
@@ -178,7 +178,7 @@ def _read(checkpoint: Path) -> tuple[Path, Any]:
 
 
 def _plain(config: object) -> dict[str, Any]:
-    """Return a config as plain containers, with its references to other settings as they are written."""
+    """Convert a config to plain containers, without resolving its references to other settings."""
     return dict(OmegaConf.to_container(config, resolve=False))  # type: ignore[arg-type]
 
 
@@ -202,7 +202,7 @@ def _changed(config: Any, overrides: list[str]) -> Any:
 def without_training(config: Any) -> Any:
     """Remove from a config what only training needs: other weights (`ONLY_FOR_TRAINING`), and a GPU.
 
-    Where there is a GPU, `rasterizer=auto` is the same as `cuda`.
+    `rasterizer=cuda` becomes `auto`, which is the same where there is a GPU.
     """
     for key in ONLY_FOR_TRAINING:
         parent, _, name = key.rpartition(".")
@@ -215,20 +215,20 @@ def without_training(config: Any) -> Any:
 
 
 def check_names(config: object, source: Path, run: Path, trust: bool) -> None:
-    """Refuse a config of the file `source` that names anything but parts of models and data, which may be the user's.
+    """Refuse a config from the file `source` that names anything but parts of models and data.
 
-    It may name what `conf/` names for models and data, or an optimizer of torch. Where the run is trusted, or belongs
-    to the user, it may also name the user's modules, such as those in the working folder.
+    A config may name what `conf/` names for models and data, and optimizers of torch. If the run is trusted or belongs
+    to the user, the config may also name the user's modules, such as those in the working folder.
 
     Args:
-        run: the run's folder, without links. It is the user's if the user owns it and `source`, and it lies below the
-            working folder.
+        run: the run's folder, with links resolved. It belongs to the user who owns it and `source`, if it lies below
+            the working folder.
 
     Raises:
         WeightsError: the config names something else.
     """
     for name, value in _strings(config):
-        # `fit` writes what it has resolved; a resolver can read the environment and more.
+        # `fit` writes resolved values. References are refused because a resolver can read the environment and more.
         if "${" in value:
             refusal = f"{source}: {shown(value)} refers to something else"
             raise WeightsError(f"{refusal}, which a run's configuration does not")
@@ -262,18 +262,18 @@ def _strings(config: object, name: object = "") -> Iterator[tuple[object, str]]:
 
 
 def _belongs_to_user(file: Path, run: Path) -> bool:
-    """Whether a run lies below the working folder and is the user's, who has then made or brought it there.
+    """Whether the user owns a run below the working folder, and has therefore made it or brought it there.
 
-    In the run's folder itself, modules that came with it would count as the user's.
+    The working folder itself must not be the run's, because modules that came with it would pass as the user's.
     """
     return Path.cwd() in run.parents and {run.stat().st_uid, file.stat().st_uid} == {os.getuid()}
 
 
 def _is_users_module(target: str) -> bool:
-    """Whether the target is defined in a module that is neither this package's nor of Python's installation."""
+    """Whether the module that defines the target is neither part of this package nor installed with Python."""
     top = target.partition(".")[0]
     try:
-        spec = find_spec(top)  # of a name without a dot: nothing is imported
+        spec = find_spec(top)  # imports nothing, because the name has no dot
     except (ImportError, ValueError):
         return False
     if spec is None or top == "completesplat":
@@ -285,7 +285,7 @@ def _is_users_module(target: str) -> bool:
         part = get_object(target)
     except (ImportError, ValueError) as error:
         raise WeightsError(f"{target}: cannot be imported ({error})") from error
-    # A user's module leads to others, by the names that it imports.
+    # A user's module also holds what it imports from others, which may not be named.
     return str(getattr(part, "__module__", None)).partition(".")[0] == top
 
 

@@ -1,4 +1,4 @@
-"""Tables of our scores, one for each protocol, so that all rows of a table compare."""
+"""Tables of our scores, one for each protocol, so that the rows of a table can be compared."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,7 +29,7 @@ LEADING = {"method": "method", "speed": "rendering speed", **COST, "scenes": "sc
 
 ALIKE = ["name", "data_set", "subset", "split", "resolution", "crop", "background", "precision", "scenes", "skipped"]
 ALIKE += ["views", "protocol_views", "scene_list"]
-"""Entries of the protocol that, with data and settings of the metrics, are equal in all rows of a table."""
+"""Entries of the protocol that are equal in all rows of a table, as are the data and the settings of the metrics."""
 DESCRIBED = [*ALIKE, "image_size", "scenes_listed", "samples", "criterion", "seed", "sampler", "steps", "skip_weight"]
 DESCRIBED += ["guidance_weight", "ema", "commit"]
 """Entries of the protocol that the note on a row states."""
@@ -47,7 +47,7 @@ Measured = TypeVar("Measured")
 
 
 def alike(measurements: Iterable[tuple[Measured, Protocol]], *more: str) -> list[list[Measured]]:
-    """Group measurements by equal protocols, in a fixed order: scores compare within a group only."""
+    """Group measurements by equal protocols, in a fixed order; only scores within a group can be compared."""
     groups: dict[str, list[Measured]] = {}
     for measured, protocol in measurements:
         values: Mapping[str, object] = protocol
@@ -57,7 +57,7 @@ def alike(measurements: Iterable[tuple[Measured, Protocol]], *more: str) -> list
 
 
 def described(protocol: Protocol, keys: Sequence[str] = DESCRIBED) -> str:
-    """Describe in one line how something was measured."""
+    """Describe a protocol in one line."""
     values: Mapping[str, object] = protocol
     known = {key: value for key in keys if (value := values.get(key)) is not None}
     parts = [f"{key} {len(value) if isinstance(value, list) else value}" for key, value in known.items()]
@@ -89,7 +89,7 @@ class Entry:
         return bool(self.scores.get(UPPER_BOUND))
 
     def method(self, notes: Notes) -> Cell:
-        """Return the method, which of its samples were scored, and the number of the note on how they were measured."""
+        """Return the method, its kind of sampling, and the number of the note that describes the protocol."""
         protocol, label = self.run.protocol, self.predictor.replace("_", " ")
         if self.ours:
             samples = protocol.get("samples", 1)
@@ -102,7 +102,7 @@ class Entry:
         return Cell(f"{OURS}{label} [{_note(self.run, notes)}]")
 
     def cell(self, name: str, notes: Notes) -> Cell:
-        """Return a cell with the score `REGION_VIEW_METRIC`, or with the number of the note on why there is none."""
+        """Return a cell with the score `REGION_VIEW_METRIC`, or with the number of the note on why it is missing."""
         if (value := self.scores.get(name)) is not None:
             return Cell(format(value, FORMATS[name.rpartition("_")[2]]), value=value)
         return notes.missing(name, self.run.protocol, f"not measured for {self.predictor}")
@@ -173,7 +173,7 @@ def _score_table(name: str, entries: Sequence[Entry]) -> Table:
 
 
 def _known(entry: Entry, column: str) -> bool:
-    """Return whether a column has a figure, or a reason why it has none."""
+    """Return whether an entry has the score of a column, or a stated reason for lacking it."""
     region, _, name = column.split("_")
     stated = name in entry.run.protocol.get("missing", {}) and any(key.startswith(region) for key in entry.scores)
     return stated or column in entry.scores
@@ -193,7 +193,7 @@ def _mode_table(name: str, runs: Sequence[Result]) -> Table:
             label = str(run.protocol.get("method", "model")) if method == MODEL else method.replace("_", " ")
             cells = [Cell(f"{scores[key]:.3f}", value=scores[key]) for key in MODE_SCORES]
             cells += [Cell(f"{scores[key]:g}") for key in ("scenes", "samples")]
-            # Methods other than the model are the same in all runs.
+            # Methods other than the model may have the same scores in several runs, and are then shown once.
             key, source = (run.name, "ours") if method == MODEL else ((label, *cells), "known")
             rows[source].setdefault(key, [Cell(f"{label} [{_note(run, notes)}]"), *cells])
     headings = [Heading("method", figures=False), *map(Heading, [*MODE_SCORES.values(), "scenes", "samples"])]

@@ -65,8 +65,8 @@ class PrintedColumn:
 class PublishedTable:
     """Table of the paper and the protocol of its figures; the head of `figures.yaml` explains each entry.
 
-    `evaluations` are the `resolution`, `protocol_views` and numbers of `scenes` that a run by one of our protocols must
-    have; without `scenes`, it has all scenes of the list.
+    `evaluations` has, by name of our protocol, the `resolution`, `protocol_views` and numbers of `scenes` that a run
+    must have; without `scenes`, it must have all scenes of the list.
     """
 
     name: str

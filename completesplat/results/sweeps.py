@@ -112,7 +112,7 @@ def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> SweepRow:
     means = {name: fmean(each) for name, each in values.items() if len(each) == len(jobs)}
     if predictor != MODEL:
         return SweepRow(label, None, scenes, None, bound, means, {})
-    # An infinite PSNR has no deviation.
+    # An infinite PSNR has no standard deviation.
     finite = {name: all(map(math.isfinite, values[name])) for name in means if len(jobs) > 1}
     deviations = {name: stdev(values[name]) if known else math.nan for name, known in finite.items()}
     return SweepRow(label, len(jobs), scenes, _common(job.steps for job in jobs), bound, means, deviations)

@@ -111,7 +111,7 @@ class Notes:
         return self.texts.index(text) + 1
 
     def missing(self, column: str, protocol: Protocol, otherwise: str) -> Cell:
-        """Return a cell for a missing score, which refers to a note on the protocol's reason, or on `otherwise`."""
+        """Return a cell that refers to a note on why a score is missing: the protocol's reason, or else `otherwise`."""
         metric = column.rpartition("_")[2]
         reason = protocol.get("missing", {}).get(metric, otherwise)
         return Cell(f"missing: note {self.number(f'{metric}: {reason}')}")
@@ -181,7 +181,7 @@ def records_table(title: str, records: Sequence[Mapping[str, object]]) -> Table:
 
 
 def _written(value: object) -> str:
-    """Return a value as text: nothing for None, and four digits of floats, or all those before the point."""
+    """Return a value as text: empty for None; a float below 1000 has four digits, a larger one no decimals."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return "" if value is None else str(value)
     return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1000 else f"{value:,.0f}"

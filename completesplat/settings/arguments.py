@@ -1,4 +1,4 @@
-"""The arguments behind a verb, rewritten for Hydra: words, file names with any characters, and settings."""
+"""Conversion of the arguments behind a verb to Hydra's: words, file names with any characters, and settings."""
 
 import os
 import re
@@ -17,7 +17,7 @@ WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--info"
 """Hydra's flags that take the next argument as their value."""
 SWEEP = ("-m", "--multirun")
 WORDS = {"predict": ("image",), "view": ("path",), "new": ("kind", "name")}
-"""Settings that words without `=` give, by verb."""
+"""By verb, the settings whose values are given as words without `=`."""
 MOST_SHOWN = 120  # characters of a value
 
 
@@ -28,7 +28,7 @@ def quoted(text: str) -> str:
 
 
 def behind_dashes(arguments: Sequence[str]) -> list[str]:
-    """Remove `--`. No argument behind it is a flag, so `-name.png` becomes `./-name.png` there."""
+    """Remove `--`. The arguments behind it are not flags, so `-name.png` becomes `./-name.png` there."""
     before = list(arguments).index("--") if "--" in arguments else len(arguments)
     behind = [f"./{argument}" if argument.startswith("-") else argument for argument in arguments[before + 1 :]]
     return [*arguments[:before], *behind]
@@ -59,11 +59,11 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
     """Return flags and settings as Hydra reads them, the flags first.
 
     `data TASK` is short for `data_task=TASK`, `predict A B` for `image=[A,B]`, `view PATH` for `path=PATH`, and
-    `new KIND NAME` for `kind=KIND name=NAME`. The name of an existing file or folder is taken literally, as `a,b.jpg`.
+    `new KIND NAME` for `kind=KIND name=NAME`. The name of an existing file or folder is taken literally: `a,b.jpg`.
 
     Raises:
-        CompleteSplatError: a flag lacks its value, there are too many words, a setting is given both ways, a word is no
-            setting, a value cannot be read, several values come without `-m`, or `out=` is empty.
+        CompleteSplatError: a flag lacks its value, there are too many words, a setting is given as a word and by `=`, a
+            word is no setting, a value cannot be read, several values come without `-m`, or `out=` is empty.
     """
     flags, others = split_flags(arguments)
     if verb in WORDS:
@@ -77,7 +77,7 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
 
 
 def _with_words(verb: str, arguments: Sequence[str]) -> list[str]:
-    """Rewrite words, which contain no `=` or name a file, as values of the settings in `WORDS`."""
+    """Rewrite words as values of the settings in `WORDS`. A word contains no `=`, or is the name of a file."""
     words = [word for word in arguments if ("=" not in word and not word.startswith("~")) or os.path.isfile(word)]
     settings = [argument for argument in arguments if argument not in words]
     keys = WORDS[verb]

@@ -197,10 +197,10 @@ def _steps(trainer: Trainer) -> str:
 class Throughput(Callback):
     """Callback that logs speed and memory at the trainer's interval.
 
-    `speed/scenes_per_second` (of all processes) and `speed/data_wait`, the share of the time in which training waited
-    for data, cover the steps since the last row; for memory see `memory`. All are means over the processes. The clock
-    stops during validation, while checkpoints are written, and from a row to the next batch. Drawing of images is
-    therefore not counted if its interval is a multiple of the trainer's and this callback comes first.
+    A row covers the steps since the last one. It has `speed/scenes_per_second` of all processes, `speed/data_wait`, the
+    share of the time in which training waited for data, and the values of `memory`; all are means over the processes.
+    The clock stops during validation, while checkpoints are written, and from a row to the next batch. Drawing of
+    images is therefore not counted if its interval is a multiple of the trainer's and this callback comes first.
     """
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -278,7 +278,7 @@ class DataClock(Profiler):
 
 
 def memory(device: torch.device) -> dict[str, float]:
-    """Return in GiB: `memory/process_gb`, this process's memory (on Linux), and `memory/gpu_gb`, torch's maximum."""
+    """Return `memory/process_gb`, that of this process (on Linux), and `memory/gpu_gb`, torch's peak, both in GiB."""
     values = {}
     if STATUS.exists():
         lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())

@@ -45,7 +45,7 @@ PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 Rows = dict[str, Shaped[np.ndarray, "image _ _ _"]]
 Sums = Float[np.ndarray, "3 channel"]
 Reference = tuple[PosedSequence, int]
-"""A sequence, and the place of the image to encode."""
+"""A sequence, and the index of its frame to encode."""
 
 logger = logging.getLogger(__name__)
 
@@ -62,17 +62,17 @@ def fingerprint(module: nn.Module) -> str:
 def fingerprints(
     autoreconstructor: VariationalAutoReconstructor, conditioning: nn.Module | None
 ) -> tuple[str, str | None]:
-    """Return fingerprints of all weights that latents depend on, and of a frozen conditioning (else None)."""
+    """Return the fingerprint of all weights that latents depend on, and that of a frozen conditioning, else None."""
     encoder, views = autoreconstructor.encoder, autoreconstructor.view_encoder
     latents = fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
     return latents, fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
 
 
 def check_cache(store: LatentCache, autoreconstructor: VariationalAutoReconstructor, conditioning: nn.Module) -> None:
-    """Raise WeightsError if a cache was made with other networks. (The data module compares data and their settings.)
+    """Raise WeightsError if a cache was made with other networks. (The data module checks data and their settings.)
 
     Args:
-        conditioning: needs its stored features if it is frozen, else stored images.
+        conditioning: the run's; the cache must hold its features if it is frozen, else images.
     """
     latents, features = fingerprints(autoreconstructor, conditioning)
     if store.origin.encoder != latents:
@@ -91,7 +91,7 @@ def encoded(
     precision: torch.dtype,
     device: torch.device | str,
 ) -> Rows:
-    """Return the rows "mean", "log_variance" and "condition" of these scenes' references, by frozen networks."""
+    """Encode the reference images of scenes; return the rows "mean", "log_variance" and "condition"."""
     scenes = scenes.to(device)
     images = scenes.reference.images
     views = scenes.all_views() if autoreconstructor.sees_views else None
@@ -108,7 +108,7 @@ def encoded(
 def moment_sums(
     mean: Float[np.ndarray, "row channel _ _"], log_variance: Float[np.ndarray, "row channel _ _"]
 ) -> Float[np.ndarray, "3 channel"]:
-    """Return count and sums of h and h^2 over all encoded elements of each channel, in float64, without samples."""
+    """Return each channel's number of elements and expected sums of h and h^2, in float64, without sampling h."""
     mean, variance = mean.astype(np.float64), np.exp(log_variance.astype(np.float64))
     total, squares = mean.sum((0, 2, 3)), (np.square(mean) + variance).sum((0, 2, 3))
     return np.stack([np.full_like(total, mean[:, 0].size), total, squares])
@@ -135,17 +135,17 @@ def encode_training_set(
 ) -> LatentCache:
     """Encode every frame of every sequence of a packed training set, without augmentation.
 
-    A finished store is not changed; an interrupted run leaves no readable one. Several processes share the batches.
+    A finished cache stays unchanged; that of an interrupted run is unreadable. Several processes share the batches.
 
     Args:
-        frames: the largest number of frames of a sequence, evenly spaced; None: all.
+        frames: at most this many frames of a sequence, evenly spaced; None: all.
         views: number of other views, evenly spread over the sequence, for a posterior that sees views.
-        precision: "float32", or "float16" for half the space, with relative errors of at most 2^-11 in means (the
-            diffusion's first timestep adds noise of 0.029 to latents of unit variance) and 0.8% in variances.
+        precision: "float32", or "float16" for half the space, with relative errors of at most 2^-11 in means and 0.8%
+            in variances. (The diffusion's first timestep adds noise of 0.029 to latents of unit variance.)
         conditioning: frozen network from images to features, which are stored; None: the images are stored.
 
     Raises:
-        DataError: data not packed or damaged, no space, another store in the folder, or encodings that are not finite.
+        DataError: damaged or unpacked data, too little space, another cache in the folder, or encodings not finite.
     """
     views = views if autoreconstructor.sees_views else 0
     source = _packed(data)
@@ -169,7 +169,7 @@ def encode_training_set(
         _write_store(out, origin, blank, batches, sequences)
     else:
         deque(batches, maxlen=0)
-    gathered(None)  # the others wait for the manifest
+    gathered(None)  # the other processes wait until the manifest is written
     return LatentCache(out)
 
 
@@ -184,7 +184,7 @@ def _packed(data: SceneDataModule) -> PackedSource:
 def _references(
     source: PackedSource, frames: int | None, sequences: list[CachedSequence], progress: bool
 ) -> Iterator[Reference]:
-    """Yield all references, by row; append each of their sequences to `sequences`."""
+    """Yield all references in the order of rows; append each sequence to `sequences` before its references."""
     rows = 0
     for name in track(source.names, "encoding sequences", disable=not (progress and is_first())):
         sequence = source.read(name)
@@ -205,9 +205,9 @@ def _encoded_batches(
     encode: Callable[[SceneBatch], Rows],
     batch_size: int,
 ) -> Iterator[tuple[Rows, Sums]]:
-    """Yield the rows and moment sums of all batches, in order; all processes must iterate: each encodes a share.
+    """Yield rows and moment sums of all batches in order. Each process encodes a share, so all must iterate.
 
-    The sums are computed before rows are sent, because their order in memory then changes, and with it the rounding.
+    Sums are computed before rows are sent, because sending changes the rows' memory order and so the rounding.
     """
     rank, count = processes()
     while group := list(islice(references, count * batch_size)):
@@ -241,7 +241,7 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
 def _write_store(
     out: Path, origin: Origin, blank: Rows, batches: Iterator[tuple[Rows, Sums]], sequences: Sequence[CachedSequence]
 ) -> None:
-    """Write rows like those of `blank`, and the manifest. `batches` completes `sequences`."""
+    """Write all rows, with the shapes and types of `blank`, then the manifest. Reading `batches` fills `sequences`."""
     total = np.zeros(())
     with ExitStack() as files:
         writers = {

@@ -19,7 +19,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.files import write_text, writing
 
 START_SECONDS = 6
-"""Time for W&B's server to start a run; it delays training at most by this."""
+"""How long W&B's server may take to start a run; training is delayed by no more than this."""
 AXIS = "trainer/global_step"
 
 logger = logging.getLogger(__name__)

@@ -184,7 +184,7 @@ class ReconstructionModule(Stage):
 
 
 class ReconstructorOnly(ReconstructionModule):
-    """Supplement, "Reconstructor-only without the Encoder": codes of images are optimised, not predicted.
+    """Reconstructor whose image codes are optimised (supplement, "Reconstructor-only without the Encoder").
 
     Codes and reconstructor are trained jointly; a test image gets a new code for the fixed reconstructor.
 
@@ -215,7 +215,7 @@ class ReconstructorOnly(ReconstructionModule):
             raise CompleteSplatError("model=reconstructor_only trains in one process: set trainer.devices=1")
 
     def save_weights(self, folder: Path) -> None:
-        """Write none, because a photo has no code."""
+        """Write no weights, because a new photo has no code."""
 
     def forward(self, scenes: SceneBatch, others: int = 0) -> Reconstruction:
         """Reconstruct training images from their codes; in evaluation, reconstruct any image from a new code."""

@@ -40,7 +40,7 @@ def intact(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def damaged(intact: Path, tmp_path: Path) -> Path:
-    """A category that may be damaged."""
+    """Copy the intact category, so that a test may damage it."""
     return shutil.copytree(intact, tmp_path / "data/set") / "toy_objects"
 
 
@@ -55,11 +55,11 @@ def test_every_planted_fault_is_found_and_nothing_else(command, intact, damaged,
     assert (finished.status, results["refused"]) == (0, [])
     assert results["usable"] == {"sequences": SCENES, "frames": 3 * SCENES}
 
-    # One fault of each sort: an image, an annotation, a whole sequence, a list. The readers' tests have the others.
+    # One fault of each sort: an image, an annotation, a whole sequence, a list. The readers' tests cover the others.
     image, pose, cloud, sound, *_ = sorted(path.name for path in damaged.iterdir() if (path / "images").is_dir())
     cut_short(damaged / image / "images/frame000002.jpg")
     cut_short(damaged / cloud / "pointcloud.ply")
-    edit(damaged / SET_LIST, lambda lists: lists["train"].append([sound, 99]))  # which is not annotated
+    edit(damaged / SET_LIST, lambda lists: lists["train"].append([sound, 99]))  # frame 99 has no annotation
 
     def plant(entries: list[dict]) -> None:
         entry = [entry for entry in entries if entry["sequence_name"] == pose][1]

@@ -1,4 +1,4 @@
-"""The paper's first experiment from files in CO3D's layout to its figures."""
+"""Stage 1 of the paper, from files in the layout of CO3D to metrics."""
 
 from co3d_trees import CATEGORY, write_tree
 from hydra.utils import instantiate
@@ -9,7 +9,7 @@ from support import strict_json
 LISTS = {"train": "abcdef", "val": "g", "test": "hi"}
 
 
-def test_stage1_starts_from_a_vae_is_tested_on_sequences_never_seen_and_continues_without_the_vae(command, tmp_path):
+def test_stage1_starts_from_a_vae_tests_on_unseen_sequences_and_resumes_without_the_vae(command, tmp_path):
     write_tree(tmp_path / "co3d", dict.fromkeys("abcdefghi", 4), LISTS)
     random_vae().save_pretrained(tmp_path / "vae")
     run = tmp_path / "run"

@@ -54,13 +54,13 @@ def tours(tmp_path_factory) -> Path:
     return write_tours(tmp_path_factory.mktemp("tours"))
 
 
-def test_objects_give_the_same_batches(toy_root, packed_objects):
+def test_packed_objects_give_the_same_batches(toy_root, packed_objects):
     assert_same_batches(objects(toy_root), objects(packed_objects))
     assert objects(toy_root).typical_camera() == objects(packed_objects).typical_camera()
     assert torch.equal(objects(toy_root).mean_image(), objects(packed_objects).mean_image())
 
 
-def test_tours_give_the_same_batches(tours, tmp_path):
+def test_packed_tours_give_the_same_batches(tours, tmp_path):
     store = prepared(clips(tours), tmp_path / "store")
     assert_same_batches(clips(tours), clips(store))
     index = {"test0": {"context": [4, 0], "target": [1, 5]}, "test3": {"context": [0, 5], "target": [3]}, "test4": None}
@@ -69,7 +69,7 @@ def test_tours_give_the_same_batches(tours, tmp_path):
     assert_same_batches(clips(tours, **chosen), clips(store, **chosen))
 
 
-def test_an_evaluation_index_means_frames_also_where_some_were_left_out(tours, tmp_path):
+def test_an_evaluation_index_uses_original_frame_numbers_even_if_frames_were_left_out(tours, tmp_path):
     root = write_tours(tmp_path / "broken")
     sorted((root / "test/test0").glob("*.jpg"), key=lambda path: int(path.stem))[2].write_bytes(b"")
     store = prepared(clips(root), tmp_path / "store", max_bad_fraction=0.5)
@@ -81,7 +81,7 @@ def test_an_evaluation_index_means_frames_also_where_some_were_left_out(tours, t
         list(clips(store, on_bad="raise", **chosen).test_dataloader())
 
 
-def test_only_settings_that_change_nothing_of_what_was_prepared_are_free(packed_objects):
+def test_only_settings_that_do_not_affect_prepared_data_may_change(packed_objects):
     for name, value in (("image_size", 99), ("subset", None), ("split_seed", 1)):
         with pytest.raises(DataError, match=name):
             objects(packed_objects, **{name: value}).setup("fit")
@@ -91,7 +91,7 @@ def test_only_settings_that_change_nothing_of_what_was_prepared_are_free(packed_
     assert set(targets.masks.unique().tolist()) == {0.0, 1.0}
 
 
-def test_resuming_on_other_data_is_refused_and_prepared_data_are_no_other(toy_root, packed_objects, tours, caplog):
+def test_resuming_on_other_data_is_refused_but_prepared_data_count_as_the_same(toy_root, packed_objects, tours, caplog):
     state = objects(toy_root).state_dict()
     with caplog.at_level(logging.WARNING):
         objects(packed_objects).load_state_dict(state)
@@ -104,7 +104,7 @@ def test_resuming_on_other_data_is_refused_and_prepared_data_are_no_other(toy_ro
     assert "not the training data that this run had before (2 sequences then" in caplog.messages[0]
 
 
-def test_the_data_of_a_run_are_those_of_its_begin(toy_root, tmp_path):
+def test_the_state_of_a_run_describes_the_data_that_it_started_with(toy_root, tmp_path):
     root = shutil.copytree(toy_root, tmp_path / "toys")
     state = objects(root).state_dict()
     data = objects(root)

@@ -39,10 +39,10 @@ def test_frames_come_back_in_order_and_upright(tmp_path):
 def test_odd_sizes_are_padded_and_small_ones_enlarged(tmp_path, caplog):
     write_video(tmp_path / "a.mp4", torch.rand(2, 3, 171, 57))
     assert read(tmp_path / "a.mp4")[0].shape == (2, 856, 286, 3)
-    assert "resizing" not in caplog.text  # what imageio says when it scales the frames instead
+    assert "resizing" not in caplog.text  # imageio would log this if it scaled the frames
 
 
-def test_nothing_to_show_or_another_format_is_refused(tmp_path):
+def test_no_frames_another_format_and_nan_are_refused(tmp_path):
     black, broken = torch.zeros(1, 3, 64, 64), torch.full((2, 3, 64, 64), torch.nan)
     for name, frames, message in (
         ("a.mp4", black[:0], "needs"),
@@ -55,23 +55,23 @@ def test_nothing_to_show_or_another_format_is_refused(tmp_path):
 
 
 def ball(center, color):
-    """One opaque round Gaussian."""
+    """Return one opaque round Gaussian."""
     quaternions, scales = torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.2)
     return Gaussians(torch.tensor([center]), quaternions, scales, torch.tensor([1.0]), torch.tensor([color]))
 
 
-def test_the_pivot_stays_in_the_centre_at_one_distance_before_the_background():
+def test_the_pivot_stays_in_the_centre_at_the_same_distance_in_front_of_the_background():
     images, depth = orbit_views(
         ReferenceRasterizer(), ball([0.0, 0.0, 3.0], [1.0, 0.5, 0.0]), CAMERA, PIVOT, 10, 0.75, UP
     )
-    assert images.shape == (10, 3, 33, 33)  # more than are rendered at a time
+    assert images.shape == (10, 3, 33, 33)  # more views than are rendered at a time
     torch.testing.assert_close(depth[:, 0, 16, 16], torch.full((10,), 3.0), rtol=0, atol=1e-4)
     torch.testing.assert_close(images[:, :, 16, 16], torch.tensor([1.0, 0.5, 0.0]).expand(10, 3), rtol=0, atol=3e-3)
     assert (images[:, :, 0, 0] == 0.75).all()
     assert (depth[:, :, 0, 0] == 0).all()
 
 
-def test_the_first_view_is_the_reference_view_and_the_axis_is_up():
+def test_the_first_view_is_the_reference_view_and_the_axis_points_up():
     gaussians = ball([0.3, -0.5, 3.0], [1.0, 0.0, 0.0])
     world_to_camera = torch.eye(4)
     world_to_camera[:3, :3] = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
@@ -83,7 +83,7 @@ def test_the_first_view_is_the_reference_view_and_the_axis_is_up():
         images, _ = orbit_views(rasterizer, here, camera, pivot, 4, 0.0, -camera.world_to_camera[1, :3])
         direct = rasterizer(here[None], camera[None, None])
         torch.testing.assert_close(images[0], direct.over(0.0)[0, 0], rtol=0, atol=1e-5)
-        # Half a turn about the camera's vertical mirrors left and right, and keeps what is up.
+        # Half a turn about the camera's vertical axis swaps left and right, but not top and bottom.
         rows, columns = (images[:, 0].sum(axis).argmax(-1) for axis in (-1, -2))
         assert (rows < 14).all()
         assert columns[0] > 17

@@ -38,7 +38,7 @@ ODD = [
 
 
 @pytest.mark.parametrize(("verb", "setting", "message"), ODD, ids=lambda text: text[:40])
-def test_an_odd_value_is_named_with_the_values_allowed(verb, setting, message):
+def test_a_wrong_value_is_refused_with_the_allowed_values(verb, setting, message):
     given = {
         "predict": ["image=a.png", "weights=nowhere"],
         "data": ["data_task=toy"],
@@ -49,19 +49,19 @@ def test_an_odd_value_is_named_with_the_values_allowed(verb, setting, message):
 
 
 @pytest.mark.parametrize("chosen", [*VERBS, "data_task=check", "bench_task=paper", "report_task=html"])
-def test_the_defaults_of_each_verb_fit(chosen):
+def test_the_defaults_of_each_verb_pass_the_checks(chosen):
     verb = chosen.partition("_")[0]
     check_verb(verb, compose_config(verb, *([chosen] if "=" in chosen else [])))
 
 
-def test_stage_2_halves_images_more_often():
+def test_stage_2_needs_image_sizes_that_are_multiples_of_32():
     stage2 = ["model=latent_diffusion", "model.autoreconstructor_checkpoint=null"]
     check_image_size(compose_config("fit", "data.image_size=72"))
     with pytest.raises(CompleteSplatError, match=r"data\.image_size=72: must be a multiple of 32 .* such as 64$"):
         check_image_size(compose_config("fit", *stage2, "data.image_size=72"))
 
 
-def test_a_value_is_named_where_it_was_set():
+def test_a_wrong_value_is_reported_under_the_setting_that_the_user_gave():
     with pytest.raises(CompleteSplatError, match=r"^seed=x: "):
         check_parts(compose_config("fit", "seed=x").callbacks, "callbacks")
 
@@ -86,7 +86,7 @@ def test_a_value_is_named_where_it_was_set():
         ("predict image=a.png weights=toy_object", r"toy_object: no such folder.*toy_objects"),
     ],
 )
-def test_a_mistyped_name_is_answered_with_the_nearest(command, typed, message):
+def test_the_nearest_name_is_suggested_for_a_mistyped_one(command, typed, message):
     finished = command(*typed.split())
     assert (finished.status, finished.err.count("\n")) == (2, 1)
     assert re.match(f"error: {message}", finished.err), finished.err
@@ -94,7 +94,7 @@ def test_a_mistyped_name_is_answered_with_the_nearest(command, typed, message):
 
 
 @pytest.mark.parametrize("empty", ["out=", "out=''", "out=null"])
-def test_an_empty_folder_to_write_into_is_refused_and_the_working_folder_stays_empty(command, tmp_path, empty):
+def test_an_empty_name_of_the_output_folder_is_refused_and_nothing_is_written(command, tmp_path, empty):
     finished = command("fit", empty)
     assert (finished.status, finished.err) == (2, f"error: {empty}: names no folder; give out=DIR\n")
     assert not list(tmp_path.iterdir())

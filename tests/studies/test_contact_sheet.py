@@ -17,7 +17,7 @@ def sheet_of(sequences, path, images=3, title="title"):
 
 
 def cells(sheet, sequences, images):
-    """Return [sequence image CELL CELL 3]: the first row of a cell is where the colour of its corner begins."""
+    """Return the cells [sequence image CELL CELL 3]; each starts at the first pixel row whose ends are not white."""
     lefts = [MARGIN + column * (CELL + GAP) for column in range(images)]
     filled = (sheet[:, lefts[0]] != 255).any(-1) & (sheet[:, lefts[0] + CELL - 1] != 255).any(-1)
     tops = [row for row in range(1, len(sheet)) if filled[row : row + CELL].sum() == CELL and not filled[row - 1]]
@@ -35,7 +35,7 @@ def test_images_are_evenly_spaced_in_time(orbit, tmp_path):
 
 def test_an_image_is_shown_upright_and_unmirrored_with_the_outline_of_its_mask(orbit, tmp_path):
     image, mask = (torch.rand(3, SIZE, SIZE) * 255).byte(), torch.zeros(1, SIZE, SIZE, dtype=torch.uint8)
-    mask[:, :, : SIZE // 4], mask[:, :, SIZE // 4 : SIZE // 3] = 255, 100  # it crosses one half
+    mask[:, :, : SIZE // 4], mask[:, :, SIZE // 4 : SIZE // 3] = 255, 100  # on either side of one half
     shown = cells(sheet_of([orbit(1, read=lambda i: MaskedImage(image, mask))], tmp_path, 1), 1, 1)[0, 0]
     yellow = (shown == MASK).all(-1)
     assert set(np.flatnonzero(yellow.any(0))) == {CELL // 4 - 1}
@@ -55,7 +55,7 @@ def test_the_cross_is_drawn_where_it_projects_and_not_behind_the_camera(orbit, w
         (left, top), (right, bottom) = arms[1].min(axis=0) - 4, arms[1].max(axis=0) + 4
         assert left < columns.min() <= columns.max() < right
         assert top < rows.min() <= rows.max() < bottom
-        # Other arms may hide its foot. All ends are seen.
+        # Other arms may hide the foot of an arm, but the tips of all arms are visible.
         for color, (_, (x, y)) in zip(CROSS_COLORS, arms, strict=True):
             near = cell[max(0, int(y) - 4) : int(y) + 5, max(0, int(x) - 4) : int(x) + 5]
             assert (near == color).all(-1).any()

@@ -39,7 +39,7 @@ PHONE_FOV = 50.0
 TOLERANCE = 1e-4
 # Neither scales nor depths are clamped.
 PARAMETERIZATION = Parameterization(layers=1, smallest_scale=1e-9, largest_scale=1e9)
-ORDER_OF_HARMONICS = [[[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]]  # of a vector's components; the transpose inverts it
+ORDER_OF_HARMONICS = [[[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]]  # signed permutation of axes; its transpose inverts it
 
 
 class Depths(NamedTuple):
@@ -50,9 +50,9 @@ class Depths(NamedTuple):
     around_object: bool
 
     def range(self, given: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
-        """Return near and far for scenes with this depth range in their data.
+        """Return near and far for scenes whose data have the depth range `given`.
 
-        Its far end gives an object's distance, because its near end is clamped to lie in front of the camera.
+        Its far end tells an object's distance; its near end does not, because it is clamped in front of the camera.
         """
         limits = given.new_tensor([self.near, self.far])
         return given[..., 1:] + limits - self.far if self.around_object else limits.expand_as(given)
@@ -60,7 +60,7 @@ class Depths(NamedTuple):
 
 @dataclass(frozen=True)
 class DirectionalGaussians(Gaussians):
-    """Gaussians with spherical harmonics of degree 1, for models by others; this package's have one colour.
+    """Gaussians with spherical harmonics of degree 1, for models by others; those of this package have one colour.
 
     Seen along a unit vector d in the Gaussians' frame, their colour is max(0, mean_colors + d @ slopes).
     Files and viewers, which hold one colour only, use `colors`.
@@ -70,7 +70,7 @@ class DirectionalGaussians(Gaussians):
     slopes: Float[Tensor, "*batch gaussian 3 3"]
 
     def seen_from(self, centers: Float[Tensor, "*batch 3"]) -> Gaussians:
-        """Return the Gaussians with the colours that these points see."""
+        """Return the Gaussians in the colours that they have as seen from these points."""
         directions = torch.nn.functional.normalize(self.means - centers[..., None, :], dim=-1)
         colors = self.mean_colors + (directions[..., None, :] @ self.slopes).squeeze(-2)
         return Gaussians(self.means, self.quaternions, self.scales, self.opacities, colors.clamp(min=0))
@@ -83,7 +83,7 @@ class DirectionalGaussians(Gaussians):
 
 
 class DirectionalRasterizer:
-    """Wrapper that gives another rasterizer `DirectionalGaussians` in the colours that each camera sees."""
+    """Wrapper of a rasterizer that draws `DirectionalGaussians` in the colours that each camera sees."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
         self.rasterizer = rasterizer
@@ -181,7 +181,7 @@ class PublishedSplatterImage(ReconstructionModel):
     def object_distance(self, image: Float[Tensor, "3 size size"], focal_length: float) -> float:
         """Estimate the distance of an object on `background`, assuming that it is as large as the training objects.
 
-        The weights of captures need this distance. Upstream takes it from the data; this estimate serves photos.
+        Weights that were trained on captures need it. Upstream takes it from the data; for photos it is estimated here.
         """
         seen = ((image - self.background).abs() > 0.05).any(0)
         extent = max((int(seen.any(axis).sum()) for axis in (0, 1)), default=0) or self.image_size
@@ -231,7 +231,7 @@ class PublishedOneAnswer(SceneModel):
         )
 
     def needed_of_data(self, data: Mapping[str, object]) -> dict[str, object]:
-        """Return size and background, and for weights of captures the depth range around an object.
+        """Return image size and background, and for weights trained on captures the depth range behind an object.
 
         Raises:
             CompleteSplatError: the weights need the distance of the object, and the data do not contain it.
@@ -246,11 +246,11 @@ class PublishedOneAnswer(SceneModel):
     def read(self, image: ImageLike, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
         """Read an image at the model's size, on the background that the weights know (`read_photograph`).
 
-        If the weights know only one camera, the image counts as that camera's, and a cut-out object is put into the
+        If the weights know only one field of view, the image is taken to have it, and a cut-out object is placed in the
         middle of the image, as large as in training.
 
         Raises:
-            CompleteSplatError: as `read_photograph`, or a field of view for weights that know one camera.
+            CompleteSplatError: as `read_photograph`, or a field of view is given, and the weights know only one.
         """
         known = self.network.fov_degrees
         if known is not None and fov_degrees is not None:
@@ -262,7 +262,7 @@ class PublishedOneAnswer(SceneModel):
         return photograph if known is None else replace(photograph, fov_degrees=known, fov_source="default")
 
     def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
-        """Return near and far; for weights of captures, around the distance that gives the object its trained size."""
+        """Return near and far; for weights trained on captures, around the object's estimated distance."""
         focal_length = self.camera(photograph).intrinsics[0, 0].item()
         distance = self.network.object_distance(photograph.image, focal_length)
         known = torch.tensor([0.0, distance + self.network.depths.far], device=self.up.device)

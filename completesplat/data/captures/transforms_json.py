@@ -1,4 +1,4 @@
-"""Reader of captures as a `transforms.json` with images, the format of NeRF, instant-ngp and nerfstudio."""
+"""Reader of captures that consist of a `transforms.json` and images, the format of NeRF, instant-ngp and nerfstudio."""
 
 import logging
 import math
@@ -34,7 +34,7 @@ from completesplat.tensors import stack
 
 logger = logging.getLogger(__name__)
 
-# OpenCV's distortion coefficients, and those that each camera model has; programs disagree on the meaning of `k4`.
+# OpenCV's distortion coefficients, and those of each camera model. There is no `k4`, on which programs disagree.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 RADIAL = {"SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2")}
 USED = {"SIMPLE_PINHOLE": (), "PINHOLE": (), **RADIAL, "OPENCV": COEFFICIENTS}
@@ -49,15 +49,15 @@ def read_transforms(path: Path) -> Capture:
     `transform_matrix` is camera-to-world with OpenGL's axes (+x right, +y up, +z backward; nerfstudio, "Data
     conventions"). Intrinsics are `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, or NeRF's `camera_angle_x`. By default the size
     is the image's, the principal point its centre, and `fl_y` equals `fl_x`. `cx` and `cy` are relative to the outer
-    corner of the first pixel, as in COLMAP, from which they are converted (nerfstudio, `process_data/colmap_utils.py`).
-    `mask_path` is the foreground. `ply_file_path` is in the world of the poses (`create_ply_from_colmap`, ibid.).
+    corner of the first pixel, as in COLMAP, from which nerfstudio converts them (`process_data/colmap_utils.py`).
+    `mask_path` is a mask of the foreground. `ply_file_path` has points in the poses' world (`create_ply_from_colmap`).
     Paths are relative to the file's folder and stay in it.
 
-    Frames without an image are left out, as in instant-ngp for frames with a `sharpness` (`nerf_loader.cu`); its
+    Frames without an image are left out, as instant-ngp leaves out those with a `sharpness` (`nerf_loader.cu`). Its
     capture of a fox lists 67 frames and has 50 images.
 
     Raises:
-        DataError: something is missing, malformed or impossible; the error has the file and the frame's number.
+        DataError: something is missing, malformed or impossible; the error names the file and the frame's number.
     """
     frames, content = _read_frames(path)
     with at(path):
@@ -70,13 +70,13 @@ def read_transforms(path: Path) -> Capture:
 
 
 def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
-    """Read photos as `read_photograph` crops and resizes them, undistorted, with their cameras in `transforms.json`.
+    """Read photos and their cameras in `transforms.json`; undistort, crop and resize them as `read_photograph` does.
 
     Returns:
         Views [view ...] in the order of the photos, in the world of the first camera and the file's units.
 
     Raises:
-        DataError: as in `read_transforms`, except for too few frames; or EXIF turns a photo, or its size differs.
+        DataError: as in `read_transforms`, but few frames suffice; or a photo is turned by EXIF or has another size.
         CompleteSplatError: a photo is not in the file.
     """
     frames = {frame.image.resolve(): frame for frame in _read_frames(path)[0]}
@@ -139,7 +139,7 @@ def _read_lens(values: Entry, image: Path) -> Lens:
         raise BadCamera(f"camera model {others[0] if others else model} is not supported; there are: {', '.join(USED)}")
     number = partial(_number, values)
     stored = None if {"w", "h"} <= values.keys() else stored_size(image, str(image))
-    height, width = stored or (int(number("h")), int(number("w")))  # instant-ngp writes 1920.0.
+    height, width = stored or (int(number("h")), int(number("w")))  # instant-ngp writes floats.
     if "fl_x" in values:
         fx = number("fl_x")
     elif "camera_angle_x" in values:

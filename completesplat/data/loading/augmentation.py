@@ -83,7 +83,7 @@ def changed(images: Images, change: int, factor: float) -> Images:
 
 @kernel
 def turn_hue(images: Float32[ndarray, "view 3 pixel"], turn: np.float32) -> None:
-    """Turn the hue of all pixels in place; compiled, because it takes kornia most of the time of a colour jitter."""
+    """Turn the hue of all pixels in place. It is compiled because it takes most of a colour jitter's time in kornia."""
     for view in range(len(images)):
         _turn(images[view, 0], images[view, 1], images[view, 2], turn)
 

@@ -61,7 +61,7 @@ class SceneDataModule(LightningDataModule):
     """
 
     splits_share_sequences = False
-    """Whether splits have the same sequences on purpose, because they divide the frames of each."""
+    """Whether all splits have the same sequences on purpose, because each split has other frames of them."""
 
     def __init__(
         self,
@@ -150,7 +150,7 @@ class SceneDataModule(LightningDataModule):
         return scenes.stackable()
 
     def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
-        """Return all test scenes, each with up to `views` views that show the modes best and evenly spread targets.
+        """Return all test scenes. Targets are up to `views` views that show the modes best, and evenly spread ones.
 
         Raises:
             CompleteSplatError: the alternatives for what the reference image hides are not known.

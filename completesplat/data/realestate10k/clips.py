@@ -1,6 +1,6 @@
 """Clips of RealEstate10K, as text files beside folders of frames or in pixelSplat's chunks.
 
-Chunks are `<split>/NNNNNN.torch`, with each clip's file in `<split>/index.json`. A chunk is a list of clips as
+Chunks are `<split>/NNNNNN.torch`; `<split>/index.json` names each clip's chunk. A chunk is a list of clips as
 dictionaries with key, url, timestamps int64 [view], cameras float32 [view 18] and images, a list of JPEG files as uint8
 tensors (`real_estate_10k_tools`, `src/convert.py`). Reading a chunk runs no code from it.
 """

@@ -23,12 +23,12 @@ from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
 from completesplat.tensors import stack
 
-# A hit that is closer than the point by more than this share of the distance belongs to another surface in front.
+# A ray that stops before a point by more than this share of the point's distance meets a surface in front of it.
 CLOSER = 1e-3
 
 
 def unseen(scene: ToyScene, reference: int, frame: int, size: int) -> Bool[Tensor, "size size"]:
-    """Mark the pixels of `frame` whose centre shows a point that is occluded in, or outside, the reference image."""
+    """Mark the pixels of `frame` whose centre shows a point that is occluded in the reference image or outside it."""
     camera, other = (frame_camera(scene, index, size) for index in (frame, reference))
     depth = torch.from_numpy(render_frame(scene, frame, size)[2]).flatten()
     points = unproject(camera, pixel_centers(size, size, dtype=torch.float64).flatten(0, 1), depth)
@@ -51,11 +51,11 @@ def frame_camera(scene: ToyScene, frame: int, size: int) -> Cameras:
 
 # A pixel belongs to the patch if a channel differs between two modes by more than this; blurred edges differ less.
 DIFFERENCE = 0.1
-# Modes may differ in the reference image only by the effect of rounding to bytes.
+# Largest difference of modes in the reference image, which rounding to bytes may cause.
 LEAK = 1.5 / 255
 # Smallest share of an image that the patch must cover.
 SMALLEST_PATCH = 0.005
-# Limit of the RMS difference between an image and its render: JPEG stays below, another patch colour above.
+# Limit of the RMS difference between an image and its render: JPEG causes less, another patch colour more.
 SAME_IMAGE = 0.025
 
 Chosen = tuple[list[int], Float[Tensor, "mode view 3 size size"], Bool[Tensor, "view size size"]]
@@ -65,8 +65,8 @@ Chosen = tuple[list[int], Float[Tensor, "mode view 3 size size"], Bool[Tensor, "
 class ToyHiddenModes:
     """Scenes of a store with all their modes; see `SceneDataModule.hidden_modes`.
 
-    `folder` is that of their category, a key of `DRAW`, and must hold a complete set of this version. Only the
-    reference that `choose` returns is used.
+    `folder` is named after a category (a key of `DRAW`) and must hold a complete set of this format version. `choose`
+    returns a reference and targets, of which only the reference is used.
     """
 
     folder: Path
@@ -124,7 +124,7 @@ class ToyHiddenModes:
         return CompleteSplatError(f"{self.folder}: {name} {reason}")
 
     def _truths(self, scene: ToyScene, frame: int) -> Float[Tensor, "mode 3 size size"]:
-        """Render a frame in every mode, with the same pixels as the data set's own images."""
+        """Render a frame in every mode, in the same way as the images of the data set."""
         modes = [scene.patch._replace(color=np.array(color)) for color in PATCH_COLORS.values()]
         return torch.stack([self._render(replace(scene, patch=mode), frame) for mode in modes])
 
@@ -135,7 +135,7 @@ class ToyHiddenModes:
         return cut_square(image, square, self.image_size).float() / 255
 
     def _from_behind(self, scene: ToyScene, name: str, frames: tuple[int, ...], reference: int) -> Chosen:
-        """Select views that show enough of the patch, most frontal ones first, with their truths and patch pixels."""
+        """Select the most frontal views that show enough of the patch; return their truths and patch pixels, too."""
         toward = scene.camera_to_world[:, :3, 3] * np.array([1, 0, 1])
         facing = toward @ scene.patch.facing / np.linalg.norm(toward, axis=-1)
         chosen: list[int] = []

@@ -54,7 +54,7 @@ def _write_set(
 ) -> Path:
     """Make `folder`, call `write` with it and (index, split) of every scene, then `finish`, and write `toy.json`.
 
-    The bytes depend only on the `numbers`: `scenes` (at least `fewest`), `frames`, `size` and `seed`. `workers` are
+    The files depend only on the `numbers`: `scenes` (at least `fewest`), `frames`, `size` and `seed`. `workers` are
     processes (None: one for each core). A folder that was made with the same numbers remains unchanged.
 
     Raises:

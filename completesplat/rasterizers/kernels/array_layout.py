@@ -3,7 +3,7 @@
 prepared   [17 lane] float32: values that do not depend on the view; padded to a multiple of 16 with Gaussians that are
            not drawn
 records    [gaussian 16] float32: the visible Gaussians of one view, packed front to back, one cache line each
-gradients  [row 16] float32: sums over the pixels of one band of a view, for each Gaussian that reaches one of them;
+gradients  [row 16] float32: sums over the pixels of one band of a view, for each Gaussian that reaches a pixel;
            row 0 is zero
 places     [lane] int32: the row of each Gaussian of the scene in `gradients`; 0 if it reaches no pixel
 camera     [20] float64

@@ -334,7 +334,7 @@ def store_columns(builder, array, stride, start, vectors):
 
 @vector_function(_vectors(LANES))
 def gathered_rows(builder, array, places, start):
-    """Return the 16 columns of rows of 16 of a flat array: those of the numbers places[start], ..., [start + 15]."""
+    """Gather the rows places[start] to places[start + 15], 16 wide, of a flat array; return their 16 columns."""
     rows = []
     for lane in range(LANES):
         entry = builder.gep(places, [builder.add(start, ir.Constant(I64, lane))], inbounds=True)
