@@ -19,7 +19,7 @@ from completesplat.settings.schema import Entries, Positive, Range, Share, check
 Images = Float[Tensor, "view 3 height width"]
 Plane = Float32[ndarray, " pixel"]
 BRIGHTNESS, CONTRAST, SATURATION, HUE = range(4)
-GREY_WEIGHTS = torch.tensor([0.299, 0.587, 0.114])[:, None, None]  # ITU-R BT.601
+GREY_WEIGHTS = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float32)[:, None, None]  # ITU-R BT.601
 ZERO, ONE, TWO, FOUR, SIX = (np.float32(number) for number in (0, 1, 2, 4, 6))
 
 
