@@ -22,7 +22,7 @@ from completesplat.data.loading.distributed import gathered, mean_of_processes
 from completesplat.errors import DivergenceError
 from completesplat.scene import CachedScene, SceneBatch
 from completesplat.settings.schema import Positive, Share
-from completesplat.training.stage import now
+from completesplat.training.stage import Stage, now
 
 BAD_STEPS = "train/bad_steps"
 FETCHING = "[_TrainingEpochLoop].train_dataloader_next"
@@ -80,6 +80,8 @@ class BadSteps(Callback):
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
         norm = torch.nn.utils.get_total_norm(gradients).to(pl_module.device)
+        if isinstance(pl_module, Stage):
+            pl_module.gradient_norm = norm
         finite = torch.stack([*self.losses, norm]).isfinite().all()
         self.losses = []
         # Processes have different losses, but the same gradients.

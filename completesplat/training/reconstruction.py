@@ -151,10 +151,11 @@ class ReconstructionModule(Stage):
         reconstruction = self(scenes, others)
         with torch.autocast(self.device.type, enabled=False):
             gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
-            prediction = Prediction(self.render(gaussians, scenes), gaussians, reconstruction.posterior)
-            total, values = self.loss(prediction, scenes.all_views(), self.global_step)
-            images, truth = prediction.images.detach().clamp(0, 1), scenes.all_views().images
-            quality = psnr(images.flatten(0, 1), truth.flatten(0, 1)).mean()
+            truth = scenes.all_views()
+            prediction = Prediction(self.render(gaussians, truth.cameras), gaussians, reconstruction.posterior)
+            total, values = self.loss(prediction, truth, self.global_step)
+            images = prediction.images.detach().clamp(0, 1)
+            quality = psnr(images.flatten(0, 1), truth.images.flatten(0, 1)).mean()
         logged = {f"train/{name}": value for name, value in values.items()}
         self.log_step({"train/loss": total.detach(), "train/psnr": quality, **logged}, batch_size=len(scenes.names))
         return total

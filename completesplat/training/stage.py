@@ -96,6 +96,7 @@ class Stage(LightningModule):
         self.evaluation = Evaluation()
         self.seconds: dict[str, list[float]] = defaultdict(list)  # for each scene, by the name of the work
         self.config: Mapping[str, Any] | None = None
+        self.gradient_norm: Tensor | None = None  # of this step, if `BadSteps` has computed it
         # Lightning's name: some of several processes that test may have no scene.
         self.allow_zero_length_dataloader_with_multiple_devices = True
 
@@ -174,10 +175,10 @@ class Stage(LightningModule):
         with torch.autocast(self.device.type, enabled=False):
             return self.rasterizer(gaussians, repeated)
 
-    def render(self, gaussians: Gaussians, scenes: SceneBatch) -> Renders:
-        """Render the reference view and all targets, in full precision even if the network runs in less."""
+    def render(self, gaussians: Gaussians, cameras: Cameras) -> Renders:
+        """Render scenes [batch] from cameras [batch view], in full precision even if the network runs in less."""
         with torch.autocast(self.device.type, enabled=False):
-            return self.rasterizer(gaussians, scenes.all_views().cameras).over(self.background)
+            return self.rasterizer(gaussians, cameras).over(self.background)
 
     def log_step(self, values: dict[str, Tensor], batch_size: int) -> None:
         """Log figures of a training step: their means over all processes.
@@ -189,7 +190,7 @@ class Stage(LightningModule):
 
     def novel_psnr(self, gaussians: Gaussians, scenes: SceneBatch) -> Float[Tensor, "batch target"]:
         """Return the PSNR of the target views, in dB."""
-        images, truth = self.render(gaussians, scenes).clamp(0, 1)[:, 1:], scenes.targets.images
+        images, truth = self.render(gaussians, scenes.targets.cameras).clamp(0, 1), scenes.targets.images
         return psnr(images.flatten(0, 1), truth.flatten(0, 1)).view(images.shape[:2])
 
     def validation_step(self, scenes: SceneBatch, index: int) -> None:
@@ -273,7 +274,13 @@ class Stage(LightningModule):
     def configure_gradient_clipping(
         self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        """Clip as Lightning does, but also for fused optimizers in bfloat16, which it refuses without loss scaling."""
+        """Clip as Lightning does, but with the norm that `BadSteps` has computed, if it has.
+
+        Fused optimizers in bfloat16, too, which Lightning refuses without loss scaling.
+        """
+        norm, self.gradient_norm = self.gradient_norm, None
+        if norm is not None and gradient_clip_val and gradient_clip_algorithm in (None, "norm"):
+            return torch.nn.utils.clip_grads_with_norm_(self.parameters(), gradient_clip_val, norm)
         precision = self.trainer.precision_plugin
         scaled = getattr(precision, "scaler", None) is not None
         clip = precision.clip_gradients if scaled else partial(Precision.clip_gradients, precision)

@@ -134,7 +134,7 @@ def test_a_model_of_one_answer_repeats_it_and_its_posterior_does_not():
     with torch.no_grad():
         several, at_once = (predictors(module, 3, batch) for batch in (2, 3))
         repeated, drawn = several["model"](scene, scene, 5), several["posterior_samples"](scene, scene, 5)
-        expected = module.render(module.reconstruct(scene), scene)[0, 1:].clamp(0, 1)
+        expected = module.render(module.reconstruct(scene), scene.targets.cameras)[0].clamp(0, 1)
         together, others = (at_once["posterior_samples"](scene, scene, seed) for seed in (5, 6))
     assert torch.equal(repeated, expected.expand(3, -1, -1, -1, -1))
     assert torch.allclose(drawn, together, atol=1e-5)

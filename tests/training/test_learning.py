@@ -49,7 +49,7 @@ def psnr_of_training_views(run) -> torch.Tensor:
     sequence = store.source.read(store.names[0])
     scenes = stack([store.scene(sequence, 0, range(1, len(sequence.frames)))])
     with torch.no_grad():
-        images = module.eval().render(module.reconstruct(scenes), scenes)
+        images = module.eval().render(module.reconstruct(scenes), scenes.all_views().cameras)
     return psnr(images[0].clamp(0, 1), scenes.all_views().images[0])
 
 

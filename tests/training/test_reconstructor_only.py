@@ -47,7 +47,9 @@ def test_new_codes_lower_the_loss_of_the_reference_and_leave_the_weights(toy_roo
     before = {name: p.clone() for name, p in module.named_parameters()}
 
     def loss(gaussians) -> float:
-        return torch.nn.functional.mse_loss(module.render(gaussians, scenes)[:, 0], scenes.reference.images).item()
+        return torch.nn.functional.mse_loss(
+            module.render(gaussians, scenes.all_views().cameras)[:, 0], scenes.reference.images
+        ).item()
 
     start = module.gaussians(module.model.new_codes(len(scenes.names), seed=0), scenes)
     with torch.inference_mode():
