@@ -36,6 +36,7 @@ class LatentDiffusion(Stage):
         checkpoint: checkpoint of this stage to start from instead (for masked diffusion): all weights, the averaged
             ones if it has them, and all measured values.
         unconditional_probability: probability of zeroing phi_ref, for guidance (0.2 in the paper).
+        noise_draws: timesteps and noises that are drawn for each scene of a batch, whose image is encoded once.
         skip_weight, guidance_weight: settings of the samples drawn in validation and test.
         scale_batches: training batches on which the latents' mean and standard deviation are measured.
         channels_last, compile: of the denoiser, see `prepare_network`.
@@ -53,6 +54,7 @@ class LatentDiffusion(Stage):
         autoreconstructor_checkpoint: str | None = None,
         checkpoint: str | None = None,
         unconditional_probability: Share = 0.2,
+        noise_draws: Positive = 1,
         skip_weight: Share = 1.0,
         guidance_weight: Share = 0.0,
         scale_batches: Positive = 50,
@@ -65,6 +67,7 @@ class LatentDiffusion(Stage):
         self.autoreconstructor_checkpoint = autoreconstructor_checkpoint
         self.checkpoint = checkpoint
         self.unconditional_probability = unconditional_probability
+        self.noise_draws = noise_draws
         self.skip_weight = skip_weight
         self.guidance_weight = guidance_weight
         self.scale_batches = scale_batches
@@ -169,7 +172,7 @@ class LatentDiffusion(Stage):
 
     def training_step(self, batch: SceneBatch | CachedScene, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat
-        latent, conditioning = self.inputs(batch)
+        latent, conditioning = (x.repeat_interleave(self.noise_draws, 0) for x in self.inputs(batch))
         conditioned = torch.rand(len(latent), device=self.device) >= self.unconditional_probability
         conditioning = conditioning * conditioned[:, None, None, None]
         noise = torch.randn(latent.shape, device=self.device)  # `randn_like` would depend on the memory layout

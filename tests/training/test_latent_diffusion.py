@@ -97,6 +97,23 @@ def test_the_conditioning_alone_is_zeroed_at_the_stated_rate(monkeypatch):
     assert torch.equal(sometimes.timestep, never.timestep)
 
 
+def test_a_scene_gets_several_noises_and_timesteps_and_is_encoded_once(monkeypatch):
+    batch, encodings = scenes(), []
+    module, _ = module_of(monkeypatch, noise_draws=3)
+    parts, shown = module.completesplat, Recorder()
+    parts.denoiser = shown
+    for part in (parts.conditioning, parts.autoreconstructor.encoder):
+        part.register_forward_pre_hook(lambda _, inputs: encodings.append(len(inputs[0])))
+    torch.manual_seed(0)
+    module.unconditional_probability = 0.0
+    module.training_step(batch, 0)
+    assert encodings == [BATCH, BATCH]
+    assert len(shown.noisy_latent) == len(shown.timestep.unique()) == 3 * BATCH
+    conditioning = shown.conditioning.view(BATCH, 3, *shown.conditioning.shape[1:])
+    assert torch.equal(conditioning, conditioning[:, :1].expand_as(conditioning))
+    assert not torch.equal(conditioning[0], conditioning[1])
+
+
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "sample"])
 def test_the_loss_is_that_of_the_prediction_type(kind, monkeypatch):
     """For the prediction zero it is the target's mean square: 1 for eps; h and v mix h and eps, uncorrelated."""

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from hydra.utils import instantiate
+from pytorch_optimizer.optimizer.utils.matrix import zero_power_via_newton_schulz_5
 from support import SMALL, compose_config
 
 from completesplat.training.optimization import constant, cosine, exponential, muon
@@ -48,18 +49,19 @@ def test_muon_steps_equally_far_in_all_directions_of_a_kernel_and_adam_moves_the
     assert [len(group["params"]) for group in muon([bias], lr=0.5, adam_lr=0.01).param_groups] == [1]
 
 
-def test_muon_takes_bfloat16_only_where_the_processor_computes_in_it(monkeypatch):
-    steps, gradients = {}, [torch.randn(shape) for shape in ((8, 4, 3, 3), (8, 36), (16, 8))]
-    for native in (True, False):
-        monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda native=native: native)
-        parameters = [torch.zeros_like(gradient, requires_grad=True) for gradient in gradients]
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient.clone()
-        muon(parameters, lr=1.0, adam_lr=0.01).step()
-        steps[native] = torch.cat([parameter.detach().flatten() for parameter in parameters])
-    assert (steps[True] - steps[False]).norm() < 0.05 * steps[True].norm()
-    short = {native: (step[:288] == step[:288].bfloat16()).all().item() for native, step in steps.items()}
-    assert short == {True: True, False: False}
+def test_muon_on_a_processor_iterates_as_the_library_does_in_float64():
+    gradients = [torch.randn(shape) for shape in ((8, 4, 3, 3), (8, 36), (16, 8), (64, 576))]
+    gradients += [torch.outer(torch.randn(8), torch.randn(12)) + 1e-4 * torch.randn(8, 12)]  # nearly of rank 1
+    parameters = [torch.zeros_like(gradient, requires_grad=True) for gradient in gradients]
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        parameter.grad = gradient.clone()
+    muon(parameters, lr=1.0, adam_lr=0.01).step()
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        matrix = gradient.flatten(1).double()
+        expected = -zero_power_via_newton_schulz_5(matrix, dtype=torch.float64)
+        expected *= max(1, len(matrix) / len(matrix.T)) ** 0.5  # the library's longer steps for tall matrices
+        actual = parameter.detach().flatten(1).double()
+        assert (actual - expected).norm() < 2e-3 * expected.norm()  # 0.01 to 0.4 in bfloat16
 
 
 def test_the_schedule_spans_the_run():
