@@ -2,11 +2,7 @@
 
 import io
 import os
-import re
 import shutil
-import subprocess
-import sys
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -214,45 +210,3 @@ def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):
     around = turn(offline, seen)  # about the red ball
     assert place(around, BALLS["red"][1]) == pytest.approx(place(seen, BALLS["red"][1]), abs=8)
     assert abs(place(around, BALLS["yellow"][1])[1] - place(seen, BALLS["yellow"][1])[1]) > 8
-
-
-@pytest.fixture
-def space(tiny_weights):
-    """The address of a Space that a new process serves on this machine."""
-    program = [sys.executable, "-m", "completesplat.viewer.space", str(tiny_weights)]
-    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-    process = subprocess.Popen(program, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    lines: list[str] = []
-    for line in process.stdout:
-        lines.append(line)
-        if "public link" in line:  # gradio's last word before it waits
-            yield re.search(r"http://127\.0\.0\.1:\d+", "".join(lines))[0]
-            break
-    else:
-        pytest.fail("".join(lines))
-    process.terminate()
-    process.wait(timeout=LIMIT)
-
-
-@pytest.mark.skipif(find_spec("gradio") is None, reason='gradio is not installed (pip install "completesplat[space]")')
-def test_a_space_completes_an_upload_and_shows_a_frame_for_each_sample(chromium, space, tmp_path):
-    file = tmp_path / "photo.png"
-    Image.fromarray(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)).save(file)
-    tab = chromium.new_page(viewport={"width": 500, "height": 600})
-    tab.set_default_timeout(1000 * LIMIT)
-    tab.goto(space)
-    tab.locator("input[type=file]").first.set_input_files(file)
-    tab.get_by_role("button", name="Complete").click()
-    frame = tab.locator("iframe").first
-    frame.wait_for()
-    assert tab.locator("iframe").count() == 2
-    frame.content_frame.locator("canvas").first.wait_for()
-    assert waited_for(lambda: drawn(frame)), "no scene in the frame"
-    links = tab.eval_on_selector_all("a", "links => links.map(link => link.href)")
-    assert {"sample_00.ply", "sample_01.html", "scene.json"} <= {link.rpartition("/")[2] for link in links}
-
-
-def drawn(frame) -> bool:
-    """Return whether the lower half of a frame, below viser's notices, shows more than one grey."""
-    seen = np.asarray(Image.open(io.BytesIO(frame.screenshot())).convert("RGB")).astype(float)
-    return bool(seen[len(seen) * 2 // 3 :].std() > 5)
