@@ -84,7 +84,7 @@ def test_the_peak_is_the_memory_that_work_adds(monkeypatch: pytest.MonkeyPatch) 
     arrays = [np.ones(FLOATS, np.float32)]  # memory from before does not count
     assert peak_megabytes(lambda: None, CPU) < 5
     assert 50 < peak_megabytes(lambda: np.ones(FLOATS, np.float32), CPU) < 70
-    assert all(peak_megabytes(lambda: drawing.Buffers().empty((FLOATS,)).fill(1), CPU) > 50 for _ in range(2))
+    assert all(peak_megabytes(lambda: drawing.empty((FLOATS,)).fill(1), CPU) > 50 for _ in range(2))
     assert 50 < peak_megabytes(lambda: arrays.append(np.ones(FLOATS, np.float32)), CPU) < 70
 
 
