@@ -141,9 +141,11 @@ def test_a_scene_that_is_drawn_again_needs_no_new_memory(monkeypatch: pytest.Mon
     for _ in range(3):
         rendering = TiledRasterizer()(gaussians, camera())
         gradients = torch.autograd.grad(rendering.color.sum(), list(vars(gaussians).values()))
+        address = gradients[0].data_ptr()
         del rendering, gradients
         gc.collect()
         pools.append({id(memory) for memory in drawing._free})
+        assert address in {np.frombuffer(memory, np.uint8).ctypes.data for memory in drawing._free}
     assert pools[0] == pools[1] == pools[2]
 
 
@@ -169,8 +171,8 @@ def test_the_system_may_take_large_free_memory() -> None:
 @pytest.mark.processes
 def test_memory_that_is_in_use_when_the_interpreter_ends() -> None:
     code = (
-        "import builtins; from completesplat.rasterizers.kernels.drawing import empty; "
-        "builtins.last = [empty((3,)), empty((2**20,))]"
+        "import builtins; from completesplat.rasterizers.kernels import drawing; "
+        "builtins.last = [drawing, drawing.empty((3,)), drawing.empty((2**20,))]"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT)
     assert (result.returncode, result.stderr) == (0, "")
