@@ -16,6 +16,8 @@ from completesplat.benchmarks.training_step import share
 from completesplat.benchmarks.workloads import (
     OPACITIES,
     Backend,
+    counted_work,
+    machine_peaks,
     peak_megabytes,
     rendering_milliseconds,
     splatter_scene,
@@ -72,9 +74,10 @@ def run(
         def tick(text: str) -> None:
             status.update(f"timing {text}")
 
-        working, absent = working_backends(backends, instantiate(constants))
+        shared = instantiate(constants)
+        working, absent = working_backends(backends, shared)
         quieten()
-        rows = speed_rows(working, sizes, views, repeats, tick)
+        rows = speed_rows(working, sizes, views, repeats, shared, tick)
         if training_step:
             size, batch, targets = training_step["size"], training_step["batch"], training_step["targets"]
             for backend in [backend for backend in working if backend.name in training_step["backends"]]:
@@ -109,10 +112,15 @@ def working_backends(names: Sequence[str], constants: RenderingConstants) -> tup
 
 
 def speed_rows(
-    backends: Sequence[Backend], sizes: Sequence[int], views: Sequence[int], repeats: int, tick: Tick
-) -> list[Row]:
-    """Return a row for each backend and workload (size, number of views, kind of opacities)."""
+    backends: Sequence[Backend], sizes: Sequence[int], views: Sequence[int], repeats: int,
+    constants: RenderingConstants, tick: Tick,
+) -> list[Row]:  # fmt: skip
+    """Return a row for each backend and workload (size, number of views, kind of opacities).
+
+    `share_of_peak` is that of the limit that `tiled` is nearer to: the machine's arithmetic or its memory bandwidth.
+    """
     rows: list[Row] = []
+    peaks = machine_peaks()
     for size, number, opacity in product(sizes, views, OPACITIES):
         tick(f"{size} x {size}, {number} views, {opacity}")
         gaussians, cameras = splatter_scene(size, number, opacity)
@@ -122,6 +130,13 @@ def speed_rows(
             rows.append({"backend": name} | workload | figures)
             if "tiled" in results:
                 rows[-1]["times_tiled"] = figures["forward_backward_ms"] / results["tiled"]["forward_backward_ms"]
+            if name == "tiled":
+                work = counted_work(gaussians, cameras, constants)
+                shares = (
+                    amount / figures["forward_backward_ms"] / peak for amount, peak in zip(work, peaks, strict=True)
+                )
+                share_of_peak, limit = max(zip(shares, ("compute", "memory"), strict=True))
+                rows[-1] |= {"share_of_peak": share_of_peak, "limit": limit}
     return rows
 
 

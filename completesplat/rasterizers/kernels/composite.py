@@ -67,7 +67,7 @@ def composite(
     color: Array, depth: Array, alpha: Array,
     grad_color: Array | None, grad_depth: Array | None, grad_alpha: Array | None,
     gradients: Array | None, places: Array | None,
-) -> None:  # fmt: skip
+) -> tuple[int, int]:  # fmt: skip
     """Draw the block rows first_row..end_row - 1 of one view, or sum every Gaussian's gradients over them.
 
     numba compiles two versions, each without the code that only the other needs.
@@ -80,7 +80,11 @@ def composite(
         color, depth, alpha: the whole images [3 height width], [height width] twice; the band is written or read.
         grad_color, grad_depth, grad_alpha: gradients of the loss with respect to these images; None to draw.
         gradients, places: [gaussian + 1 16] and [lane], see `array_layout`.
+
+    Returns:
+        The number of times that a block was drawn to, and the number of Gaussians that reached one.
     """
+    drawn, written = 0, 0
     height, width = alpha.shape
     columns = (width + BLOCK - 1) // BLOCK
     integers = records.view(np.int32)
@@ -89,7 +93,6 @@ def composite(
         flat_gradients = gradients.reshape(-1)
         store(flat_gradients, 0, splat(ZERO))
         places[:] = 0
-        written = 0
         read_images(first_row, end_row, columns, state, color, depth, alpha, grad_color, grad_depth, grad_alpha)
     blocks_left = open_all_blocks(open_words, end_row - first_row, columns)
     for j in range(count):
@@ -120,6 +123,7 @@ def composite(
                 while mask != 0:
                     column = (word << WORD_SHIFT) + lowest_bit(mask)
                     mask &= mask - BIT
+                    drawn += 1
                     offset = ((row - first_row) * columns + column) * (STATE_VECTORS * LANES)
                     u = u_row + column_offset(records, j, column)
                     value, opacity = alpha_at(exponent_row - u * u, log2_min_alpha, max_alpha)
@@ -149,14 +153,15 @@ def composite(
                     if not any_lane(behind > ZERO):
                         close_block(open_words, row - first_row, column)
                         blocks_left -= 1
+        written += reached
         if gradients is not None and places is not None and reached:
             moments = (sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv)
             sums = lane_sums((sum_red, sum_green, sum_blue, sum_z) + moments)  # noqa: RUF005
-            written += 1
             store(flat_gradients, written * layout.GRADIENT_WIDTH, sums + reached_flag())
             places[integers[j, layout.INDEX]] = written
     if gradients is None:
         write_images(first_row, end_row, columns, state, color, depth, alpha)
+    return drawn, written
 
 
 @helper

@@ -1,6 +1,7 @@
 """Sequence of kernels over all scenes and views of a batch, on several threads and in reused memory."""
 
 import math
+import mmap
 import os
 import threading
 from collections.abc import Callable
@@ -18,8 +19,8 @@ from completesplat.rasterizers.kernels.project import prepare, project, project_
 from completesplat.rasterizers.kernels.projection import camera_backward
 from completesplat.rasterizers.kernels.simd import LANES
 
-ALIGNMENT = 64  # bytes, one cache line
-MOST_FREE_BYTES = 512 * 2**20
+LARGE = 2**20  # bytes; for smaller blocks, advice to the system would cost more than it gains
+MOST_FREE_BYTES = 2**31  # after a new block; the system can take what is free, so this is no loss to others
 # Views are cut into bands of block rows until there are this many tasks. This is a constant, because sums over bands
 # depend on where the bands end, and results must not depend on the number of threads.
 FEWEST_TASKS = 4
@@ -28,8 +29,8 @@ CHUNK = 2048  # Gaussians per task of the projection's backward pass
 
 _pools: dict[int, ThreadPoolExecutor] = {}
 _pool_lock = threading.Lock()
-_free: list[np.ndarray] = []  # buffers of uint8, oldest first
-_buffers_lock = threading.Lock()
+_free: list[mmap.mmap] = []  # oldest first
+_free_lock = threading.Lock()
 
 
 def parallel(task: Callable[[int], None], count: int) -> None:
@@ -67,50 +68,55 @@ def _pool(size: int) -> ThreadPoolExecutor:
 
 def _after_a_fork() -> None:
     """Replace pools and locks in a child process, where the threads that may hold the locks do not exist."""
-    global _pool_lock, _buffers_lock
+    global _pool_lock, _free_lock
     _pools.clear()
-    _pool_lock, _buffers_lock = threading.Lock(), threading.Lock()
+    _pool_lock, _free_lock = threading.Lock(), threading.Lock()
 
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_a_fork)
 
 
-class Buffers:
-    """Arrays whose memory is reused after this object is deleted (with the autograd node that owns it)."""
+class _Loan(np.ndarray):
+    """Bytes whose memory is free again once no array that views them is left."""
 
-    def __init__(self) -> None:
-        self._blocks: list[np.ndarray] = []
+    base: mmap.mmap  # type: ignore[assignment]
 
-    def empty(self, shape: tuple[int, ...], dtype: type[np.number] = np.float32) -> np.ndarray:
-        """Return an uninitialised array at an aligned address."""
-        size = math.prod(shape) * np.dtype(dtype).itemsize
-        block = _take(size)
-        self._blocks.append(block)
-        start = -block.ctypes.data % ALIGNMENT
-        array: np.ndarray = block[start : start + size].view(dtype).reshape(shape)
-        return array
-
-    def __del__(self) -> None:
-        # No lock: the garbage collector may call this while `_take` of the same thread holds it. And extend is atomic.
-        _free.extend(self._blocks)
+    # Defaults hold the values that are needed, because globals may be gone when the interpreter ends.
+    def __del__(self, free: list[mmap.mmap] = _free, large: int = LARGE, advice: int = mmap.MADV_FREE) -> None:
+        if len(self.base) >= large:
+            # It stays in place, to be written again without page faults, unless the system needs it elsewhere.
+            self.base.madvise(advice)
+        # No lock: the garbage collector may call this while `_take` of the same thread holds it. And append is atomic.
+        free.append(self.base)
 
 
-def _take(size: int) -> np.ndarray:
+def empty(shape: tuple[int, ...], dtype: type[np.number] = np.float32) -> np.ndarray:
+    """Return an uninitialised, aligned array in memory that is reused after the array and its views are deleted."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    memory = _take(-(-max(size, 1) // mmap.PAGESIZE) * mmap.PAGESIZE)
+    # NumPy keeps views of views from skipping the loan, because the types differ.
+    array: np.ndarray = _Loan(len(memory), np.uint8, memory).view(np.ndarray)[:size].view(dtype).reshape(shape)
+    return array
+
+
+def _take(size: int) -> mmap.mmap:
     """Return a free block of one to two times the size, or a new one."""
-    needed = size + ALIGNMENT
-    with _buffers_lock:
-        while sum(block.nbytes for block in _free) > MOST_FREE_BYTES:
-            del _free[0]
-        for i, block in enumerate(_free):
-            if needed <= block.nbytes <= 2 * needed:
+    with _free_lock:
+        for i, memory in enumerate(_free):
+            if size <= len(memory) <= 2 * size:
                 return _free.pop(i)
-    return np.empty(needed, np.uint8)
+        while sum(map(len, _free)) > MOST_FREE_BYTES:
+            del _free[0]
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    if size >= LARGE and hasattr(mmap, "MADV_HUGEPAGE"):  # Linux
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    return memory
 
 
 def release() -> None:
     """Return unused memory to the system."""
-    with _buffers_lock:
+    with _free_lock:
         _free.clear()
 
 
@@ -167,16 +173,17 @@ class Drawing:
             np.float32(self.log2_min_alpha),
             np.float32(constants.min_transmittance),
         )
-        self.buffers = Buffers()
         self.lanes = -(-self.count // LANES) * LANES
-        self.prepared = self.buffers.empty((self.scenes, layout.PREPARED_WIDTH, self.lanes))
+        self.prepared = empty((self.scenes, layout.PREPARED_WIDTH, self.lanes))
         self.held = self.scenes * self.views if keep else min(self.scenes * self.views, VIEWS_AT_ONCE)
-        self.records = self.buffers.empty((self.held, self.count, layout.RECORD_WIDTH))
+        self.records = empty((self.held, self.count, layout.RECORD_WIDTH))
         self.visible_counts = np.zeros(self.held, np.int64)
         rows = -(-self.height // layout.BLOCK)
         count = min(rows, -(-FEWEST_TASKS // max(1, self.scenes * self.views)))
         # First and end block row of each band of a view.
         self.bands = [(i * rows // count, (i + 1) * rows // count) for i in range(count)]
+        # For each band of a view: how often a block was drawn to, and the number of Gaussians that reached one.
+        self.counts = np.zeros((self.held * len(self.bands), 2), np.int64)
 
     def draw(self) -> Images:
         """Project and composite every view."""
@@ -194,14 +201,13 @@ class Drawing:
 
         The cameras' gradients are [batch view 16], for the first 16 columns of `cameras`.
         """
-        buffers = Buffers()
         bands, views = len(self.bands), self.scenes * self.views
         sums = Sums(
-            buffers.empty((self.scenes, self.views, bands, self.count + 1, layout.GRADIENT_WIDTH)),
-            buffers.empty((self.scenes, self.views, bands, self.lanes), np.int32),
+            empty((self.scenes, self.views, bands, self.count + 1, layout.GRADIENT_WIDTH)),
+            empty((self.scenes, self.views, bands, self.lanes), np.int32),
         )
         parallel(partial(self._composite_backward, images, gradients, sums), views * bands)
-        result = Parameters(*(np.empty_like(x) for x in self.parameters))
+        result = Parameters(*(empty(x.shape) for x in self.parameters))
         chunks = -(-self.count // CHUNK)
         parallel(partial(self._project_backward, result, sums), self.scenes * chunks)
         if not to_cameras:
@@ -214,11 +220,10 @@ class Drawing:
         prepare(*(x[scene] for x in self.parameters), self.log2_min_alpha, self.prepared[scene])
 
     def _project(self, start: int, slot: int) -> None:
-        buffers = Buffers()
         scene, camera = divmod(start + slot, self.views)
         room = self.count + 1
-        unsorted = buffers.empty((room, layout.RECORD_WIDTH))
-        keys, order = buffers.empty((2, room), np.int64), buffers.empty((2, room), np.int32)
+        unsorted = empty((room, layout.RECORD_WIDTH))
+        keys, order = empty((2, room), np.int64), empty((2, room), np.int32)
         self.visible_counts[slot] = project(
             self.prepared[scene], self.cameras[scene, camera], self.height, self.width,
             float(self.constants.blur), float(self.constants.near_plane),
@@ -227,7 +232,8 @@ class Drawing:
 
     def _composite(self, images: Images, start: int, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
-        self._run(slot, band, (*images.view(*divmod(start + slot, self.views)), None, None, None, None, None))
+        arrays = (*images.view(*divmod(start + slot, self.views)), None, None, None, None, None)
+        self.counts[task] = self._run(slot, band, arrays)
 
     def _composite_backward(self, images: Images, gradients: Images, sums: Sums, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
@@ -235,15 +241,14 @@ class Drawing:
         arrays = (*images.view(scene, view), *gradients.view(scene, view))
         self._run(slot, band, (*arrays, *(x[scene, view, band] for x in sums)))
 
-    def _run(self, slot: int, band: int, arrays: tuple[np.ndarray | None, ...]) -> None:
-        buffers = Buffers()
+    def _run(self, slot: int, band: int, arrays: tuple[np.ndarray | None, ...]) -> tuple[int, int]:
         first, end = self.bands[band]
         columns = -(-self.width // layout.BLOCK)
-        state = buffers.empty(((end - first) * columns * STATE_VECTORS * LANES,))
-        open_words = buffers.empty((end - first, -(-columns // WORD_BITS)), np.uint64)
-        spans = buffers.empty((2 * (end - first + LANES),), np.int32)
+        state = empty(((end - first) * columns * STATE_VECTORS * LANES,))
+        open_words = empty((end - first, -(-columns // WORD_BITS)), np.uint64)
+        spans = empty((2 * (end - first + LANES),), np.int32)
         count = self.visible_counts[slot]
-        composite(self.records[slot], count, first, end, *self.thresholds, state, open_words, spans, *arrays)
+        return composite(self.records[slot], count, first, end, *self.thresholds, state, open_words, spans, *arrays)
 
     def _project_backward(self, result: Parameters, sums: Sums, task: int) -> None:
         scene, chunk = divmod(task, -(-self.count // CHUNK))
