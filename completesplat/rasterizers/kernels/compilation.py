@@ -4,13 +4,16 @@ import hashlib
 import inspect
 import logging
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+import llvmlite
 import numba
+from llvmlite import binding as llvm
 
 Result = TypeVar("Result")
 numba_config: Any = numba.config
@@ -66,3 +69,12 @@ def _cache_directory() -> Path | None:
         return folder
     logger.info("no writable cache folder (%s): kernels are compiled anew in every process", bases[-1])
     return None
+
+
+def compiled() -> tuple[Path, list[Path], str] | None:
+    """Return the cache folder, the compiled kernels in it, and a text of what runs them; None without a folder."""
+    folder = _cache_directory()
+    if folder is None:
+        return None
+    machine = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten(), sys.version
+    return folder, sorted(folder.glob("*/*.nb?")), repr((*machine, numba.__version__, llvmlite.__version__))
