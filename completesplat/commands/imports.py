@@ -1,17 +1,21 @@
 """Imports of commands: without the garbage collector, and of diffusers without modules that no prediction uses."""
 
 import gc
+import importlib.metadata
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections import UserDict
+from collections.abc import Callable, Iterator, MutableSequence
 from contextlib import contextmanager
+from functools import cached_property
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
+from importlib.metadata import packages_distributions
 from importlib.util import spec_from_loader
 from types import ModuleType
 from typing import Any
 
-POSTPONED = ("torch._dynamo", "scipy.integrate", "scipy.stats")
+POSTPONED = ("requests", "scipy.integrate", "scipy.stats", "torch._dynamo")
 """Modules that diffusers imports: for decorators of its classes, and for schedulers with options of their own."""
 
 
@@ -43,9 +47,11 @@ def postponing() -> Iterator[None]:
         vars(stand_ins["torch._dynamo"]).update(allow_in_graph=lambda marked: marked, disable=_disable)
     sys.modules.update(stand_ins)
     sys.meta_path.insert(0, finder)
+    importlib.metadata.packages_distributions = _Distributions
     try:
         yield
     finally:
+        importlib.metadata.packages_distributions = packages_distributions
         sys.meta_path.remove(finder)
         for name, stand_in in stand_ins.items():
             if sys.modules.get(name) is stand_in:
@@ -64,13 +70,24 @@ def _disable(function: Callable[..., Any] | None = None, recursive: bool = True,
 
     if "wrapping" in settings:  # torch does so now
         return _real("torch._dynamo").disable(function, recursive, **settings)
-    return torch._disable_dynamo(function, recursive)
+    return torch._disable_dynamo(function, recursive)  # type: ignore[attr-defined]
+
+
+class _Distributions(UserDict[str, list[str]]):
+    """`packages_distributions`, which reads the records of all installed packages, when it is first looked into."""
+
+    def __init__(self) -> None:
+        pass
+
+    @cached_property
+    def data(self) -> dict[str, list[str]]:  # type: ignore[override]
+        return dict(packages_distributions())
 
 
 class _StandIn(ModuleType):
     """Stand-in for a module, which is imported when the first of its attributes is used."""
 
-    __path__: Sequence[str] = ()
+    __path__: MutableSequence[str] = []  # noqa: RUF012
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):  # `inspect` looks for such attributes in all modules

@@ -42,7 +42,7 @@ def auto(constants: RenderingConstants | None = None) -> Rasterizer:
     for name, make in FASTER.items():
         reason = None if name == "tiled" and _passed_before(constants) else failure(name, constants)
         if reason is None:
-            logger.info("rasterizer: %s (a test rendering agrees with the reference)", name)
+            logger.info("rasterizer: %s (a test rendering agreed with the reference)", name)
             return make(constants)
         expected = name == "cuda" and not torch.cuda.is_available()
         logger.log(logging.INFO if expected else logging.WARNING, "rasterizer: not %s: %s", name, reason)
@@ -75,30 +75,31 @@ def failure(name: str, constants: RenderingConstants | None) -> str | None:
     if not difference <= TOLERANCE:
         return f"its test rendering is wrong by {difference:.2g}"
     if name == "tiled":
-        with suppress(Exception):  # the next process then tests again
-            file, digest = _memory(constants)
-            file.write_text(digest)
+        with suppress(OSError):
+            _proof(constants).touch()
     return None
 
 
 def _passed_before(constants: RenderingConstants | None) -> bool:
-    """Return whether the tiled backend has passed its test in another process, with the same kernels and machine."""
+    """Return whether the tiled backend has passed its test in an earlier process under the same conditions."""
     try:
-        file, digest = _memory(constants)
-        return file.read_text() == digest
-    except Exception:  # as in `failure`: the test finds out
+        return _proof(constants).exists()
+    except Exception:  # as in `failure`, which finds the reason
         return False
 
 
-def _memory(constants: RenderingConstants | None) -> tuple[Path, str]:
-    """Return the file that remembers a passed test, and its content: a digest of all that the result depends on."""
+def _proof(constants: RenderingConstants | None) -> Path:
+    """Return the path of an empty file that exists if the tiled backend has passed its test.
+
+    Its name is a digest of what the result depends on: machine, versions, constants, sources, and compiled kernels.
+    """
     from completesplat.rasterizers.kernels.compilation import compiled
 
     folder, kernels, machine = compiled()
     digest = sha256(repr((constants, machine, torch.__version__, __version__)).encode())
     for path in (*sorted(Path(__file__).parent.glob("*.py")), *kernels):
         digest.update(path.read_bytes())
-    return folder / "tested", digest.hexdigest()
+    return folder / f"passed-{digest.hexdigest()}"
 
 
 @torch.enable_grad()

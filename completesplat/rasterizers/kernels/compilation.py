@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import llvmlite
 import numba
 from llvmlite import binding as llvm
+from numba.core.event import Event, Listener, register
 
 Result = TypeVar("Result")
 numba_config: Any = numba.config
@@ -71,10 +72,32 @@ def _cache_directory() -> Path | None:
     return None
 
 
-def compiled() -> tuple[Path, list[Path], str] | None:
-    """Return the cache folder, the compiled kernels in it, and a text of what runs them; None without a folder."""
+def compiled() -> tuple[Path, list[Path], str]:
+    """Return the cache folder, the compiled kernels in it, and a text that names what compiled and runs them.
+
+    Raises:
+        OSError: there is no writable cache folder.
+    """
     folder = _cache_directory()
     if folder is None:
-        return None
-    machine = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten(), sys.version
+        raise OSError("no cache folder")
+    settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
+    machine = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten(), sys.version, settings
     return folder, sorted(folder.glob("*/*.nb?")), repr((*machine, numba.__version__, llvmlite.__version__))
+
+
+class _Announcement(Listener):
+    """Message before the first kernel is compiled; there is none if all come from the cache."""
+
+    said = False
+
+    def on_start(self, event: Event) -> None:
+        if not self.said and event.data["dispatcher"].py_func.__module__.startswith(__package__):
+            self.said = True
+            logger.info("rasterizer: compiling its kernels, once on this machine, takes 10 to 30 s")
+
+    def on_end(self, event: Event) -> None:
+        pass
+
+
+register("numba:compile", _Announcement())
