@@ -39,13 +39,12 @@ def importing() -> Iterator[None]:
 def postponing() -> Iterator[None]:
     """Import diffusers without `POSTPONED`, which took half of its import's time; their first use imports them.
 
-    diffusers' networks are then not marked for torch.compile (`allow_in_graph`), so this is for commands that do not
-    compile them. Afterwards `sys.modules` has the real modules, or none.
+    Afterwards `sys.modules` holds the real modules or none. diffusers' blocks are not marked for torch.compile
+    (`allow_in_graph`), so this is for commands that do not compile networks.
     """
-    finder, stand_ins = _Submodules(), {name: _StandIn(name) for name in POSTPONED if name not in sys.modules}
-    if "torch._dynamo" in stand_ins:
-        vars(stand_ins["torch._dynamo"]).update(allow_in_graph=lambda marked: marked, disable=_disable)
-    sys.modules.update(stand_ins)
+    finder, stand_ins = _Submodules(), {name: _StandIn(name) for name in POSTPONED}
+    vars(stand_ins["torch._dynamo"]).update(allow_in_graph=lambda marked: marked, disable=_disable)
+    sys.modules.update({name: stand_in for name, stand_in in stand_ins.items() if name not in sys.modules})
     sys.meta_path.insert(0, finder)
     importlib.metadata.packages_distributions = _Distributions
     try:
@@ -74,14 +73,12 @@ def _disable(function: Callable[..., Any] | None = None, recursive: bool = True,
 
 
 class _Distributions(UserDict[str, list[str]]):
-    """`packages_distributions`, which reads the records of all installed packages, when it is first looked into."""
+    """`packages_distributions`, but the records of all installed packages are read when one is looked up."""
+
+    data = cached_property(lambda self: packages_distributions())  # type: ignore[assignment]
 
     def __init__(self) -> None:
         pass
-
-    @cached_property
-    def data(self) -> dict[str, list[str]]:  # type: ignore[override]
-        return dict(packages_distributions())
 
 
 class _StandIn(ModuleType):

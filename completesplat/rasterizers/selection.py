@@ -1,6 +1,8 @@
 """Choice of a backend that works on this machine."""
 
 import logging
+import os
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -42,7 +44,7 @@ def auto(constants: RenderingConstants | None = None) -> Rasterizer:
     for name, make in FASTER.items():
         reason = None if name == "tiled" and _passed_before(constants) else failure(name, constants)
         if reason is None:
-            logger.info("rasterizer: %s (a test rendering agreed with the reference)", name)
+            logger.info("rasterizer: %s (a test rendering agrees with the reference)", name)
             return make(constants)
         expected = name == "cuda" and not torch.cuda.is_available()
         logger.log(logging.INFO if expected else logging.WARNING, "rasterizer: not %s: %s", name, reason)
@@ -82,10 +84,9 @@ def failure(name: str, constants: RenderingConstants | None) -> str | None:
 
 def _passed_before(constants: RenderingConstants | None) -> bool:
     """Return whether the tiled backend has passed its test in an earlier process under the same conditions."""
-    try:
+    with suppress(Exception):  # as in `failure`, which finds the reason
         return _proof(constants).exists()
-    except Exception:  # as in `failure`, which finds the reason
-        return False
+    return False
 
 
 def _proof(constants: RenderingConstants | None) -> Path:
@@ -93,13 +94,17 @@ def _proof(constants: RenderingConstants | None) -> Path:
 
     Its name is a digest of what the result depends on: machine, versions, constants, sources, and compiled kernels.
     """
-    from completesplat.rasterizers.kernels.compilation import compiled
+    import numba
+    from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
-    folder, kernels, machine = compiled()
-    digest = sha256(repr((constants, machine, torch.__version__, __version__)).encode())
-    for path in (*sorted(Path(__file__).parent.glob("*.py")), *kernels):
-        digest.update(path.read_bytes())
-    return folder / f"passed-{digest.hexdigest()}"
+    from completesplat.rasterizers.kernels.compilation import cache_directory
+
+    folder = cache_directory() or Path(os.devnull)
+    machine = get_host_cpu_name(), get_host_cpu_features().flatten(), sys.version, numba.__version__, torch.__version__
+    settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
+    files = *sorted(Path(__file__).parent.glob("*.py")), *sorted(folder.glob("*/*.nb?"))
+    parts = [repr((machine, settings, constants, __version__)).encode(), *(path.read_bytes() for path in files)]
+    return folder / f"passed-{sha256(b''.join(parts)).hexdigest()}"
 
 
 @torch.enable_grad()

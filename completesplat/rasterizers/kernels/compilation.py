@@ -4,16 +4,13 @@ import hashlib
 import inspect
 import logging
 import os
-import sys
 import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-import llvmlite
 import numba
-from llvmlite import binding as llvm
 from numba.core.event import Event, Listener, register
 
 Result = TypeVar("Result")
@@ -32,7 +29,7 @@ OPTIONS: dict[str, Any] = {
 
 def kernel(function: Callable[..., Result]) -> Callable[..., Result]:
     """Compile an entry point on its first call; later processes load it from the cache."""
-    before, directory = numba_config.CACHE_DIR, _cache_directory()
+    before, directory = numba_config.CACHE_DIR, cache_directory()
     numba_config.CACHE_DIR = before if directory is None else str(directory)
     cached = directory is not None
     try:
@@ -50,7 +47,7 @@ def helper(function: Callable[..., Result]) -> Callable[..., Result]:
 
 
 @cache
-def _cache_directory() -> Path | None:
+def cache_directory() -> Path | None:
     """Return the first writable of $NUMBA_CACHE_DIR, a folder beside the sources and the user's cache, or None.
 
     numba invalidates a cached function when its file changes, but not when a helper in another file does, so the
@@ -72,28 +69,14 @@ def _cache_directory() -> Path | None:
     return None
 
 
-def compiled() -> tuple[Path, list[Path], str]:
-    """Return the cache folder, the compiled kernels in it, and a text that names what compiled and runs them.
-
-    Raises:
-        OSError: there is no writable cache folder.
-    """
-    folder = _cache_directory()
-    if folder is None:
-        raise OSError("no cache folder")
-    settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
-    machine = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten(), sys.version, settings
-    return folder, sorted(folder.glob("*/*.nb?")), repr((*machine, numba.__version__, llvmlite.__version__))
-
-
 class _Announcement(Listener):
-    """Message before the first kernel is compiled; there is none if all come from the cache."""
+    """Message before the first kernel is compiled; there is none if all kernels come from the cache."""
 
-    said = False
+    made = False
 
     def on_start(self, event: Event) -> None:
-        if not self.said and event.data["dispatcher"].py_func.__module__.startswith(__package__):
-            self.said = True
+        if not self.made and event.data["dispatcher"].py_func.__module__.startswith(__package__):
+            self.made = True
             logger.info("rasterizer: compiling its kernels, once on this machine, takes 10 to 30 s")
 
     def on_end(self, event: Event) -> None:
