@@ -2,7 +2,6 @@
 
 import logging
 import os
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -92,19 +91,16 @@ def _passed_before(constants: RenderingConstants | None) -> bool:
 def _proof(constants: RenderingConstants | None) -> Path:
     """Return the path of an empty file that exists if the tiled backend has passed its test.
 
-    Its name is a digest of what the result depends on: machine, versions, constants, sources, and compiled kernels.
+    It lies beside the compiled kernels. Its name is a digest of all else that the result depends on.
     """
-    import numba
-    from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
-
     from completesplat.rasterizers.kernels.compilation import cache_directory
 
     folder = cache_directory() or Path(os.devnull)
-    machine = get_host_cpu_name(), get_host_cpu_features().flatten(), sys.version, numba.__version__, torch.__version__
     settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
     files = *sorted(Path(__file__).parent.glob("*.py")), *sorted(folder.glob("*/*.nb?"))
-    parts = [repr((machine, settings, constants, __version__)).encode(), *(path.read_bytes() for path in files)]
-    return folder / f"passed-{sha256(b''.join(parts)).hexdigest()}"
+    facts = repr((settings, constants, torch.__version__, __version__)).encode()
+    digest = sha256(b"".join([facts, *(path.read_bytes() for path in files)])).hexdigest()
+    return folder / f"passed-{digest}"
 
 
 @torch.enable_grad()
