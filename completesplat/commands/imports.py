@@ -45,7 +45,7 @@ def postponing() -> Iterator[None]:
     finder, stand_ins = _Submodules(), {name: _StandIn(name) for name in POSTPONED}
     vars(stand_ins["torch._dynamo"]).update(allow_in_graph=lambda marked: marked, disable=_disable)
     sys.modules.update({name: stand_in for name, stand_in in stand_ins.items() if name not in sys.modules})
-    sys.meta_path.insert(0, finder)
+    sys.meta_path.append(finder)
     importlib.metadata.packages_distributions = _Distributions
     try:
         yield

@@ -88,6 +88,14 @@ with postponing():
     assert (sys.modules["torch._dynamo"], sys.modules["scipy.stats"]) == before
 assert (sys.modules["torch._dynamo"], sys.modules["scipy.stats"]) == before
 """
+CALLED = """
+from completesplat.commands.imports import postponing
+with postponing():
+    import torch
+    from torch.utils.checkpoint import checkpoint
+    assert checkpoint(torch.cos, torch.zeros(2), use_reentrant=False).tolist() == [1, 1]
+assert torch._dynamo.allow_in_graph.__module__ == "torch._dynamo.decorators"
+"""
 
 
 def run(program: str) -> None:
@@ -107,3 +115,7 @@ def test_another_library_gets_the_modules_themselves() -> None:
 
 def test_what_is_imported_already_stays() -> None:
     run(LOADED)
+
+
+def test_what_torch_excludes_from_compilation_can_be_called_meanwhile() -> None:
+    run(CALLED)
