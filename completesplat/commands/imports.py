@@ -15,7 +15,7 @@ from importlib.util import spec_from_loader
 from types import ModuleType
 from typing import Any
 
-POSTPONED = ("requests", "scipy.integrate", "scipy.stats", "torch._dynamo")
+POSTPONED = ("requests", "scipy.integrate", "scipy.stats", "torch._dynamo", "torch.distributed._functional_collectives")
 """Modules that diffusers imports: for decorators of its classes, and for schedulers with options of their own."""
 
 
