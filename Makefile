@@ -4,6 +4,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# The rasterizer's kernels are compiled in the background, while the target that needed .venv begins.
 # LOCKED=1 installs the versions of requirements.lock, whose files must have the hashes in it.
 READY := .venv/installed$(if $(LOCKED),-locked)
 DEMO := outputs/demo
@@ -20,6 +21,7 @@ $(READY): pyproject.toml $(if $(LOCKED),requirements.lock)
 	@$(PYTHON) -m venv .venv
 	$(if $(LOCKED),@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements.lock)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
+	@$(BIN)/python -c "from completesplat.rasterizers.selection import auto; auto()" > /dev/null 2>&1 &
 	@touch $(READY)
 
 # The scenes have another seed than those of the weights' training. The held-out image is the first frame of the last scene.

@@ -21,10 +21,6 @@ from completesplat.errors import CompleteSplatError
 from completesplat.settings.schema import Positive
 
 TORCH, PREDICT, AGAIN, VIEW = "import torch", "predict", "predict once more", "view, until its page is there"
-# The least that every prediction needs: diffusers' networks and scheduler, with what diffusers itself imports.
-NEEDED = "import torch and the networks of diffusers"
-NETWORKS = "import gc; gc.disable(); import torch; from diffusers import FlowMatchEulerDiscreteScheduler, UNet2DModel; "
-NETWORKS += "from diffusers.models.autoencoders import vae"
 # The second call needs no imports and no compilation of kernels: it has settings, weights, a sample and files left.
 TWICE = """
 import json, sys, time
@@ -79,7 +75,7 @@ def timed(programs: Mapping[str, Sequence[str]], repeats: int) -> dict[str, Seco
 
     `programs` has the arguments of `PREDICT`, and perhaps of `VIEW`, which is ended when it has printed an address.
     """
-    kinds = {TORCH: ["-c", "import torch"], NEEDED: ["-c", NETWORKS]}
+    kinds = {TORCH: ["-c", "import torch"]}
     kinds |= {name: ["-m", "completesplat", *arguments] for name, arguments in programs.items()}
     kinds[AGAIN] = ["-c", TWICE, *programs[PREDICT]]
     taken: dict[str, list[Seconds]] = {name: [] for name in kinds}

@@ -1,6 +1,5 @@
 """Jobs, single or of a sweep: their folders, locks and records, and how they continue."""
 
-import gc
 import json
 import logging
 import math
@@ -10,7 +9,7 @@ import shlex
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -22,6 +21,7 @@ from hydra.utils import get_method, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from completesplat import __version__
+from completesplat.commands.imports import importing, postponing
 from completesplat.commands.protocol import git_commit, write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.files import atomic_path, writing
@@ -170,7 +170,7 @@ def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) 
 
 def start(verb: str, config: DictConfig, out: Path) -> None:
     """Check the settings and call the function that the config names as its task, or else the verb's `run`."""
-    with importing():
+    with importing(), postponing() if verb == "predict" else nullcontext():
         check_verb(verb, config)
         if config.get("task") is None:
             run = partial(import_module(f"completesplat.commands.{verb}").run, config, out)
@@ -178,22 +178,6 @@ def start(verb: str, config: DictConfig, out: Path) -> None:
             check_settings(get_method(config.task._target_), resolved_settings(config.task))
             run = partial(instantiate, config.task, out=out, _convert_="all")
     run()
-
-
-@contextmanager
-def importing() -> Iterator[None]:
-    """Pause the garbage collector during imports, because it took a fifth of a prediction's time.
-
-    The objects that exist after the first import of torch are frozen: the collector does not examine them again.
-    """
-    before = "torch" in sys.modules
-    gc.disable()
-    try:
-        yield
-    finally:
-        if not before and "torch" in sys.modules:
-            gc.freeze()
-        gc.enable()
 
 
 def is_finished(out: Path, config: Mapping[str, object]) -> bool:

@@ -9,7 +9,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from completesplat.commands.jobs import at_work, importing
+from completesplat.commands.imports import importing, postponing
+from completesplat.commands.jobs import at_work
 from completesplat.errors import CompleteSplatError
 from completesplat.files import printable
 from completesplat.settings.checks import REMOVE, check_parts
@@ -90,7 +91,7 @@ def settings_of(path: Path) -> dict[str, str]:
 
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     """Create a server's page and fill it with the scenes or the model that the settings name."""
-    with importing():
+    with importing(), postponing():
         import torch
         from hydra.utils import instantiate
 

@@ -16,7 +16,7 @@ def test_programs_take_turns_after_a_round_that_does_not_count(monkeypatch):
 
     monkeypatch.setattr(startup, "_run", run)
     times = startup.timed({startup.PREDICT: ["predict"], startup.VIEW: ["view"]}, 2)
-    assert started == 3 * [(False,), (False,), ("predict", False), ("view", True), ("predict", False)]
+    assert started == 3 * [(False,), ("predict", False), ("view", True), ("predict", False)]
     assert times["predict once more"] == (0.5, 0.75)
 
 

@@ -16,6 +16,7 @@ from completesplat.errors import CompleteSplatError
 
 FEW = ["samples=2", "frames=4", "steps=2"]
 UNNEEDED = ["lightning", "matplotlib", "pandas", "torchmetrics", "viser", "wandb"]
+UNNEEDED += ["torch._dynamo", "sympy", "scipy.stats", "scipy.integrate", "requests"]  # diffusers imports them
 UNNEEDED += [f"completesplat.{part}" for part in ("data.importing", "data.loading", "metrics", "studies", "training")]
 
 

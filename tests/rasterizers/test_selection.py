@@ -18,6 +18,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.opening import config_of_run
 from completesplat.rasterizers import Rendering, RenderingConstants, cuda, selection
+from completesplat.rasterizers.kernels import compilation
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.tiled import TiledRasterizer
 
@@ -25,9 +26,10 @@ from completesplat.rasterizers.tiled import TiledRasterizer
 @pytest.fixture(autouse=True)
 def _no_gpu_and_no_memory(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    selection.failure.cache_clear()
+    failure = selection.failure
+    failure.cache_clear()
     yield
-    selection.failure.cache_clear()
+    failure.cache_clear()
 
 
 class Works(ReferenceRasterizer):
@@ -105,6 +107,60 @@ def test_a_backend_that_raises_or_renders_wrongly_is_not_taken(wrong: str, monke
     assert isinstance(selection.auto(), Works)
     reason = "OSError: no such instruction" if wrong == "call" else "its test rendering is wrong by"
     assert f"not first: {reason}" in warnings_in(caplog)
+
+
+@pytest.fixture
+def tests_run(monkeypatch, tmp_path) -> list[str]:
+    """Names of the backends that were tested, where no test has been passed before."""
+    ran, test = list[str](), selection.failure.__wrapped__
+    monkeypatch.setattr(selection, "failure", lambda name, constants: ran.append(name) or test(name, constants))
+    monkeypatch.setattr(selection, "FASTER", {"tiled": Works})
+    monkeypatch.setattr(compilation, "cache_directory", lambda: tmp_path)
+    (tmp_path / "machine").mkdir()
+    (tmp_path / "machine/kernel.nbc").write_bytes(b"code")
+    return ran
+
+
+def test_a_passed_test_is_not_repeated_under_the_same_conditions(tests_run, tmp_path, monkeypatch) -> None:
+    constants = RenderingConstants(max_alpha=0.98)
+    for _ in range(2):
+        assert isinstance(selection.auto(constants), Works)
+    assert tests_run == ["tiled"]
+
+    def tested_again() -> bool:
+        before = len(tests_run)
+        selection.auto(constants)
+        selection.auto(constants)
+        return len(tests_run) == before + 1
+
+    (tmp_path / "machine/kernel.nbc").write_bytes(b"cope")
+    assert tested_again()
+    (tmp_path / "machine/other.nbi").write_bytes(b"index")
+    assert tested_again()
+    monkeypatch.setattr(torch, "__version__", "3.0")
+    assert tested_again()
+    monkeypatch.setenv("NUMBA_OPT", "0")
+    assert tested_again()
+    constants = RenderingConstants(max_alpha=0.97)
+    assert tested_again()
+    for path in tmp_path.glob("passed-*"):
+        path.unlink()
+    assert tested_again()
+
+
+def test_a_failed_test_is_repeated(tests_run, monkeypatch) -> None:
+    monkeypatch.setattr(selection, "TOLERANCE", -1.0)
+    for _ in range(2):
+        assert not isinstance(selection.auto(), Works)
+    assert tests_run == ["tiled", "tiled"]
+
+
+@pytest.mark.parametrize("folder", [None, "missing"])
+def test_without_a_writable_folder_every_process_tests(folder: str | None, tests_run, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(compilation, "cache_directory", lambda: folder and tmp_path / folder)
+    for _ in range(2):
+        assert isinstance(selection.auto(), Works)
+    assert tests_run == ["tiled", "tiled"]
 
 
 def test_constants_that_the_tiled_backend_refuses_go_to_the_reference(caplog: pytest.LogCaptureFixture) -> None:

@@ -4,6 +4,7 @@ import hashlib
 import inspect
 import logging
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
 Result = TypeVar("Result")
 numba_config: Any = numba.config
@@ -28,7 +30,7 @@ OPTIONS: dict[str, Any] = {
 
 def kernel(function: Callable[..., Result]) -> Callable[..., Result]:
     """Compile an entry point on its first call; later processes load it from the cache."""
-    before, directory = numba_config.CACHE_DIR, _cache_directory()
+    before, directory = numba_config.CACHE_DIR, cache_directory()
     numba_config.CACHE_DIR = before if directory is None else str(directory)
     cached = directory is not None
     try:
@@ -46,16 +48,18 @@ def helper(function: Callable[..., Result]) -> Callable[..., Result]:
 
 
 @cache
-def _cache_directory() -> Path | None:
+def cache_directory() -> Path | None:
     """Return the first writable of $NUMBA_CACHE_DIR, a folder beside the sources and the user's cache, or None.
 
     numba invalidates a cached function when its file changes, but not when a helper in another file does, so the
-    folder's name contains a digest of all kernel sources.
+    folder's name contains a digest of all kernel sources, and of the processor and versions that they are compiled for.
     """
     here = Path(__file__).parent
     user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "completesplat"
     bases = [Path(numba_config.CACHE_DIR)] if numba_config.CACHE_DIR else [here / "__pycache__", user_cache]
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(here.glob("*.py")))).hexdigest()
+    machine = repr((get_host_cpu_name(), get_host_cpu_features().flatten(), sys.version, numba.__version__)).encode()
+    sources = b"".join(path.read_bytes() for path in sorted(here.glob("*.py")))
+    digest = hashlib.sha256(machine + sources).hexdigest()
     for base in bases:
         folder = base / f"kernels-{digest[:12]}"
         try:
@@ -63,6 +67,8 @@ def _cache_directory() -> Path | None:
             tempfile.TemporaryFile(dir=folder).close()
         except OSError:
             continue
+        if not any(folder.glob("*/*.nbc")):
+            logger.info("rasterizer: compiling its kernels on first use, once on this machine, takes 10 to 30 s")
         return folder
     logger.info("no writable cache folder (%s): kernels are compiled anew in every process", bases[-1])
     return None

@@ -1,6 +1,7 @@
 """Threads, forks, caches and buffers around the kernels."""
 
 import gc
+import logging
 import multiprocessing
 import os
 import subprocess
@@ -65,7 +66,7 @@ def test_a_forked_child_renders() -> None:
 @pytest.mark.processes
 def test_a_second_process_compiles_nothing() -> None:
     image()
-    if compilation._cache_directory() is None:
+    if compilation.cache_directory() is None:
         pytest.skip("no cache folder can be written here")
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); from degenerate_gaussians import camera, healthy; "
@@ -79,22 +80,27 @@ def test_a_second_process_compiles_nothing() -> None:
     assert result.stdout.strip() == "[(1, 0), (1, 0), (1, 0)]", result.stderr
 
 
-def test_without_a_writable_folder_kernels_are_compiled_but_not_kept(tmp_path, monkeypatch) -> None:
+def test_without_a_writable_folder_kernels_are_compiled_but_not_kept(tmp_path, monkeypatch, caplog) -> None:
     blocked = tmp_path / "file"
     blocked.touch()  # no folder can be made under a file
     monkeypatch.setattr(compilation.numba_config, "CACHE_DIR", str(blocked))
-    compilation._cache_directory.cache_clear()
+    compilation.cache_directory.cache_clear()
     try:
-        assert compilation._cache_directory() is None
+        assert compilation.cache_directory() is None
         double = compilation.kernel(_double)
         assert double(3) == 6
         assert double.stats.cache_path is None
         monkeypatch.setattr(compilation.numba_config, "CACHE_DIR", str(tmp_path))
-        compilation._cache_directory.cache_clear()
-        assert compilation.kernel(_double)(3) == 6
-        assert list(tmp_path.glob("kernels-*/*/*.nbc"))
+        compilation.cache_directory.cache_clear()
+        with caplog.at_level(logging.INFO):
+            assert compilation.kernel(_double)(3) == 6
+            assert list(tmp_path.glob("kernels-*/*/*.nbc"))
+            assert caplog.text.count("compiling its kernels on first use") == 1
+            compilation.cache_directory.cache_clear()
+            compilation.cache_directory()
+            assert caplog.text.count("compiling its kernels on first use") == 1  # they are in the cache
     finally:
-        compilation._cache_directory.cache_clear()
+        compilation.cache_directory.cache_clear()
 
 
 def _double(x: int) -> int:

@@ -1,0 +1,121 @@
+"""Imports that are postponed: nothing that diffusers or another library then does with them differs."""
+
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.processes
+
+IMPORTED = """
+import copy, pickle, sys
+from completesplat.commands.imports import POSTPONED, postponing
+with postponing():
+    import torch
+    from diffusers import FlowMatchEulerDiscreteScheduler, UNet2DModel
+    from diffusers.models.autoencoders import vae
+assert not set(POSTPONED) & set(sys.modules), set(POSTPONED) & set(sys.modules)
+sizes = {"block_out_channels": (8, 8), "down_block_types": ("DownBlock2D", "AttnDownBlock2D"), "norm_num_groups": 4}
+sizes |= {"up_block_types": ("AttnUpBlock2D", "UpBlock2D"), "attention_head_dim": 4, "layers_per_block": 1}
+"""
+SCRIPTS = {
+    "networks are compiled": """
+network = UNet2DModel(**sizes).eval()
+inputs = torch.randn(1, 3, 16, 16), torch.tensor([3])
+with torch.no_grad():
+    expected = network(*inputs).sample
+    graphs = []
+    def backend(graph, example):
+        graphs.append(graph)
+        return graph.forward
+    compiled = torch.compile(network, backend=backend, fullgraph=True)
+    assert torch.equal(compiled(*inputs).sample, expected) and len(graphs) == 1
+import torch._dynamo.config
+assert torch._dynamo is sys.modules["torch._dynamo"] and torch._dynamo.config is sys.modules["torch._dynamo.config"]
+assert torch._dynamo.__file__ and torch.compiler.disable(len)([1]) == 1
+""",
+    "networks are copied": """
+network = UNet2DModel(**sizes)
+for twin in (copy.deepcopy(network), pickle.loads(pickle.dumps(network))):
+    assert all(torch.equal(a, b) for a, b in zip(network.state_dict().values(), twin.state_dict().values()))
+assert not set(POSTPONED) & set(sys.modules)
+""",
+    "schedulers use scipy": """
+import scipy.stats
+scheduler = FlowMatchEulerDiscreteScheduler(use_beta_sigmas=True)
+scheduler.set_timesteps(4)
+expected = scipy.stats.beta.ppf([1, 2 / 3, 1 / 3, 0], 0.6, 0.6)
+sigmas = scheduler.sigmas[:4].numpy()
+assert abs((sigmas - sigmas[-1]) / (sigmas[0] - sigmas[-1]) - expected).max() < 1e-5, (sigmas, expected)
+from diffusers.schedulers import scheduling_lms_discrete
+assert abs(scheduling_lms_discrete.integrate.quad(lambda x: x, 0, 1)[0] - 0.5) < 1e-9
+""",
+    "functions stay excluded from compilation": """
+from diffusers.hooks.taylorseer_cache import TaylorSeerState
+state = TaylorSeerState()
+state.current_step, state.last_update_step = 3, 1
+state.taylor_factors, state.module_dtypes = {0: {0: torch.ones(2)}}, (torch.float32,)
+assert TaylorSeerState.predict.__name__ == "predict" and torch.equal(state.predict()[0], torch.ones(2))
+assert "torch._dynamo" in sys.modules
+""",
+    "diffusers knows which packages are installed": """
+import importlib.metadata
+from diffusers.utils import import_utils
+assert importlib.metadata.packages_distributions.__module__ == "importlib.metadata"
+assert import_utils._package_map == importlib.metadata.packages_distributions()
+""",
+}
+OTHERS = """
+import sys
+from completesplat.commands.imports import POSTPONED, postponing
+with postponing():
+    import torch._dynamo.config as config
+    import scipy.stats.qmc
+    from scipy.stats import norm
+    import requests
+    assert requests.codes.ok == 200
+import torch
+assert config is torch._dynamo.config is sys.modules["torch._dynamo.config"]
+assert torch._dynamo.allow_in_graph.__module__ == "torch._dynamo.decorators"
+assert scipy.stats.qmc is sys.modules["scipy.stats.qmc"] and norm is scipy.stats.norm
+assert requests is not sys.modules["requests"] and requests.get is sys.modules["requests"].get
+"""
+LOADED = """
+import sys, torch._dynamo, scipy.stats
+before = sys.modules["torch._dynamo"], sys.modules["scipy.stats"]
+from completesplat.commands.imports import postponing
+with postponing():
+    assert (sys.modules["torch._dynamo"], sys.modules["scipy.stats"]) == before
+assert (sys.modules["torch._dynamo"], sys.modules["scipy.stats"]) == before
+"""
+CALLED = """
+from completesplat.commands.imports import postponing
+with postponing():
+    import torch
+    from torch.utils.checkpoint import checkpoint
+    assert checkpoint(torch.cos, torch.zeros(2), use_reentrant=False).tolist() == [1, 1]
+assert torch._dynamo.allow_in_graph.__module__ == "torch._dynamo.decorators"
+"""
+
+
+def run(program: str) -> None:
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_diffusers_works_as_if_it_had_imported_all(name: str) -> None:
+    run(IMPORTED + SCRIPTS[name])
+
+
+def test_another_library_gets_the_modules_themselves() -> None:
+    """Modules below a postponed one, as transformers imports them, exist once and lie in their packages."""
+    run(OTHERS)
+
+
+def test_what_is_imported_already_stays() -> None:
+    run(LOADED)
+
+
+def test_what_torch_excludes_from_compilation_can_be_called_meanwhile() -> None:
+    run(CALLED)
