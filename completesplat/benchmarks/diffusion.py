@@ -14,7 +14,6 @@ from rich.console import Console
 from torch.utils.flop_counter import FlopCounterMode
 
 from completesplat.benchmarks.measuring import WARM_UP, Row, Work, milliseconds, report
-from completesplat.benchmarks.training_step import Training
 from completesplat.commands import quieten
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.writing import prepare
@@ -26,6 +25,7 @@ from completesplat.scene import CachedScene, SceneBatch
 from completesplat.settings.schema import Positive
 from completesplat.training.encoding import encode_training_set
 from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.training.steps import Training
 
 GUIDANCE_WEIGHT = 0.5  # from the paper's settings for diverse samples
 MANY_STEPS = 50  # the paper's

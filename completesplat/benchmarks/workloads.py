@@ -1,7 +1,6 @@
 """Workloads of the rasterizers: scenes like splatter images, and the time and memory of one rendering."""
 
 import ctypes
-import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,13 +11,12 @@ import torch
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians, concatenate
-from completesplat.geometry.cameras import Cameras, look_at, pinhole, pixel_centers, unproject
+from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unproject
 from completesplat.rasterizers import Rasterizer
 from completesplat.rasterizers.kernels.drawing import release
 from completesplat.training.stage import now
+from completesplat.training.steps import DISTANCE, FOV_DEGREES, orbit
 
-DISTANCE = 2.2  # from the cameras to the object's centre, world units
-FOV_DEGREES = 49.0
 OPACITIES = ("trained", "initial")
 MOST_REFERENCE_PAIRS = 2**28  # of a Gaussian and a pixel; the reference takes a second for a tenth of them
 MEBIBYTE = 2**20
@@ -72,15 +70,6 @@ def _layer(layer: int, source: Cameras, opacity: str, generator: torch.Generator
         opacities=trained if opacity == "trained" else 0.1 + 0.2 * uniform,
         colors=torch.stack([x, y, x * y], dim=-1).mul(3 + layer).sin() / 2 + 0.5,
     )
-
-
-def orbit(size: int, views: int) -> Cameras:
-    """Return cameras [1 view] on an orbit about the object, for images of side `size`."""
-    angles = 0.5 + 2 * math.pi * torch.arange(views) / views
-    target = torch.tensor([0.0, 0.0, DISTANCE])
-    eyes = target + DISTANCE * torch.stack([angles.sin(), torch.full_like(angles, -0.2), -angles.cos()], dim=-1)
-    matrices = look_at(eyes, target, torch.tensor([0.0, -1.0, 0.0]))
-    return Cameras(matrices[None], pinhole(FOV_DEGREES, size).expand(1, views, 3, 3), (size, size))
 
 
 def rendering_milliseconds(rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> tuple[float, float]:

@@ -138,3 +138,10 @@ class LearnedPerceptualSimilarity:
             pair = (images.flatten(0, 1).float() for images in (prediction.images, truth.images))
             distances: Tensor = self.distance(*pair)
             return distances.mean()
+
+
+class UntrainedPerceptualSimilarity(LearnedPerceptualSimilarity):
+    """The same network with random weights, to count the work of a step (`completesplat plan`)."""
+
+    def __init__(self) -> None:
+        self.distance = PerceptualDistance(VGG16Features(), load_heads())

@@ -47,6 +47,30 @@ class Fit(TypedDict):
     optimized_metric: str | None
 
 
+class Gpu(TypedDict):
+    """Peak TFLOP/s by precision, memory in GB, and its bandwidth in TB/s."""
+
+    bfloat16: Annotated[float, Range(1e-3)]
+    float32: Annotated[float, Range(1e-3)]
+    memory: Annotated[float, Range(1e-3)]
+    bandwidth: Annotated[float, Range(1e-3)]
+
+
+class Plan(Fit):
+    """Settings of `completesplat plan`."""
+
+    gpu: str
+    devices: Positive
+    share: Annotated[float, Range(0.01, 1)]
+    price: Annotated[float, Range(0)]
+    sequences: Positive
+    frames: Positive
+    pixel_bytes: Annotated[float, Range(0)]
+    loading_rate: Annotated[float, Range(1e-3)]
+    usable: Annotated[float, Range(0.01, 1)]
+    gpus: Mapping[str, Gpu]
+
+
 class SceneSettings(TypedDict):
     """Settings that `completesplat predict` and `view` share."""
 
@@ -95,7 +119,7 @@ class Test(RunSettings):
     trust: bool
 
 
-VERBS: dict[str, type] = {"fit": Fit, "predict": Predict, "view": View, "test": Test}
+VERBS: dict[str, type] = {"fit": Fit, "plan": Plan, "predict": Predict, "view": View, "test": Test}
 
 
 def check_verb(verb: str, config: DictConfig) -> None:

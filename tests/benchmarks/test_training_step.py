@@ -5,12 +5,13 @@ import torch
 from support import compose_config
 
 from completesplat.benchmarks import training_step
-from completesplat.benchmarks.training_step import share, synthetic_batch
-from completesplat.benchmarks.workloads import DISTANCE, Backend
+from completesplat.benchmarks.training_step import share
+from completesplat.benchmarks.workloads import Backend
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, project
 from completesplat.rasterizers import Rendering
 from completesplat.rasterizers.tiled import TiledRasterizer
+from completesplat.training.steps import DISTANCE, synthetic_batch
 
 
 def test_the_cameras_of_the_synthetic_batch_look_at_one_point_within_the_depth_range() -> None:

@@ -1,0 +1,275 @@
+"""`completesplat plan`: what a training takes, computed before it starts."""
+
+import copy
+import json
+import math
+import os
+import statistics
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.experimental.callback import Callback
+from hydra.utils import get_class
+from hydra.utils import instantiate as build
+from lightning.pytorch.callbacks import WeightAveraging
+from omegaconf import DictConfig, OmegaConf
+
+from completesplat.commands.fit import OTHER_WEIGHTS
+from completesplat.commands.protocol import write_json
+from completesplat.data.loading.distributed import batch_per_process
+from completesplat.errors import CompleteSplatError
+from completesplat.results.tables import Table, records_table, show
+from completesplat.settings.checks import check_image_size, check_optimizer
+from completesplat.settings.options import did_you_mean
+from completesplat.training.stage import Stage, now
+from completesplat.training.step_counts import StepCounts, count_step, encode
+from completesplat.training.steps import Training, synthetic_batch
+
+HERE = "this"
+MOST_TIMED = 1e9  # bytes that a timed step may take on a CPU
+UNTIMED_STEPS, TIMED_STEPS = 2, 5
+BYTES, DAY = 1e9, 24 * 3600
+WITH_CHECKPOINTING = ("autoreconstructor", "denoiser")
+PAPER_MS = {"reconstruct": 15.7, "sample": 2_700.0, "samples": 54_000.0, "render": 29.1, "stage2_step": 157.0}
+"""The paper's durations on an A100: Table 2, and of a step by its supplement, 1,100,000 steps in 2 days."""
+PAPER = (
+    "The paper, on one A100: 15.7 ms to reconstruct an image, 2.7 s a sample, 29.1 ms to render; stage 1 took 6 days, "
+    "stage 2 2 days, which is 157 ms a step."
+)
+LINES: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "parameters_trained": ("parameters, trained", "{:,}".format),
+    "parameters_frozen": ("parameters, frozen", "{:,}".format),
+    "flops": ("FLOPs of a step, all GPUs", "{:.4g}".format),
+    "memory": ("memory of a GPU", lambda kinds: "\n".join(f"{name} {x / BYTES:.3g} GB" for name, x in kinds.items())),
+    "peak_bytes": ("together", lambda x: f"{x / BYTES:.3g} GB"),
+    "fits": ("fits", lambda fits: "yes" if fits else "no"),
+    "step_seconds": ("seconds a step", "{:.3g}".format),
+    "images_per_second": ("images a second to load", "{:,.0f}".format),
+    "loading_workers": ("loading processes, all GPUs", "{:,}".format),
+    "prepared_bytes": ("prepared data", lambda x: f"{x / BYTES:.3g} GB"),
+    "latent_bytes": ("latents (data latents)", lambda x: "" if x is None else f"{x / BYTES:.3g} GB"),
+    "steps": ("steps", "{:,}".format),
+    "days": ("days", "{:.3g}".format),
+    "gpu_hours": ("GPU-hours", "{:,.4g}".format),
+    "price": ("price", "{:,.0f}".format),
+}
+ADDED = ("steps", "days", "gpu_hours", "price")
+
+
+def run(config: DictConfig, out: Path) -> None:
+    """Print the plan of a training and write `plan.json`."""
+    plan = plan_of(config)
+    write_json(out / "plan.json", plan)
+    show(plan_table({"plan": plan}), width=160)
+    for line in plan["remarks"]:
+        print(line)
+
+
+class Total(Callback):
+    """Hydra callback that prints the plans of a sweep side by side, with a total, after the last job."""
+
+    def on_multirun_end(self, config: Any, **kwargs: object) -> None:
+        """Print the table of all `plan.json` in the sweep's folder, in the order of the jobs."""
+        paths = sorted(Path(config.hydra.sweep.dir).glob("*/plan.json"), key=lambda path: path.stat().st_mtime)
+        plans = {path.parent.name: json.loads(path.read_text()) for path in paths}
+        if plans:
+            show(plan_table(plans), width=60 + 30 * len(plans))
+
+
+def plan_table(plans: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return a table with a column for each plan; several have a total, as for the stages of one recipe."""
+    rows: list[dict[str, object]] = []
+    for key, (label, text) in LINES.items():
+        row = {"": label} | {name: text(plan[key]) for name, plan in plans.items()}
+        if len(plans) > 1:
+            row["total"] = text(sum(plan[key] for plan in plans.values())) if key in ADDED else ""
+        rows.append(row)
+    return records_table("completesplat plan", rows)
+
+
+def plan_of(config: DictConfig) -> dict[str, Any]:
+    """Return the figures of a training that LINES names, with `assumptions` and `remarks`.
+
+    Raises:
+        CompleteSplatError: a setting is unfit, the GPU is unknown, or the length of the training.
+    """
+    check_image_size(config)
+    check_optimizer(config.optimizer)
+    if config.gpu != HERE and config.gpu not in config.gpus:
+        names = [*config.gpus, HERE]
+        raise CompleteSplatError(f"gpu={config.gpu}: there are {', '.join(names)}{did_you_mean(config.gpu, names)}")
+    data, name = config.data, precision(config)
+    batch = batch_per_process(data.batch_size, config.devices, config.trainer.accumulate_grad_batches)
+    sequences = known_sequences(config)
+    steps = steps_of(config, sequences)
+    counts = counted(config, batch)
+    limit = memory_limit(config)
+    flops = counts.flops * config.devices
+    if config.gpu == HERE:
+        seconds = timed(config, counts, batch) * config.trainer.accumulate_grad_batches
+    else:
+        seconds = seconds_on(config.gpus[config.gpu], counts, name, config.share)
+    per_item = 1 if data.latent_cache is not None else 1 + data.targets
+    rate, frames = data.batch_size * per_item / seconds, sequences * config.frames
+    hours = steps * seconds * config.devices / 3600
+    fits = counts.peak <= limit
+    speed = f"measured here, {flops / seconds / 1e12:.3g} TFLOP/s" if config.gpu == HERE else f"share={config.share}"
+    assumed = {
+        key: config[key] for key in ("gpu", "devices", "share", "price", "frames", "pixel_bytes", "loading_rate")
+    }
+    return {
+        "parameters_trained": counts.trained, "parameters_frozen": counts.frozen, "flops": flops,
+        "memory": dict(counts.memory), "peak_bytes": counts.peak, "fits": fits, "step_seconds": seconds,
+        "images_per_second": rate, "loading_workers": math.ceil(rate / config.loading_rate),
+        "prepared_bytes": frames * data.image_size**2 * config.pixel_bytes,
+        "latent_bytes": counts.latent_bytes and counts.latent_bytes * frames,
+        "steps": steps, "days": steps * seconds / DAY, "gpu_hours": hours, "price": hours * config.price,
+        "assumptions": {**assumed, "sequences": sequences, "usable": config.usable, "precision": name},
+        "paper_ms_a100": PAPER_MS,
+        "remarks": [
+            f"Speed: {speed} in {name}. FLOPs: forward, backward and optimizer, without the rasterizer and elementwise work.",
+            *([] if fits else advice(config, counts, batch, limit)),
+            "Not counted: validation, tests, checkpoints, waiting for data. " + PAPER,
+        ],
+    }  # fmt: skip
+
+
+def seconds_on(gpu: Mapping[str, float], counts: StepCounts, precision: str, share: float) -> float:
+    """Return the seconds of a step on a GPU: those of the FLOPs, and those of changing the weights.
+
+    The optimizer reads and writes weights, gradients (once more to clip them), its state and the averages, as fast as
+    the GPU's memory allows; for large networks and small batches, this takes longer than the FLOPs.
+    """
+    peak = gpu["float32" if precision.startswith("32") else "bfloat16"] * 1e12
+    changed = counts.memory["optimizer"] + counts.memory["averages"] + 3 * counts.memory["gradients"]
+    return counts.flops / (peak * share) + 2 * changed / (gpu["bandwidth"] * 1e12)
+
+
+def precision(config: DictConfig) -> str:
+    """Return Lightning's name of the training's precision; the default is what the GPU supports, not this machine."""
+    chosen = str(config.trainer.precision)
+    default = str(config.trainer._get_node("precision")._value()).startswith("${best_precision")
+    return "bf16-mixed" if config.gpu != HERE and (default or chosen.startswith("16")) else chosen
+
+
+def known_sequences(config: DictConfig) -> int:
+    """Return the number of training sequences in `data.root`, if it exists, else the setting."""
+    if OmegaConf.is_missing(config.data, "root") or not Path(config.data.root).is_dir():
+        return int(config.sequences)
+    return len(build(config.data, _convert_="all").source("train").names)
+
+
+def steps_of(config: DictConfig, sequences: int) -> int:
+    """Return the optimizer steps of the training; raise CompleteSplatError if it has no end."""
+    trainer, data = config.trainer, config.data
+    epochs = trainer.get("max_epochs")
+    limits = [] if trainer.max_steps < 0 else [trainer.max_steps]
+    if epochs is not None and epochs >= 0:
+        limits.append(epochs * math.ceil(sequences * data.references_per_sequence / data.batch_size))
+    if not limits:
+        raise CompleteSplatError("the training has no end: give trainer.max_steps=N or trainer.max_epochs=N")
+    return int(min(limits))
+
+
+def untrained(config: DictConfig) -> DictConfig:
+    """Return a copy of a config whose module is built without reading weights and without compiling."""
+    config = copy.deepcopy(config)
+    OmegaConf.set_struct(config, False)
+    for part in (config.autoreconstructor, config.conditioning, config.model):
+        part.update(dict.fromkeys(OTHER_WEIGHTS & part.keys()))
+    config.model.update({key: False for key in ("compile", "channels_last") if key in config.model})
+    for entry in filter(None, config.loss.terms.values()):
+        if entry.get("term", {}).get("_target_") == "completesplat.losses.lpips.LearnedPerceptualSimilarity":
+            entry.term = {"_target_": "completesplat.losses.lpips.UntrainedPerceptualSimilarity"}
+    return config
+
+
+def counted(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
+    """Return the counts of a process that takes `batch` scenes at a time."""
+    copied = untrained(config)
+    copied.rasterizer = {"_target_": "hydra.utils.get_object", "path": "completesplat.training.step_counts.store_only"}
+    for key, value in changes.items():
+        OmegaConf.update(copied, key, value)
+    targets = [callback._target_ for callback in config.callbacks.values() if callback is not None]
+    return count_step(
+        partial(build, copied.model, _convert_="all"),
+        config.data.image_size,
+        batch,
+        config.data.targets,
+        precision(config),
+        accumulated=config.trainer.accumulate_grad_batches,
+        averaged=any(issubclass(get_class(target), WeightAveraging) for target in targets),
+        distributed=config.devices > 1,
+        cached=config.data.latent_cache is not None,
+        gpu=config.gpu != HERE or torch.cuda.is_available(),
+    )
+
+
+def memory_limit(config: DictConfig) -> float:
+    """Return the bytes that a process can use."""
+    if config.gpu != HERE:
+        return float(config.gpus[config.gpu].memory * BYTES * config.usable)
+    if torch.cuda.is_available():
+        return float(torch.cuda.get_device_properties(0).total_memory * config.usable)
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * config.usable
+
+
+def parts_of(counts: StepCounts) -> tuple[int, int]:
+    """Return the bytes that do not depend on the batch, and those that grow with it."""
+    grows = sum(counts.memory[kind] for kind in ("batch", "activations", "intermediate results"))
+    return counts.peak - grows, grows
+
+
+def advice(config: DictConfig, counts: StepCounts, batch: int, limit: float) -> list[str]:
+    """Return the settings with which a step fits into the memory: those that leave the training the same."""
+    keys = [f"{part}.gradient_checkpointing" for part in WITH_CHECKPOINTING if f"{part}.gradient_checkpointing"]
+    off = [key for key in keys if OmegaConf.select(config, key) is False]
+    fewer = counted(config, batch, **dict.fromkeys(off, True)) if off else counts
+    used = off if fewer.peak < 0.98 * counts.peak else []
+    ways = [("", counts), *([(" ".join(f"{key}=true" for key in used), fewer)] if used else [])]
+    lines = []
+    for settings, found in ways:
+        fixed, grows = parts_of(found)
+        least = next((k for k in range(1, batch + 1) if batch % k == 0 and fixed + grows / k <= limit), None)
+        if least is not None:
+            times = least * config.trainer.accumulate_grad_batches
+            more = f"trainer.accumulate_grad_batches={times}" if least > 1 else ""
+            lines.append(
+                f"It fits with {' '.join(filter(None, [settings, more]))}: {(fixed + grows / least) / BYTES:.3g} GB."
+            )
+    reason = f"weights, gradients, optimizer and averages alone take {parts_of(counts)[0] / BYTES:.3g} GB"
+    return lines or [f"No setting here makes it fit: {reason}."]
+
+
+def timed(config: DictConfig, counts: StepCounts, batch: int) -> float:
+    """Return the median seconds of real steps on this machine, for `batch` scenes.
+
+    On a CPU, steps with fewer scenes are timed if a whole batch takes more than 1 GB.
+
+    Raises:
+        CompleteSplatError: a step with one scene takes too much memory.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    limit = memory_limit(config) if device.type == "cuda" else MOST_TIMED
+    fixed, grows = parts_of(counts)
+    scenes = next((n for n in range(batch, 0, -1) if batch % n == 0 and fixed + grows * n / batch <= limit), None)
+    if scenes is None:
+        message = (
+            f"a step takes {(fixed + grows / batch) / BYTES:.3g} GB, more than the {limit / BYTES:.3g} GB to time it"
+        )
+        raise CompleteSplatError(f"gpu={HERE}: {message}; give a GPU by name")
+    copied = untrained(config)
+    copied.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
+    module: Stage = build(copied.model, _convert_="all").to(device)
+    data: Any = synthetic_batch(config.data.image_size, scenes, config.data.targets)
+    training = Training(module, precision(config))
+    data = data.to(device) if config.data.latent_cache is None else encode(module, data.to(device))
+    seconds = []
+    for _ in range(UNTIMED_STEPS + TIMED_STEPS):
+        start = now()
+        training.step(data)
+        seconds.append(now() - start)
+    return statistics.median(seconds[UNTIMED_STEPS:]) * batch / scenes

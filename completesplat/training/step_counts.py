@@ -1,0 +1,222 @@
+"""Parameters, FLOPs and memory of one optimizer step, counted on fake tensors, which have shapes but no values.
+
+Multiplications and additions of matrix products, convolutions and attention are counted, forward and backward, as by
+`torch.utils.flop_counter`; elementwise operations and the rasterizer are not. Memory is what is alive at the same time:
+fake tensors are freed when real ones would be.
+"""
+
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.nn.functional import group_norm, layer_norm, softmax
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
+
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras
+from completesplat.losses.ssim import blur_matrix
+from completesplat.rasterizers import Rendering
+from completesplat.scene import CachedScene, SceneBatch
+from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.training.reconstruction import ReconstructionModule
+from completesplat.training.stage import Stage
+from completesplat.training.steps import Training, synthetic_batch
+
+aten = torch.ops.aten
+# torch's counter knows the attention kernels of GPUs only.
+ATTENTION: dict[Any, Callable[..., int]] = {
+    aten._scaled_dot_product_flash_attention_for_cpu: lambda *shapes, **_: sdpa_flop_count(*shapes[:3]),
+    aten._scaled_dot_product_flash_attention_for_cpu_backward: lambda *shapes, **_: sdpa_backward_flop_count(
+        *shapes[:4]
+    ),
+}
+VALUES_OF_A_PROJECTION = 13  # that gsplat stores of each Gaussian and view: 2D mean, conic, depth, radii, colour, ...
+
+
+@dataclass(frozen=True)
+class StepCounts:
+    """Work and memory of one optimizer step of one process.
+
+    Attributes:
+        trained, frozen: numbers of parameters.
+        flops: of all accumulated batches.
+        memory: bytes at the moment when most are in use, by kind.
+        latent_bytes: bytes of one encoded image in a latent cache; None without latents.
+    """
+
+    trained: int
+    frozen: int
+    flops: int
+    memory: Mapping[str, int]
+    latent_bytes: int | None
+
+    @property
+    def peak(self) -> int:
+        """Return the bytes of all kinds together."""
+        return sum(self.memory.values())
+
+
+class GpuPrecision(TorchFunctionMode):
+    """Mode that skips the initialisation of weights and, if asked to, computes in float32 what autocast does on GPUs.
+
+    Fake tensors are on the CPU, whose autocast leaves normalisations in bfloat16; a GPU's does not ("CUDA Ops that
+    can autocast to float32" in torch's documentation), so it stores more for the backward pass.
+    """
+
+    def __init__(self, gpu: bool) -> None:
+        super().__init__()
+        self.gpu = gpu
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if getattr(func, "__module__", None) == "torch.nn.init":
+            return args[0] if args else kwargs["tensor"]
+        if self.gpu and func in (group_norm, layer_norm, softmax) and torch.is_autocast_enabled("cpu"):
+            args, kwargs = tree_map(lambda x: x.float() if isinstance(x, Tensor) else x, (args, kwargs or {}))
+        return func(*args, **(kwargs or {}))
+
+
+class LiveMemory(TorchDispatchMode):
+    """Mode that counts the bytes of all tensors that are alive, storages once, and their maximum."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bytes = self.peak = 0
+        self.known: weakref.WeakSet[Any] = weakref.WeakSet()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        results = func(*args, **(kwargs or {}))
+        for tensor in tree_leaves(results):
+            if isinstance(tensor, Tensor) and (storage := tensor.untyped_storage()) not in self.known:
+                self.known.add(storage)
+                self.bytes += storage.nbytes()
+                weakref.finalize(storage, self._free, storage.nbytes())
+        self.peak = max(self.peak, self.bytes)
+        return results
+
+    def _free(self, size: int) -> None:
+        self.bytes -= size
+
+    def peak_since(self) -> int:
+        """Return the maximum since the last call."""
+        peak, self.peak = self.peak, self.bytes
+        return peak
+
+
+class _Store(torch.autograd.Function):
+    """Images of the right shape, which keep for the backward pass what a rasterizer keeps."""
+
+    @staticmethod
+    def forward(ctx: Any, views: int, height: int, width: int, *gaussians: Tensor) -> Tensor:
+        batch, count = gaussians[0].shape[:2]
+        image = gaussians[0].new_empty(batch, views, 5, height, width)
+        ctx.save_for_backward(*gaussians, image.new_empty(batch, views, count, VALUES_OF_A_PROJECTION), image)
+        return image.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        return None, None, None, *map(torch.empty_like, ctx.saved_tensors[:5])
+
+
+def store_only(gaussians: Gaussians, cameras: Cameras) -> Rendering:
+    """Take a rasterizer's memory without drawing; the lists of Gaussians of each tile are not included."""
+    values = vars(gaussians).values()
+    image = _Store.apply(cameras.world_to_camera.shape[1], *cameras.image_size, *values)  # type: ignore[no-untyped-call]
+    return Rendering(image[:, :, :3], image[:, :, 3:4], image[:, :, 4:])
+
+
+def count_step(
+    build: Callable[[], Stage],
+    image_size: int,
+    batch: int,
+    targets: int,
+    precision: str,
+    accumulated: int = 1,
+    averaged: bool = False,
+    distributed: bool = False,
+    cached: bool = False,
+    gpu: bool = True,
+) -> StepCounts:
+    """Count a step; a network of any size takes little memory and some seconds.
+
+    Args:
+        build: makes the module, whose rasterizer should be `store_only`, without reading weights.
+        image_size: side of the images in pixels.
+        batch, targets: number of scenes of a batch of this process, and of target views of each.
+        precision: precision in Lightning's notation.
+        accumulated: number of batches of a step.
+        averaged: whether a callback averages the weights.
+        distributed: whether several processes share the step, so that each has a second copy of the gradients.
+        cached: whether the batch has latents instead of images.
+        gpu: whether to store what autocast stores on a GPU.
+    """
+    live, counter = LiveMemory(), FlopCounterMode(display=False, custom_mapping=ATTENTION)
+    with _fake_tensors(), GpuPrecision(gpu), live:
+        module = build()
+        weights = live.bytes
+        scenes = synthetic_batch(image_size, batch, targets)
+        if isinstance(module, ReconstructionModule):
+            module.draw_others = lambda targets: targets - 1  # type: ignore[method-assign]
+        encoded = encode(module, scenes) if isinstance(module, LatentDiffusion) else None
+        training, inputs = Training(module, precision), encoded if cached and encoded else scenes
+        del scenes
+        before = live.bytes
+        live.peak_since()
+        with counter:
+            loss = training.loss(inputs)
+            forward, kept = live.peak_since(), live.bytes - before
+            torch.autograd.backward([loss])
+            backward, step = live.peak_since(), counter.get_total_flops()
+            training.update()
+        gradients = [p.grad for p in module.parameters() if p.grad is not None]
+        states = [x for state in training.optimizer.state.values() for x in tree_leaves(state) if torch.is_tensor(x)]
+        memory = {"weights": weights, "gradients": size_of(gradients), "optimizer": size_of(states)}
+        memory |= {"averages": weights if averaged else 0, "copies for ddp": memory["gradients"] if distributed else 0}
+        memory |= {"batch": before - weights, "activations": kept}
+        # Gradients of the last step are alive during the forward pass: Lightning removes them before the backward pass.
+        extra = memory["averages"] + memory["copies for ddp"]
+        peaks = forward + memory["gradients"] + memory["optimizer"], backward + memory["optimizer"], live.peak_since()
+        memory["intermediate results"] = max(peaks) + extra - sum(memory.values())
+        trained = sum(p.numel() for p in module.parameters() if p.requires_grad)
+        frozen = sum(p.numel() for p in module.parameters()) - trained
+        flops = step * accumulated + counter.get_total_flops() - step
+        return StepCounts(trained, frozen, flops, memory, encoded and row_bytes(encoded, module))
+
+
+@contextmanager
+def _fake_tensors() -> Iterator[None]:
+    """Make fake tensors only, and leave none in the package's caches."""
+    blur_matrix.cache_clear()
+    try:
+        with FakeTensorMode():
+            yield
+    finally:
+        blur_matrix.cache_clear()
+
+
+def size_of(tensors: list[Tensor]) -> int:
+    """Return the bytes of tensors."""
+    return sum(tensor.nbytes for tensor in tensors)
+
+
+@torch.no_grad()
+def encode(module: LatentDiffusion, scenes: SceneBatch) -> CachedScene:
+    """Return the scenes as a latent cache would give them."""
+    parts, images = module.completesplat, scenes.reference.images
+    latent = torch.zeros_like(module.inputs(scenes)[0])
+    condition = parts.conditioning(images) if parts.conditioning.frozen else images
+    return CachedScene(latent, latent.clone(), condition, scenes.reference_frame, scenes.names)
+
+
+def row_bytes(encoded: CachedScene, module: Stage) -> int:
+    """Return the bytes of one image in a latent cache in float32, where images have a byte for each value."""
+    moments = encoded.mean[0].numel() + encoded.log_variance[0].numel()
+    of_value = 4 if isinstance(module, LatentDiffusion) and module.completesplat.conditioning.frozen else 1
+    return 4 * moments + of_value * encoded.condition[0].numel() + 4  # and a checksum
