@@ -22,8 +22,10 @@ from completesplat.commands.protocol import write_json
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Table, records_table, show
+from completesplat.scene import CachedScene, SceneBatch
 from completesplat.settings.checks import check_image_size, check_optimizer
 from completesplat.settings.options import did_you_mean
+from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.stage import Stage, now
 from completesplat.training.step_counts import StepCounts, count_step, encode
 from completesplat.training.steps import Training, synthetic_batch
@@ -56,6 +58,7 @@ LINES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "gpu_hours": ("GPU-hours", "{:,.4g}".format),
     "price": ("price", "{:,.0f}".format),
 }
+ASSUMED = ("gpu", "devices", "share", "price", "frames", "pixel_bytes", "loading_rate", "usable")
 ADDED = ("steps", "days", "gpu_hours", "price")
 
 
@@ -83,7 +86,7 @@ def plan_table(plans: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return a table with a column for each plan; several have a total, as for the stages of one recipe."""
     rows: list[dict[str, object]] = []
     for key, (label, text) in LINES.items():
-        row = {"": label} | {name: text(plan[key]) for name, plan in plans.items()}
+        row: dict[str, object] = {"": label, **{name: text(plan[key]) for name, plan in plans.items()}}
         if len(plans) > 1:
             row["total"] = text(sum(plan[key] for plan in plans.values())) if key in ADDED else ""
         rows.append(row)
@@ -127,10 +130,10 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
         "prepared_bytes": frames * data.image_size**2 * config.pixel_bytes,
         "latent_bytes": counts.latent_bytes and counts.latent_bytes * frames,
         "steps": steps, "days": steps * seconds / DAY, "gpu_hours": hours, "price": hours * config.price,
-        "assumptions": {**assumed, "sequences": sequences, "usable": config.usable, "precision": name},
+        "assumptions": {**assumed, "sequences": sequences, "precision": name},
         "paper_ms_a100": PAPER_MS,
         "remarks": [
-            f"Speed: {speed} in {name}. FLOPs: forward, backward and optimizer, without the rasterizer and elementwise work.",
+            f"Speed: {speed} in {name}. FLOPs are those of both passes and the optimizer, without the rasterizer's.",
             *([] if fits else advice(config, counts, batch, limit)),
             "Not counted: validation, tests, checkpoints, waiting for data. " + PAPER,
         ],
@@ -214,7 +217,7 @@ def memory_limit(config: DictConfig) -> float:
         return float(config.gpus[config.gpu].memory * BYTES * config.usable)
     if torch.cuda.is_available():
         return float(torch.cuda.get_device_properties(0).total_memory * config.usable)
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * config.usable
+    return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * config.usable)
 
 
 def parts_of(counts: StepCounts) -> tuple[int, int]:
@@ -264,12 +267,13 @@ def timed(config: DictConfig, counts: StepCounts, batch: int) -> float:
     copied = untrained(config)
     copied.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
     module: Stage = build(copied.model, _convert_="all").to(device)
-    data: Any = synthetic_batch(config.data.image_size, scenes, config.data.targets)
+    inputs: SceneBatch | CachedScene = synthetic_batch(config.data.image_size, scenes, config.data.targets).to(device)
+    if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch) and config.data.latent_cache is not None:
+        inputs = encode(module, inputs)
     training = Training(module, precision(config))
-    data = data.to(device) if config.data.latent_cache is None else encode(module, data.to(device))
     seconds = []
     for _ in range(UNTIMED_STEPS + TIMED_STEPS):
         start = now()
-        training.step(data)
+        training.step(inputs)
         seconds.append(now() - start)
     return statistics.median(seconds[UNTIMED_STEPS:]) * batch / scenes

@@ -99,8 +99,9 @@ class PerceptualDistance(nn.Module):
     ) -> Float[Tensor, " image"]:
         """Return the distance of each pair of sRGB images with values in [0, 1] and sides of at least 16 pixels."""
         # Weights moved to a device in inference mode (validation before the first step) could not be used in training.
-        with torch.inference_mode(False):
-            self.to(first.device)
+        if self.shift.device != first.device:
+            with torch.inference_mode(False):
+                self.to(first.device)
         layers = zip(self.heads, self.directions(first), self.directions(second), strict=True)
         maps = [nn.functional.conv2d((left - right).square(), head) for head, left, right in layers]
         return torch.stack([differences.mean((1, 2, 3)) for differences in maps]).sum(0)

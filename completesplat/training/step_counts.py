@@ -16,9 +16,9 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.nn.functional import group_norm, layer_norm, softmax
 from torch.overrides import TorchFunctionMode
+from torch.utils import flop_counter
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
-from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -32,11 +32,10 @@ from completesplat.training.steps import Training, synthetic_batch
 
 aten = torch.ops.aten
 # torch's counter knows the attention kernels of GPUs only.
-ATTENTION: dict[Any, Callable[..., int]] = {
-    aten._scaled_dot_product_flash_attention_for_cpu: lambda *shapes, **_: sdpa_flop_count(*shapes[:3]),
-    aten._scaled_dot_product_flash_attention_for_cpu_backward: lambda *shapes, **_: sdpa_backward_flop_count(
-        *shapes[:4]
-    ),
+FORWARD, BACKWARD = flop_counter.sdpa_flop_count, flop_counter.sdpa_backward_flop_count
+ATTENTION: dict[Any, Callable[..., Any]] = {
+    aten._scaled_dot_product_flash_attention_for_cpu: lambda *shapes, **_: FORWARD(*shapes[:3]),
+    aten._scaled_dot_product_flash_attention_for_cpu_backward: lambda *shapes, **_: BACKWARD(*shapes[:4]),
 }
 VALUES_OF_A_PROJECTION = 13  # that gsplat stores of each Gaussian and view: 2D mean, conic, depth, radii, colour, ...
 
@@ -74,20 +73,23 @@ class GpuPrecision(TorchFunctionMode):
     def __init__(self, gpu: bool) -> None:
         super().__init__()
         self.gpu = gpu
+        self.building = True
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if getattr(func, "__module__", None) == "torch.nn.init":
             return args[0] if args else kwargs["tensor"]
+        if self.building and func is Tensor.item:  # samplers read limits of their noise levels, which change no shape
+            return 1.0
         if self.gpu and func in (group_norm, layer_norm, softmax) and torch.is_autocast_enabled("cpu"):
             args, kwargs = tree_map(lambda x: x.float() if isinstance(x, Tensor) else x, (args, kwargs or {}))
         return func(*args, **(kwargs or {}))
 
 
-class LiveMemory(TorchDispatchMode):
+class LiveMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Mode that counts the bytes of all tensors that are alive, storages once, and their maximum."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.bytes = self.peak = 0
         self.known: weakref.WeakSet[Any] = weakref.WeakSet()
 
@@ -157,9 +159,10 @@ def count_step(
         cached: whether the batch has latents instead of images.
         gpu: whether to store what autocast stores on a GPU.
     """
-    live, counter = LiveMemory(), FlopCounterMode(display=False, custom_mapping=ATTENTION)
-    with _fake_tensors(), GpuPrecision(gpu), live:
+    live, counter = LiveMemory(), flop_counter.FlopCounterMode(display=False, custom_mapping=ATTENTION)
+    with _fake_tensors(), GpuPrecision(gpu) as mode, live:
         module = build()
+        mode.building = False
         weights = live.bytes
         scenes = synthetic_batch(image_size, batch, targets)
         if isinstance(module, ReconstructionModule):
@@ -187,7 +190,7 @@ def count_step(
         trained = sum(p.numel() for p in module.parameters() if p.requires_grad)
         frozen = sum(p.numel() for p in module.parameters()) - trained
         flops = step * accumulated + counter.get_total_flops() - step
-        return StepCounts(trained, frozen, flops, memory, encoded and row_bytes(encoded, module))
+        return StepCounts(trained, frozen, flops, memory, None if encoded is None else row_bytes(encoded, module))
 
 
 @contextmanager
