@@ -16,7 +16,6 @@ from completesplat.benchmarks.training_step import share
 from completesplat.benchmarks.workloads import (
     OPACITIES,
     Backend,
-    peak_megabytes,
     rendering_milliseconds,
     splatter_scene,
 )
@@ -26,6 +25,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
 from completesplat.settings.schema import Positive
+from completesplat.training.steps import peak_megabytes
 
 # `gsplat_torch` is a baseline for this comparison; training cannot choose it.
 CLASSES = {

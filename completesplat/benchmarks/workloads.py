@@ -1,10 +1,6 @@
 """Workloads of the rasterizers: scenes like splatter images, and the time and memory of one rendering."""
 
-import ctypes
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,13 +9,11 @@ from torch import Tensor
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unproject
 from completesplat.rasterizers import Rasterizer
-from completesplat.rasterizers.kernels.drawing import release
 from completesplat.training.stage import now
 from completesplat.training.steps import DISTANCE, FOV_DEGREES, orbit
 
 OPACITIES = ("trained", "initial")
 MOST_REFERENCE_PAIRS = 2**28  # of a Gaussian and a pixel; the reference takes a second for a tenth of them
-MEBIBYTE = 2**20
 
 
 @dataclass(frozen=True)
@@ -87,29 +81,3 @@ def _ones(cameras: Cameras, channels: int) -> Tensor:
     # NumPy, because torch would wake its own threads, which then spin for a while on the cores that are timed.
     ones = np.ones((*cameras.intrinsics.shape[:2], channels, *cameras.image_size), np.float32)
     return torch.from_numpy(ones).to(cameras.intrinsics.device)
-
-
-def peak_megabytes(work: Callable[[], object], device: torch.device) -> float | None:
-    """Return the memory in MB that `work` adds to the process, or to the GPU; None if the system does not tell."""
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats()
-        before = torch.cuda.memory_allocated()
-        work()
-        return (torch.cuda.max_memory_allocated() - before) / MEBIBYTE
-    # Return memory that the process still holds after freeing it, because reusing it would not be counted.
-    release()
-    with suppress(AttributeError, OSError, TypeError):
-        ctypes.CDLL(None).malloc_trim(0)  # a function of glibc
-    try:
-        Path("/proc/self/clear_refs").write_text("5")  # Linux: the peak becomes the present memory
-    except OSError:
-        work()
-        return None
-    before = _peak_resident_kilobytes()
-    work()
-    return (_peak_resident_kilobytes() - before) / 1024
-
-
-def _peak_resident_kilobytes() -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))

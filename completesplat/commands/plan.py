@@ -28,7 +28,7 @@ from completesplat.settings.options import did_you_mean
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.stage import Stage, now
 from completesplat.training.step_counts import StepCounts, count_step, encode
-from completesplat.training.steps import Training, synthetic_batch
+from completesplat.training.steps import MEBIBYTE, Training, peak_megabytes, synthetic_batch
 
 HERE = "this"
 MOST_TIMED = 1e9  # bytes that a timed step may take on a CPU
@@ -45,8 +45,11 @@ LINES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "parameters_trained": ("parameters, trained", "{:,}".format),
     "parameters_frozen": ("parameters, frozen", "{:,}".format),
     "flops": ("FLOPs of a step, all GPUs", "{:.4g}".format),
+    "operations": ("operations of a step", "{:,}".format),
     "memory": ("memory of a GPU", lambda kinds: "\n".join(f"{name} {x / BYTES:.3g} GB" for name, x in kinds.items())),
     "peak_bytes": ("together", lambda x: f"{x / BYTES:.3g} GB"),
+    "measured_peak_bytes": ("together, measured", lambda x: "" if x is None else f"{x / BYTES:.3g} GB"),
+    "usable_bytes": ("usable", lambda x: f"{x / BYTES:.3g} GB"),
     "fits": ("fits", lambda fits: "yes" if fits else "no"),
     "step_seconds": ("seconds a step", "{:.3g}".format),
     "images_per_second": ("images a second to load", "{:,.0f}".format),
@@ -58,7 +61,7 @@ LINES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "gpu_hours": ("GPU-hours", "{:,.4g}".format),
     "price": ("price", "{:,.0f}".format),
 }
-ASSUMED = ("gpu", "devices", "share", "price", "frames", "pixel_bytes", "loading_rate", "usable")
+ASSUMED = ("gpu", "devices", "share", "price", "frames", "pixel_bytes", "loading_rate", "usable", "operation_us")
 ADDED = ("steps", "days", "gpu_hours", "price")
 
 
@@ -77,7 +80,7 @@ class Total(Callback):
     def on_multirun_end(self, config: Any, **kwargs: object) -> None:
         """Print the table of all `plan.json` in the sweep's folder, in the order of the jobs."""
         paths = sorted(Path(config.hydra.sweep.dir).glob("*/plan.json"), key=lambda path: path.stat().st_mtime)
-        plans = {path.parent.name: json.loads(path.read_text()) for path in paths}
+        plans = {path.parent.name.removeprefix("experiment-"): json.loads(path.read_text()) for path in paths}
         if plans:
             show(plan_table(plans), width=60 + 30 * len(plans))
 
@@ -111,10 +114,14 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
     counts = counted(config, batch)
     limit = memory_limit(config)
     flops = counts.flops * config.devices
+    measured = None
     if config.gpu == HERE:
-        seconds = timed(config, counts, batch) * config.trainer.accumulate_grad_batches
+        seconds, measured = timed(config, counts, batch)
+        seconds, bound = seconds * config.trainer.accumulate_grad_batches, []
     else:
-        seconds = seconds_on(config.gpus[config.gpu], counts, name, config.share)
+        seconds, starting = seconds_on(config, counts, name), counts.operations * config.operation_us * 1e-6
+        bound = ["Starting operations takes this long, however many GPUs there are."] if starting > seconds else []
+        seconds = max(seconds, starting)
     per_item = 1 if data.latent_cache is not None else 1 + data.targets
     rate, frames = data.batch_size * per_item / seconds, sequences * config.frames
     hours = steps * seconds * config.devices / 3600
@@ -125,7 +132,9 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
     }
     return {
         "parameters_trained": counts.trained, "parameters_frozen": counts.frozen, "flops": flops,
-        "memory": dict(counts.memory), "peak_bytes": counts.peak, "fits": fits, "step_seconds": seconds,
+        "operations": counts.operations,
+        "memory": dict(counts.memory), "peak_bytes": counts.peak,
+        "measured_peak_bytes": measured, "usable_bytes": limit, "fits": fits, "step_seconds": seconds,
         "images_per_second": rate, "loading_workers": math.ceil(rate / config.loading_rate),
         "prepared_bytes": frames * data.image_size**2 * config.pixel_bytes,
         "latent_bytes": counts.latent_bytes and counts.latent_bytes * frames,
@@ -134,21 +143,23 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
         "paper_ms_a100": PAPER_MS,
         "remarks": [
             f"Speed: {speed} in {name}. FLOPs are those of both passes and the optimizer, without the rasterizer's.",
+            *bound,
             *([] if fits else advice(config, counts, batch, limit)),
             "Not counted: validation, tests, checkpoints, waiting for data. " + PAPER,
         ],
     }  # fmt: skip
 
 
-def seconds_on(gpu: Mapping[str, float], counts: StepCounts, precision: str, share: float) -> float:
+def seconds_on(config: DictConfig, counts: StepCounts, precision: str) -> float:
     """Return the seconds of a step on a GPU: those of the FLOPs, and those of changing the weights.
 
     The optimizer reads and writes weights, gradients (once more to clip them), its state and the averages, as fast as
     the GPU's memory allows; for large networks and small batches, this takes longer than the FLOPs.
     """
+    gpu = config.gpus[config.gpu]
     peak = gpu["float32" if precision.startswith("32") else "bfloat16"] * 1e12
     changed = counts.memory["optimizer"] + counts.memory["averages"] + 3 * counts.memory["gradients"]
-    return counts.flops / (peak * share) + 2 * changed / (gpu["bandwidth"] * 1e12)
+    return float(counts.flops / (peak * config.share) + 2 * changed / (gpu.bandwidth * 1e12))
 
 
 def precision(config: DictConfig) -> str:
@@ -193,7 +204,8 @@ def untrained(config: DictConfig) -> DictConfig:
 def counted(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
     """Return the counts of a process that takes `batch` scenes at a time."""
     copied = untrained(config)
-    copied.rasterizer = {"_target_": "hydra.utils.get_object", "path": "completesplat.training.step_counts.store_only"}
+    gpu = config.gpu != HERE or torch.cuda.is_available()
+    copied.rasterizer = {"_target_": "completesplat.training.step_counts.StoreOnly", "gpu": gpu}
     for key, value in changes.items():
         OmegaConf.update(copied, key, value)
     targets = [callback._target_ for callback in config.callbacks.values() if callback is not None]
@@ -207,7 +219,7 @@ def counted(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
         averaged=any(issubclass(get_class(target), WeightAveraging) for target in targets),
         distributed=config.devices > 1,
         cached=config.data.latent_cache is not None,
-        gpu=config.gpu != HERE or torch.cuda.is_available(),
+        gpu=gpu,
     )
 
 
@@ -247,10 +259,10 @@ def advice(config: DictConfig, counts: StepCounts, batch: int, limit: float) -> 
     return lines or [f"No setting here makes it fit: {reason}."]
 
 
-def timed(config: DictConfig, counts: StepCounts, batch: int) -> float:
-    """Return the median seconds of real steps on this machine, for `batch` scenes.
+def timed(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, float | None]:
+    """Return the median seconds of real steps on this machine with `batch` scenes, and their peak in bytes, if known.
 
-    On a CPU, steps with fewer scenes are timed if a whole batch takes more than 1 GB.
+    On a CPU, steps with fewer scenes are timed, and their memory not measured, if a whole batch takes more than 1 GB.
 
     Raises:
         CompleteSplatError: a step with one scene takes too much memory.
@@ -260,20 +272,23 @@ def timed(config: DictConfig, counts: StepCounts, batch: int) -> float:
     fixed, grows = parts_of(counts)
     scenes = next((n for n in range(batch, 0, -1) if batch % n == 0 and fixed + grows * n / batch <= limit), None)
     if scenes is None:
-        message = (
-            f"a step takes {(fixed + grows / batch) / BYTES:.3g} GB, more than the {limit / BYTES:.3g} GB to time it"
-        )
-        raise CompleteSplatError(f"gpu={HERE}: {message}; give a GPU by name")
+        message = f"a step with one scene takes {(fixed + grows / batch) / BYTES:.3g} GB, at most {limit / BYTES:.3g}"
+        raise CompleteSplatError(f"gpu={HERE}: {message} GB are timed; give a GPU by name")
     copied = untrained(config)
     copied.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
     module: Stage = build(copied.model, _convert_="all").to(device)
     inputs: SceneBatch | CachedScene = synthetic_batch(config.data.image_size, scenes, config.data.targets).to(device)
     if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch) and config.data.latent_cache is not None:
         inputs = encode(module, inputs)
-    training = Training(module, precision(config))
-    seconds = []
-    for _ in range(UNTIMED_STEPS + TIMED_STEPS):
+    training, seconds = Training(module, precision(config)), []
+
+    def step() -> None:
         start = now()
         training.step(inputs)
         seconds.append(now() - start)
-    return statistics.median(seconds[UNTIMED_STEPS:]) * batch / scenes
+
+    for _ in range(UNTIMED_STEPS + TIMED_STEPS):
+        step()
+    growth = peak_megabytes(step, device)
+    peak = None if growth is None or scenes < batch else fixed + growth * MEBIBYTE
+    return statistics.median(seconds[UNTIMED_STEPS:-1]) * batch / scenes, peak

@@ -67,6 +67,7 @@ class Plan(Fit):
     frames: Positive
     pixel_bytes: Annotated[float, Range(0)]
     loading_rate: Annotated[float, Range(1e-3)]
+    operation_us: Annotated[float, Range(0)]
     usable: Annotated[float, Range(0.01, 1)]
     gpus: Mapping[str, Gpu]
 

@@ -32,12 +32,15 @@ from completesplat.training.steps import Training, synthetic_batch
 
 aten = torch.ops.aten
 # torch's counter knows the attention kernels of GPUs only.
-FORWARD, BACKWARD = flop_counter.sdpa_flop_count, flop_counter.sdpa_backward_flop_count
+FORWARD: Any = flop_counter.sdpa_flop_count
+BACKWARD: Any = flop_counter.sdpa_backward_flop_count
 ATTENTION: dict[Any, Callable[..., Any]] = {
     aten._scaled_dot_product_flash_attention_for_cpu: lambda *shapes, **_: FORWARD(*shapes[:3]),
     aten._scaled_dot_product_flash_attention_for_cpu_backward: lambda *shapes, **_: BACKWARD(*shapes[:4]),
 }
-VALUES_OF_A_PROJECTION = 13  # that gsplat stores of each Gaussian and view: 2D mean, conic, depth, radii, colour, ...
+# Floats for each Gaussian and view: kept for the backward pass (gsplat: 2D mean, conic, depth, radii, colour, opacity,
+# tiles), and added by it (their gradients). The CPU's were measured with bench rasterizers.
+RASTERIZER_FLOATS = {"gpu": (16, 12), "cpu": (5, 40)}
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,8 @@ class StepCounts:
 
     Attributes:
         trained, frozen: numbers of parameters.
-        flops: of all accumulated batches.
+        flops: of all accumulated batches and the optimizer.
+        operations: of all accumulated batches, each of which starts a kernel; the optimizer's few are left out.
         memory: bytes at the moment when most are in use, by kind.
         latent_bytes: bytes of one encoded image in a latent cache; None without latents.
     """
@@ -54,6 +58,7 @@ class StepCounts:
     trained: int
     frozen: int
     flops: int
+    operations: int
     memory: Mapping[str, int]
     latent_bytes: int | None
 
@@ -86,15 +91,16 @@ class GpuPrecision(TorchFunctionMode):
 
 
 class LiveMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Mode that counts the bytes of all tensors that are alive, storages once, and their maximum."""
+    """Mode that counts the bytes of all tensors that are alive, storages once, their maximum, and operations."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.bytes = self.peak = 0
+        self.bytes = self.peak = self.operations = 0
         self.known: weakref.WeakSet[Any] = weakref.WeakSet()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         results = func(*args, **(kwargs or {}))
+        self.operations += func.namespace == "aten" and not func.is_view and "empty" not in func.name()
         for tensor in tree_leaves(results):
             if isinstance(tensor, Tensor) and (storage := tensor.untyped_storage()) not in self.known:
                 self.known.add(storage)
@@ -113,25 +119,35 @@ class LiveMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 
 class _Store(torch.autograd.Function):
-    """Images of the right shape, which keep for the backward pass what a rasterizer keeps."""
+    """Images of the right shape, and the memory of a rasterizer's two passes."""
 
     @staticmethod
-    def forward(ctx: Any, views: int, height: int, width: int, *gaussians: Tensor) -> Tensor:
-        batch, count = gaussians[0].shape[:2]
-        image = gaussians[0].new_empty(batch, views, 5, height, width)
-        ctx.save_for_backward(*gaussians, image.new_empty(batch, views, count, VALUES_OF_A_PROJECTION), image)
+    def forward(ctx: Any, floats: tuple[int, int], cameras: Cameras, *gaussians: Tensor) -> Tensor:
+        new, views = gaussians[0].new_empty, cameras.world_to_camera.shape[1]
+        shape = (len(gaussians[0]), views, gaussians[0].shape[1])
+        image = new(len(gaussians[0]), views, 5, *cameras.image_size)
+        ctx.shape, ctx.added = shape, floats[1]
+        ctx.save_for_backward(*gaussians, new(*shape, floats[0]), image)
         return image.clone()
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return None, None, None, *map(torch.empty_like, ctx.saved_tensors[:5])
+        added = gradients[0].new_empty(*ctx.shape, ctx.added)
+        results = [torch.empty_like(tensor) for tensor in ctx.saved_tensors[:5]]
+        del added
+        return None, None, *results
 
 
-def store_only(gaussians: Gaussians, cameras: Cameras) -> Rendering:
-    """Take a rasterizer's memory without drawing; the lists of Gaussians of each tile are not included."""
-    values = vars(gaussians).values()
-    image = _Store.apply(cameras.world_to_camera.shape[1], *cameras.image_size, *values)  # type: ignore[no-untyped-call]
-    return Rendering(image[:, :, :3], image[:, :, 3:4], image[:, :, 4:])
+class StoreOnly:
+    """Rasterizer that takes the memory of the `cuda` backend on a GPU, or of `tiled`, and draws nothing."""
+
+    def __init__(self, gpu: bool) -> None:
+        self.floats = RASTERIZER_FLOATS["gpu" if gpu else "cpu"]
+
+    def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        """Return empty images of scenes [batch] from cameras [batch view]."""
+        image = _Store.apply(self.floats, cameras, *vars(gaussians).values())  # type: ignore[no-untyped-call]
+        return Rendering(image[:, :, :3], image[:, :, 3:4], image[:, :, 4:])
 
 
 def count_step(
@@ -149,7 +165,7 @@ def count_step(
     """Count a step; a network of any size takes little memory and some seconds.
 
     Args:
-        build: makes the module, whose rasterizer should be `store_only`, without reading weights.
+        build: makes the module, whose rasterizer should be `StoreOnly`, without reading weights.
         image_size: side of the images in pixels.
         batch, targets: number of scenes of a batch of this process, and of target views of each.
         precision: precision in Lightning's notation.
@@ -172,11 +188,12 @@ def count_step(
         del scenes
         before = live.bytes
         live.peak_since()
+        first = live.operations
         with counter:
             loss = training.loss(inputs)
             forward, kept = live.peak_since(), live.bytes - before
             torch.autograd.backward([loss])
-            backward, step = live.peak_since(), counter.get_total_flops()
+            backward, flops, operations = live.peak_since(), counter.get_total_flops(), live.operations - first
             training.update()
         gradients = [p.grad for p in module.parameters() if p.grad is not None]
         states = [x for state in training.optimizer.state.values() for x in tree_leaves(state) if torch.is_tensor(x)]
@@ -189,8 +206,11 @@ def count_step(
         memory["intermediate results"] = max(peaks) + extra - sum(memory.values())
         trained = sum(p.numel() for p in module.parameters() if p.requires_grad)
         frozen = sum(p.numel() for p in module.parameters()) - trained
-        flops = step * accumulated + counter.get_total_flops() - step
-        return StepCounts(trained, frozen, flops, memory, None if encoded is None else row_bytes(encoded, module))
+        more = accumulated - 1  # batches without a change of the weights
+        flops, operations = counter.get_total_flops() + more * flops, live.operations - first + more * operations
+        return StepCounts(
+            trained, frozen, flops, operations, memory, None if encoded is None else row_bytes(encoded, module)
+        )
 
 
 @contextmanager

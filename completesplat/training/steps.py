@@ -1,7 +1,11 @@
-"""Optimizer steps outside of a trainer, on a synthetic batch."""
+"""Optimizer steps outside of a trainer, on a synthetic batch, and the memory that work takes."""
 
+import ctypes
 import math
+from collections.abc import Callable
+from contextlib import suppress
 from functools import cached_property
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -13,6 +17,7 @@ from completesplat.training.stage import Stage
 
 DISTANCE = 2.2  # from the cameras to the object's centre, world units
 FOV_DEGREES = 49.0
+MEBIBYTE = 2**20
 MAXIMAL_NORM = 1.0  # of gradients, as in conf/trainer
 
 
@@ -77,3 +82,31 @@ def synthetic_batch(size: int, batch: int, targets: int) -> SceneBatch:
     depth_range = torch.tensor([0.5 * DISTANCE, 2 * DISTANCE]).expand(batch, 2)
     frames = torch.zeros(batch, dtype=torch.int64)
     return SceneBatch(views[:, 0], views[:, 1:], depth_range, views.masks[:, 0], frames, ("synthetic",) * batch)
+
+
+def peak_megabytes(work: Callable[[], object], device: torch.device) -> float | None:
+    """Return the memory in MB that `work` adds to the process, or to the GPU; None if the system does not tell."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        work()
+        return (torch.cuda.max_memory_allocated() - before) / MEBIBYTE
+    from completesplat.rasterizers.kernels.drawing import release  # imports numba
+
+    # Return memory that the process still holds after freeing it, because reusing it would not be counted.
+    release()
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)  # a function of glibc
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # Linux: the peak becomes the present memory
+    except OSError:
+        work()
+        return None
+    before = _peak_resident_kilobytes()
+    work()
+    return (_peak_resident_kilobytes() - before) / 1024
+
+
+def _peak_resident_kilobytes() -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))

@@ -10,9 +10,7 @@ from rasterizer_scenes import render_with_gradients
 
 from completesplat.benchmarks import workloads
 from completesplat.benchmarks.workloads import (
-    FOV_DEGREES,
     OPACITIES,
-    peak_megabytes,
     rendering_milliseconds,
     splatter_scene,
 )
@@ -22,6 +20,7 @@ from completesplat.rasterizers import Rendering
 from completesplat.rasterizers.kernels import drawing
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.training import stage
+from completesplat.training.steps import FOV_DEGREES, peak_megabytes
 
 
 @pytest.mark.parametrize("opacity", OPACITIES)
