@@ -34,12 +34,11 @@ HERE = "this"
 MOST_TIMED = 1e9  # bytes that a timed step may take on a CPU
 UNTIMED_STEPS, TIMED_STEPS = 2, 5
 BYTES, DAY = 1e9, 24 * 3600
-WITH_CHECKPOINTING = ("autoreconstructor", "denoiser")
-PAPER_MS = {"reconstruct": 15.7, "sample": 2_700.0, "samples": 54_000.0, "render": 29.1, "stage2_step": 157.0}
-"""The paper's durations on an A100: Table 2, and of a step by its supplement, 1,100,000 steps in 2 days."""
-PAPER = (
+REMARKS = (
+    "FLOPs are those of both passes and the optimizer, without the rasterizer and elementwise operations.",
+    "Not counted: exchange of gradients between GPUs, validation, tests, checkpoints, waiting for data.",
     "The paper, on one A100: 15.7 ms to reconstruct an image, 2.7 s a sample, 29.1 ms to render; stage 1 took 6 days, "
-    "stage 2 2 days, which is 157 ms a step."
+    "stage 2 2 days, which is 157 ms a step.",
 )
 LINES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "parameters_trained": ("parameters, trained", "{:,}".format),
@@ -61,7 +60,7 @@ LINES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "gpu_hours": ("GPU-hours", "{:,.4g}".format),
     "price": ("price", "{:,.0f}".format),
 }
-ASSUMED = ("gpu", "devices", "share", "price", "frames", "pixel_bytes", "loading_rate", "usable", "operation_us")
+ASSUMED = ("gpu", "devices", "share", "operation_us", "price", "usable", "pixel_bytes", "loading_rate")
 ADDED = ("steps", "days", "gpu_hours", "price")
 
 
@@ -70,6 +69,7 @@ def run(config: DictConfig, out: Path) -> None:
     plan = plan_of(config)
     write_json(out / "plan.json", plan)
     show(plan_table({"plan": plan}), width=160)
+    print("Assumptions:", " ".join(f"{key}={value}" for key, value in plan["assumptions"].items()))
     for line in plan["remarks"]:
         print(line)
 
@@ -100,66 +100,55 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
     """Return the figures of a training that LINES names, with `assumptions` and `remarks`.
 
     Raises:
-        CompleteSplatError: a setting is unfit, the GPU is unknown, or the length of the training.
+        CompleteSplatError: a setting does not fit, the GPU is unknown, or nothing says how long the training is.
     """
     check_image_size(config)
     check_optimizer(config.optimizer)
     if config.gpu != HERE and config.gpu not in config.gpus:
         names = [*config.gpus, HERE]
         raise CompleteSplatError(f"gpu={config.gpu}: there are {', '.join(names)}{did_you_mean(config.gpu, names)}")
-    data, name = config.data, precision(config)
-    batch = batch_per_process(data.batch_size, config.devices, config.trainer.accumulate_grad_batches)
-    sequences = known_sequences(config)
-    steps = steps_of(config, sequences)
-    counts = counted(config, batch)
-    limit = memory_limit(config)
-    flops = counts.flops * config.devices
-    measured = None
+    data, accumulated = config.data, config.trainer.accumulate_grad_batches
+    batch = batch_per_process(data.batch_size, config.devices, accumulated)
+    sequences, frames = size_of_data(config)
+    steps, counts, limit = steps_of(config, sequences), counted(config, batch), memory_limit(config)
+    flops, measured, fits = counts.flops * config.devices, None, counts.peak <= limit
     if config.gpu == HERE:
         seconds, measured = timed(config, counts, batch)
-        seconds, bound = seconds * config.trainer.accumulate_grad_batches, []
+        seconds *= accumulated
+        speed = f"measured here, {flops / seconds / 1e12:.3g} TFLOP/s"
     else:
-        seconds, starting = seconds_on(config, counts, name), counts.operations * config.operation_us * 1e-6
-        bound = ["Starting operations takes this long, however many GPUs there are."] if starting > seconds else []
-        seconds = max(seconds, starting)
-    per_item = 1 if data.latent_cache is not None else 1 + data.targets
-    rate, frames = data.batch_size * per_item / seconds, sequences * config.frames
-    hours = steps * seconds * config.devices / 3600
-    fits = counts.peak <= limit
-    speed = f"measured here, {flops / seconds / 1e12:.3g} TFLOP/s" if config.gpu == HERE else f"share={config.share}"
-    assumed = {
-        key: config[key] for key in ("gpu", "devices", "share", "price", "frames", "pixel_bytes", "loading_rate")
-    }
-    return {
-        "parameters_trained": counts.trained, "parameters_frozen": counts.frozen, "flops": flops,
-        "operations": counts.operations,
-        "memory": dict(counts.memory), "peak_bytes": counts.peak,
-        "measured_peak_bytes": measured, "usable_bytes": limit, "fits": fits, "step_seconds": seconds,
-        "images_per_second": rate, "loading_workers": math.ceil(rate / config.loading_rate),
-        "prepared_bytes": frames * data.image_size**2 * config.pixel_bytes,
-        "latent_bytes": counts.latent_bytes and counts.latent_bytes * frames,
-        "steps": steps, "days": steps * seconds / DAY, "gpu_hours": hours, "price": hours * config.price,
-        "assumptions": {**assumed, "sequences": sequences, "precision": name},
-        "paper_ms_a100": PAPER_MS,
-        "remarks": [
-            f"Speed: {speed} in {name}. FLOPs are those of both passes and the optimizer, without the rasterizer's.",
-            *bound,
-            *([] if fits else advice(config, counts, batch, limit)),
-            "Not counted: validation, tests, checkpoints, waiting for data. " + PAPER,
-        ],
-    }  # fmt: skip
+        seconds, speed = seconds_on(config, counts)
+    rate = data.batch_size * (1 if data.latent_cache is not None else 1 + data.targets) / seconds
+    hours, images = steps * seconds * config.devices / 3600, sequences * frames
+    figures: dict[str, Any] = {"parameters_trained": counts.trained, "parameters_frozen": counts.frozen}
+    figures |= {"flops": flops, "operations": counts.operations, "memory": dict(counts.memory)}
+    figures |= {"peak_bytes": counts.peak, "measured_peak_bytes": measured, "usable_bytes": limit, "fits": fits}
+    figures |= {"step_seconds": seconds, "images_per_second": rate}
+    figures |= {"loading_workers": math.ceil(rate / config.loading_rate)}
+    figures |= {"prepared_bytes": images * data.image_size**2 * config.pixel_bytes}
+    figures |= {"latent_bytes": counts.latent_bytes and counts.latent_bytes * images}
+    figures |= {"steps": steps, "days": steps * seconds / DAY, "gpu_hours": hours, "price": hours * config.price}
+    assumed = {key: config[key] for key in ASSUMED} | {"sequences": sequences, "frames": frames}
+    remarks = [f"Time of a step: {speed}.", *([] if fits else advice(config, counts, batch, limit)), *REMARKS]
+    assumed |= {"precision": precision(config)}
+    return {**figures, "assumptions": assumed, "remarks": remarks}
 
 
-def seconds_on(config: DictConfig, counts: StepCounts, precision: str) -> float:
-    """Return the seconds of a step on a GPU: those of the FLOPs, and those of changing the weights.
+def seconds_on(config: DictConfig, counts: StepCounts) -> tuple[float, str]:
+    """Return the seconds of a step on a GPU of the table, and in words what they are.
 
-    The optimizer reads and writes weights, gradients (once more to clip them), its state and the averages, as fast as
-    the GPU's memory allows; for large networks and small batches, this takes longer than the FLOPs.
+    A step takes the time of its FLOPs and that of changing the weights: weights, gradients (also to clip them), the
+    optimizer's state and averages are read and written as fast as the memory allows. It takes at least as long as
+    starting its operations one after the other.
     """
-    gpu = config.gpus[config.gpu]
-    peak = gpu["float32" if precision.startswith("32") else "bfloat16"] * 1e12
+    gpu, name = config.gpus[config.gpu], precision(config)
+    computing = counts.flops / (gpu["float32" if name.startswith("32") else "bfloat16"] * 1e12 * config.share)
     changed = counts.memory["optimizer"] + counts.memory["averages"] + 3 * counts.memory["gradients"]
-    return float(counts.flops / (peak * config.share) + 2 * changed / (gpu.bandwidth * 1e12))
+    changing, starting = 2 * changed / (gpu.bandwidth * 1e12), counts.operations * config.operation_us * 1e-6
+    parts = f"{computing * 1e3:.3g} ms of FLOPs in {name} and {changing * 1e3:.3g} ms to change the weights"
+    if starting > computing + changing:
+        return starting, f"starting its operations, which hides {parts}; more or faster GPUs do not help"
+    return computing + changing, parts
 
 
 def precision(config: DictConfig) -> str:
@@ -169,11 +158,13 @@ def precision(config: DictConfig) -> str:
     return "bf16-mixed" if config.gpu != HERE and (default or chosen.startswith("16")) else chosen
 
 
-def known_sequences(config: DictConfig) -> int:
-    """Return the number of training sequences in `data.root`, if it exists, else the setting."""
-    if OmegaConf.is_missing(config.data, "root") or not Path(config.data.root).is_dir():
-        return int(config.sequences)
-    return len(build(config.data, _convert_="all").source("train").names)
+def size_of_data(config: DictConfig) -> tuple[int, int]:
+    """Return the numbers of training sequences and of frames of each: in `data.root`, to be made, or assumed."""
+    data = config.data
+    sequences, frames = data.get("scenes", config.sequences), data.get("frames", config.frames)
+    if not OmegaConf.is_missing(data, "root") and Path(data.root).is_dir():
+        sequences = len(build(data, _convert_="all").source("train").names)
+    return sequences, frames
 
 
 def steps_of(config: DictConfig, sequences: int) -> int:
@@ -209,8 +200,9 @@ def counted(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
     for key, value in changes.items():
         OmegaConf.update(copied, key, value)
     targets = [callback._target_ for callback in config.callbacks.values() if callback is not None]
+    build_module = partial(build, copied.model, _convert_="all")
     return count_step(
-        partial(build, copied.model, _convert_="all"),
+        build_module,
         config.data.image_size,
         batch,
         config.data.targets,
@@ -240,11 +232,10 @@ def parts_of(counts: StepCounts) -> tuple[int, int]:
 
 def advice(config: DictConfig, counts: StepCounts, batch: int, limit: float) -> list[str]:
     """Return the settings with which a step fits into the memory: those that leave the training the same."""
-    keys = [f"{part}.gradient_checkpointing" for part in WITH_CHECKPOINTING if f"{part}.gradient_checkpointing"]
-    off = [key for key in keys if OmegaConf.select(config, key) is False]
-    fewer = counted(config, batch, **dict.fromkeys(off, True)) if off else counts
-    used = off if fewer.peak < 0.98 * counts.peak else []
-    ways = [("", counts), *([(" ".join(f"{key}=true" for key in used), fewer)] if used else [])]
+    key = f"{'denoiser' if 'completesplat' in config.model else 'autoreconstructor'}.gradient_checkpointing"
+    ways = [("", counts)]
+    if OmegaConf.select(config, key) is False:
+        ways.append((f"{key}=true", counted(config, batch, **{key: True})))
     lines = []
     for settings, found in ways:
         fixed, grows = parts_of(found)

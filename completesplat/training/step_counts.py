@@ -6,20 +6,20 @@ fake tensors are freed when real ones would be.
 """
 
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch._subclasses.fake_tensor import FakeTensorMode
-from torch.nn.functional import group_norm, layer_norm, softmax
+from torch import Tensor, nn
+from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
 from torch.overrides import TorchFunctionMode
 from torch.utils import flop_counter
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils._pytree import tree_leaves
 
+from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses.ssim import blur_matrix
@@ -68,26 +68,28 @@ class StepCounts:
         return sum(self.memory.values())
 
 
-class GpuPrecision(TorchFunctionMode):
-    """Mode that skips the initialisation of weights and, if asked to, computes in float32 what autocast does on GPUs.
-
-    Fake tensors are on the CPU, whose autocast leaves normalisations in bfloat16; a GPU's does not ("CUDA Ops that
-    can autocast to float32" in torch's documentation), so it stores more for the backward pass.
-    """
-
-    def __init__(self, gpu: bool) -> None:
-        super().__init__()
-        self.gpu = gpu
-        self.building = True
+class Unfilled(TorchFunctionMode):
+    """Mode in which modules are built without initial weights; samplers, which read values, read ones."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if getattr(func, "__module__", None) == "torch.nn.init":
             return args[0] if args else kwargs["tensor"]
-        if self.building and func is Tensor.item:  # samplers read limits of their noise levels, which change no shape
-            return 1.0
-        if self.gpu and func in (group_norm, layer_norm, softmax) and torch.is_autocast_enabled("cpu"):
-            args, kwargs = tree_map(lambda x: x.float() if isinstance(x, Tensor) else x, (args, kwargs or {}))
-        return func(*args, **(kwargs or {}))
+        return 1.0 if func is Tensor.item else func(*args, **(kwargs or {}))
+
+
+def normalize_in_float32(module: nn.Module) -> None:
+    """Make normalisations compute in float32 under autocast, as on GPUs, where they store more for the backward pass.
+
+    Fake tensors are on the CPU, whose autocast leaves normalisations in bfloat16. See "CUDA Ops that can autocast to
+    float32" in torch's documentation.
+    """
+
+    def cast(_: nn.Module, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...] | None:
+        return tuple(x.float() for x in inputs) if torch.is_autocast_enabled("cpu") else None
+
+    for part in module.modules():
+        if isinstance(part, nn.GroupNorm | nn.LayerNorm):
+            part.register_forward_pre_hook(cast)
 
 
 class LiveMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
@@ -164,6 +166,8 @@ def count_step(
 ) -> StepCounts:
     """Count a step; a network of any size takes little memory and some seconds.
 
+    Raises CompleteSplatError if a step has no loss, or decides by the values of tensors.
+
     Args:
         build: makes the module, whose rasterizer should be `StoreOnly`, without reading weights.
         image_size: side of the images in pixels.
@@ -176,55 +180,62 @@ def count_step(
         gpu: whether to store what autocast stores on a GPU.
     """
     live, counter = LiveMemory(), flop_counter.FlopCounterMode(display=False, custom_mapping=ATTENTION)
-    with _fake_tensors(), GpuPrecision(gpu) as mode, live:
-        module = build()
-        mode.building = False
+    with fake_tensors(), live:
+        with Unfilled():
+            module = build()
+        if gpu:
+            normalize_in_float32(module)
         weights = live.bytes
         scenes = synthetic_batch(image_size, batch, targets)
-        if isinstance(module, ReconstructionModule):
-            module.draw_others = lambda targets: targets - 1  # type: ignore[method-assign]
         encoded = encode(module, scenes) if isinstance(module, LatentDiffusion) else None
         training, inputs = Training(module, precision), encoded if cached and encoded else scenes
+        if isinstance(module, ReconstructionModule):
+            module.draw_others = lambda targets: targets - 1  # type: ignore[method-assign]
         del scenes
-        before = live.bytes
+        before, first = live.bytes, live.operations
         live.peak_since()
-        first = live.operations
         with counter:
             loss = training.loss(inputs)
+            if not isinstance(loss, Tensor):
+                raise CompleteSplatError(
+                    f"{type(module).__name__} has no loss in its steps: plan counts trained networks"
+                )
             forward, kept = live.peak_since(), live.bytes - before
             torch.autograd.backward([loss])
             backward, flops, operations = live.peak_since(), counter.get_total_flops(), live.operations - first
             training.update()
-        gradients = [p.grad for p in module.parameters() if p.grad is not None]
+        trained = [p for p in module.parameters() if p.requires_grad]
         states = [x for state in training.optimizer.state.values() for x in tree_leaves(state) if torch.is_tensor(x)]
-        memory = {"weights": weights, "gradients": size_of(gradients), "optimizer": size_of(states)}
-        memory |= {"averages": weights if averaged else 0, "copies for ddp": memory["gradients"] if distributed else 0}
+        gradients, state = size_of(p.grad for p in trained if p.grad is not None), size_of(states)
+        memory = {"weights": weights, "gradients": gradients, "optimizer": state}
+        memory["averages"] = size_of([*module.parameters(), *module.buffers()]) if averaged else 0
+        memory["copies for ddp"] = gradients if distributed else 0
         memory |= {"batch": before - weights, "activations": kept}
         # Gradients of the last step are alive during the forward pass: Lightning removes them before the backward pass.
-        extra = memory["averages"] + memory["copies for ddp"]
-        peaks = forward + memory["gradients"] + memory["optimizer"], backward + memory["optimizer"], live.peak_since()
-        memory["intermediate results"] = max(peaks) + extra - sum(memory.values())
-        trained = sum(p.numel() for p in module.parameters() if p.requires_grad)
-        frozen = sum(p.numel() for p in module.parameters()) - trained
-        more = accumulated - 1  # batches without a change of the weights
-        flops, operations = counter.get_total_flops() + more * flops, live.operations - first + more * operations
-        return StepCounts(
-            trained, frozen, flops, operations, memory, None if encoded is None else row_bytes(encoded, module)
-        )
+        peak = max(forward + gradients + state, backward + state, live.peak_since())
+        known = sum(memory.values()) - memory["averages"] - memory["copies for ddp"]
+        memory["intermediate results"] = peak - known
+        numbers = [sum(p.numel() for p in some) for some in (trained, module.parameters())]
+        latent_bytes = None if encoded is None else row_bytes(encoded, module)
+        flops = flops * (accumulated - 1) + counter.get_total_flops()
+        return StepCounts(numbers[0], numbers[1] - numbers[0], flops, operations * accumulated, memory, latent_bytes)
 
 
 @contextmanager
-def _fake_tensors() -> Iterator[None]:
+def fake_tensors() -> Iterator[None]:
     """Make fake tensors only, and leave none in the package's caches."""
     blur_matrix.cache_clear()
     try:
         with FakeTensorMode():
             yield
+    except DataDependentOutputException as error:
+        message = "a step decides by the values of tensors, which plan does not compute"
+        raise CompleteSplatError(f"{message} ({error.func}): this model cannot be planned") from error
     finally:
         blur_matrix.cache_clear()
 
 
-def size_of(tensors: list[Tensor]) -> int:
+def size_of(tensors: Iterable[Tensor]) -> int:
     """Return the bytes of tensors."""
     return sum(tensor.nbytes for tensor in tensors)
 
