@@ -5,7 +5,8 @@ import json
 import math
 import os
 import statistics
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,26 +41,6 @@ REMARKS = (
     "The paper, on one A100: 15.7 ms to reconstruct an image, 2.7 s a sample, 29.1 ms to render; stage 1 took 6 days, "
     "stage 2 2 days, which is 157 ms a step.",
 )
-LINES: dict[str, tuple[str, Callable[[Any], str]]] = {
-    "parameters_trained": ("parameters, trained", "{:,}".format),
-    "parameters_frozen": ("parameters, frozen", "{:,}".format),
-    "flops": ("FLOPs of a step, all GPUs", "{:.4g}".format),
-    "operations": ("operations of a step", "{:,}".format),
-    "memory": ("memory of a GPU", lambda kinds: "\n".join(f"{name} {x / BYTES:.3g} GB" for name, x in kinds.items())),
-    "peak_bytes": ("together", lambda x: f"{x / BYTES:.3g} GB"),
-    "measured_peak_bytes": ("together, measured", lambda x: "" if x is None else f"{x / BYTES:.3g} GB"),
-    "usable_bytes": ("usable", lambda x: f"{x / BYTES:.3g} GB"),
-    "fits": ("fits", lambda fits: "yes" if fits else "no"),
-    "step_seconds": ("seconds a step", "{:.3g}".format),
-    "images_per_second": ("images a second to load", "{:,.0f}".format),
-    "loading_workers": ("loading processes, all GPUs", "{:,}".format),
-    "prepared_bytes": ("prepared data", lambda x: f"{x / BYTES:.3g} GB"),
-    "latent_bytes": ("latents (data latents)", lambda x: "" if x is None else f"{x / BYTES:.3g} GB"),
-    "steps": ("steps", "{:,}".format),
-    "days": ("days", "{:.3g}".format),
-    "gpu_hours": ("GPU-hours", "{:,.4g}".format),
-    "price": ("price", "{:,.0f}".format),
-}
 ASSUMED = ("gpu", "devices", "share", "operation_us", "price", "usable", "pixel_bytes", "loading_rate")
 ADDED = ("steps", "days", "gpu_hours", "price")
 
@@ -88,16 +69,15 @@ class Total(Callback):
 def plan_table(plans: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return a table with a column for each plan; several have a total, as for the stages of one recipe."""
     rows: list[dict[str, object]] = []
-    for key, (label, text) in LINES.items():
-        row: dict[str, object] = {"": label, **{name: text(plan[key]) for name, plan in plans.items()}}
+    for key in [key for key in next(iter(plans.values())) if key not in ("assumptions", "remarks")]:
+        rows.append({"": key.replace("_", " "), **{name.replace("_", " "): plan[key] for name, plan in plans.items()}})
         if len(plans) > 1:
-            row["total"] = text(sum(plan[key] for plan in plans.values())) if key in ADDED else ""
-        rows.append(row)
+            rows[-1]["total"] = sum(plan[key] for plan in plans.values()) if key in ADDED else None
     return records_table("completesplat plan", rows)
 
 
 def plan_of(config: DictConfig) -> dict[str, Any]:
-    """Return the figures of a training that LINES names, with `assumptions` and `remarks`.
+    """Return the figures of a training, with `assumptions` and `remarks`.
 
     Raises:
         CompleteSplatError: a setting does not fit, the GPU is unknown, or nothing says how long the training is.
@@ -120,18 +100,20 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
         seconds, speed = seconds_on(config, counts)
     rate = data.batch_size * (1 if data.latent_cache is not None else 1 + data.targets) / seconds
     hours, images = steps * seconds * config.devices / 3600, sequences * frames
-    figures: dict[str, Any] = {"parameters_trained": counts.trained, "parameters_frozen": counts.frozen}
-    figures |= {"flops": flops, "operations": counts.operations, "memory": dict(counts.memory)}
-    figures |= {"peak_bytes": counts.peak, "measured_peak_bytes": measured, "usable_bytes": limit, "fits": fits}
-    figures |= {"step_seconds": seconds, "images_per_second": rate}
-    figures |= {"loading_workers": math.ceil(rate / config.loading_rate)}
-    figures |= {"prepared_bytes": images * data.image_size**2 * config.pixel_bytes}
-    figures |= {"latent_bytes": counts.latent_bytes and counts.latent_bytes * images}
-    figures |= {"steps": steps, "days": steps * seconds / DAY, "gpu_hours": hours, "price": hours * config.price}
-    assumed = {key: config[key] for key in ASSUMED} | {"sequences": sequences, "frames": frames}
-    remarks = [f"Time of a step: {speed}.", *([] if fits else advice(config, counts, batch, limit)), *REMARKS]
-    assumed |= {"precision": precision(config)}
-    return {**figures, "assumptions": assumed, "remarks": remarks}
+    stored = None if counts.latent_bytes is None else counts.latent_bytes * images / BYTES
+    assumed = {key: config[key] for key in ASSUMED}
+    return {
+        **{"trained_parameters": counts.trained, "frozen_parameters": counts.frozen, "flops_of_a_step": flops},
+        **{"operations_of_a_step": counts.operations},
+        **{f"{kind.replace(' ', '_')}_GB": size / BYTES for kind, size in counts.memory.items()},
+        **{"memory_GB": counts.peak / BYTES, "memory_measured_GB": measured, "usable_GB": limit / BYTES, "fits": fits},
+        **{"seconds_a_step": seconds, "images_a_second": rate},
+        **{"loading_processes": math.ceil(rate / config.loading_rate)},
+        **{"prepared_data_GB": images * data.image_size**2 * config.pixel_bytes / BYTES, "latents_GB": stored},
+        **{"steps": steps, "days": steps * seconds / DAY, "gpu_hours": hours, "price": hours * config.price},
+        "assumptions": {**assumed, "sequences": sequences, "frames": frames, "precision": precision(config)},
+        "remarks": [f"Time of a step: {speed}.", *([] if fits else advice(config, counts, batch, limit)), *REMARKS],
+    }
 
 
 def seconds_on(config: DictConfig, counts: StepCounts) -> tuple[float, str]:
@@ -199,20 +181,14 @@ def counted(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
     copied.rasterizer = {"_target_": "completesplat.training.step_counts.StoreOnly", "gpu": gpu}
     for key, value in changes.items():
         OmegaConf.update(copied, key, value)
-    targets = [callback._target_ for callback in config.callbacks.values() if callback is not None]
-    build_module = partial(build, copied.model, _convert_="all")
-    return count_step(
-        build_module,
-        config.data.image_size,
-        batch,
-        config.data.targets,
-        precision(config),
-        accumulated=config.trainer.accumulate_grad_batches,
-        averaged=any(issubclass(get_class(target), WeightAveraging) for target in targets),
-        distributed=config.devices > 1,
-        cached=config.data.latent_cache is not None,
-        gpu=gpu,
-    )
+    targets = [get_class(callback._target_) for callback in config.callbacks.values() if callback is not None]
+    averaged = any(issubclass(target, WeightAveraging) for target in targets)
+    data, make = config.data, partial(build, copied.model, _convert_="all")
+    sizes = (data.image_size, batch, data.targets, precision(config), config.trainer.accumulate_grad_batches)
+    counts = count_step(make, *sizes, data.latent_cache is not None, gpu)
+    more = {"averages": counts.memory["weights"] if averaged else 0}
+    more |= {"copies for ddp": counts.memory["gradients"] if config.devices > 1 else 0}
+    return replace(counts, memory={**counts.memory, **more})
 
 
 def memory_limit(config: DictConfig) -> float:
@@ -243,15 +219,14 @@ def advice(config: DictConfig, counts: StepCounts, batch: int, limit: float) -> 
         if least is not None:
             times = least * config.trainer.accumulate_grad_batches
             more = f"trainer.accumulate_grad_batches={times}" if least > 1 else ""
-            lines.append(
-                f"It fits with {' '.join(filter(None, [settings, more]))}: {(fixed + grows / least) / BYTES:.3g} GB."
-            )
+            size = f"{(fixed + grows / least) / BYTES:.3g} GB"
+            lines.append(f"It fits with {' '.join(filter(None, [settings, more]))}: {size}.")
     reason = f"weights, gradients, optimizer and averages alone take {parts_of(counts)[0] / BYTES:.3g} GB"
     return lines or [f"No setting here makes it fit: {reason}."]
 
 
 def timed(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, float | None]:
-    """Return the median seconds of real steps on this machine with `batch` scenes, and their peak in bytes, if known.
+    """Return the median seconds of real steps on this machine with `batch` scenes, and their peak in GB, if known.
 
     On a CPU, steps with fewer scenes are timed, and their memory not measured, if a whole batch takes more than 1 GB.
 
@@ -281,5 +256,5 @@ def timed(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, fl
     for _ in range(UNTIMED_STEPS + TIMED_STEPS):
         step()
     growth = peak_megabytes(step, device)
-    peak = None if growth is None or scenes < batch else fixed + growth * MEBIBYTE
+    peak = None if growth is None or scenes < batch else (fixed + growth * MEBIBYTE) / BYTES
     return statistics.median(seconds[UNTIMED_STEPS:-1]) * batch / scenes, peak

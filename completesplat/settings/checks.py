@@ -47,15 +47,6 @@ class Fit(TypedDict):
     optimized_metric: str | None
 
 
-class Gpu(TypedDict):
-    """Peak TFLOP/s by precision, memory in GB, and its bandwidth in TB/s."""
-
-    bfloat16: Annotated[float, Range(1e-3)]
-    float32: Annotated[float, Range(1e-3)]
-    memory: Annotated[float, Range(1e-3)]
-    bandwidth: Annotated[float, Range(1e-3)]
-
-
 class Plan(Fit):
     """Settings of `completesplat plan`."""
 
@@ -69,7 +60,7 @@ class Plan(Fit):
     loading_rate: Annotated[float, Range(1e-3)]
     operation_us: Annotated[float, Range(0)]
     usable: Annotated[float, Range(0.01, 1)]
-    gpus: Mapping[str, Gpu]
+    gpus: Mapping[str, Mapping[str, Annotated[float, Range(1e-3)]]]
 
 
 class SceneSettings(TypedDict):

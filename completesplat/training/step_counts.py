@@ -6,7 +6,7 @@ fake tensors are freed when real ones would be.
 """
 
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -127,14 +127,14 @@ class _Store(torch.autograd.Function):
     def forward(ctx: Any, floats: tuple[int, int], cameras: Cameras, *gaussians: Tensor) -> Tensor:
         new, views = gaussians[0].new_empty, cameras.world_to_camera.shape[1]
         shape = (len(gaussians[0]), views, gaussians[0].shape[1])
-        image = new(len(gaussians[0]), views, 5, *cameras.image_size)
-        ctx.shape, ctx.added = shape, floats[1]
+        image = new(*shape[:2], 5, *cameras.image_size)
+        ctx.shape = (*shape, floats[1])
         ctx.save_for_backward(*gaussians, new(*shape, floats[0]), image)
         return image.clone()
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        added = gradients[0].new_empty(*ctx.shape, ctx.added)
+        added = gradients[0].new_empty(ctx.shape)
         results = [torch.empty_like(tensor) for tensor in ctx.saved_tensors[:5]]
         del added
         return None, None, *results
@@ -159,14 +159,12 @@ def count_step(
     targets: int,
     precision: str,
     accumulated: int = 1,
-    averaged: bool = False,
-    distributed: bool = False,
     cached: bool = False,
     gpu: bool = True,
 ) -> StepCounts:
     """Count a step; a network of any size takes little memory and some seconds.
 
-    Raises CompleteSplatError if a step has no loss, or decides by the values of tensors.
+    Raises CompleteSplatError if nothing is trained, or a step decides by the values of tensors.
 
     Args:
         build: makes the module, whose rasterizer should be `StoreOnly`, without reading weights.
@@ -174,51 +172,54 @@ def count_step(
         batch, targets: number of scenes of a batch of this process, and of target views of each.
         precision: precision in Lightning's notation.
         accumulated: number of batches of a step.
-        averaged: whether a callback averages the weights.
-        distributed: whether several processes share the step, so that each has a second copy of the gradients.
         cached: whether the batch has latents instead of images.
         gpu: whether to store what autocast stores on a GPU.
     """
-    live, counter = LiveMemory(), flop_counter.FlopCounterMode(display=False, custom_mapping=ATTENTION)
-    with fake_tensors(), live:
+    with fake_tensors(), LiveMemory() as live:
         with Unfilled():
             module = build()
+        if not any(parameter.requires_grad for parameter in module.parameters()):
+            raise CompleteSplatError(f"{type(module).__name__} has nothing to train in steps: nothing to plan")
         if gpu:
             normalize_in_float32(module)
-        weights = live.bytes
-        scenes = synthetic_batch(image_size, batch, targets)
-        encoded = encode(module, scenes) if isinstance(module, LatentDiffusion) else None
-        training, inputs = Training(module, precision), encoded if cached and encoded else scenes
         if isinstance(module, ReconstructionModule):
             module.draw_others = lambda targets: targets - 1  # type: ignore[method-assign]
-        del scenes
-        before, first = live.bytes, live.operations
-        live.peak_since()
-        with counter:
-            loss = training.loss(inputs)
-            if not isinstance(loss, Tensor):
-                raise CompleteSplatError(
-                    f"{type(module).__name__} has no loss in its steps: plan counts trained networks"
-                )
-            forward, kept = live.peak_since(), live.bytes - before
-            torch.autograd.backward([loss])
-            backward, flops, operations = live.peak_since(), counter.get_total_flops(), live.operations - first
-            training.update()
-        trained = [p for p in module.parameters() if p.requires_grad]
-        states = [x for state in training.optimizer.state.values() for x in tree_leaves(state) if torch.is_tensor(x)]
-        gradients, state = size_of(p.grad for p in trained if p.grad is not None), size_of(states)
-        memory = {"weights": weights, "gradients": gradients, "optimizer": state}
-        memory["averages"] = size_of([*module.parameters(), *module.buffers()]) if averaged else 0
-        memory["copies for ddp"] = gradients if distributed else 0
-        memory |= {"batch": before - weights, "activations": kept}
-        # Gradients of the last step are alive during the forward pass: Lightning removes them before the backward pass.
-        peak = max(forward + gradients + state, backward + state, live.peak_since())
-        known = sum(memory.values()) - memory["averages"] - memory["copies for ddp"]
-        memory["intermediate results"] = peak - known
-        numbers = [sum(p.numel() for p in some) for some in (trained, module.parameters())]
-        latent_bytes = None if encoded is None else row_bytes(encoded, module)
-        flops = flops * (accumulated - 1) + counter.get_total_flops()
-        return StepCounts(numbers[0], numbers[1] - numbers[0], flops, operations * accumulated, memory, latent_bytes)
+        weights, latent_bytes = live.bytes, None
+        inputs: SceneBatch | CachedScene = synthetic_batch(image_size, batch, targets)
+        if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch):
+            encoded = encode(module, inputs)  # rows of a cache are in float32 with a checksum, images in bytes
+            part = 4 if module.completesplat.conditioning.frozen else 1
+            latent_bytes = 8 * encoded.mean[0].numel() + part * encoded.condition[0].numel() + 4
+            inputs = encoded if cached else inputs
+            del encoded
+        flops, operations, memory = _count(Training(module, precision), inputs, accumulated, live)
+        memory = {"weights": weights, **memory, "batch": memory["batch"] - weights}
+        trained = sum(p.numel() for p in module.parameters() if p.requires_grad)
+        frozen = sum(p.numel() for p in module.parameters()) - trained
+        return StepCounts(trained, frozen, flops, operations, memory, latent_bytes)
+
+
+def _count(
+    training: Training, inputs: SceneBatch | CachedScene, accumulated: int, live: LiveMemory
+) -> tuple[int, int, dict[str, int]]:
+    """Return FLOPs, operations and memory of a step; the weights are part of the batch's."""
+    counter = flop_counter.FlopCounterMode(display=False, custom_mapping=ATTENTION)
+    before, first = live.bytes, live.operations
+    live.peak_since()
+    with counter:
+        loss = training.loss(inputs)
+        forward, kept = live.peak_since(), live.bytes - before
+        torch.autograd.backward([loss])
+        backward, flops, operations = live.peak_since(), counter.get_total_flops(), live.operations - first
+        training.update()
+    gradients = sum(p.grad.nbytes for p in training.module.parameters() if p.grad is not None)
+    states = tree_leaves(list(training.optimizer.state.values()))
+    state = sum(x.nbytes for x in states if isinstance(x, Tensor))
+    # Gradients of the last step are alive during the forward pass: Lightning removes them before the backward pass.
+    peak = max(forward + gradients + state, backward + state, live.peak_since())
+    memory = {"gradients": gradients, "optimizer": state, "batch": before, "activations": kept}
+    memory["intermediate results"] = peak - sum(memory.values())
+    return flops * (accumulated - 1) + counter.get_total_flops(), operations * accumulated, memory
 
 
 @contextmanager
@@ -235,11 +236,6 @@ def fake_tensors() -> Iterator[None]:
         blur_matrix.cache_clear()
 
 
-def size_of(tensors: Iterable[Tensor]) -> int:
-    """Return the bytes of tensors."""
-    return sum(tensor.nbytes for tensor in tensors)
-
-
 @torch.no_grad()
 def encode(module: LatentDiffusion, scenes: SceneBatch) -> CachedScene:
     """Return the scenes as a latent cache would give them."""
@@ -247,10 +243,3 @@ def encode(module: LatentDiffusion, scenes: SceneBatch) -> CachedScene:
     latent = torch.zeros_like(module.inputs(scenes)[0])
     condition = parts.conditioning(images) if parts.conditioning.frozen else images
     return CachedScene(latent, latent.clone(), condition, scenes.reference_frame, scenes.names)
-
-
-def row_bytes(encoded: CachedScene, module: Stage) -> int:
-    """Return the bytes of one image in a latent cache in float32, where images have a byte for each value."""
-    moments = encoded.mean[0].numel() + encoded.log_variance[0].numel()
-    of_value = 4 if isinstance(module, LatentDiffusion) and module.completesplat.conditioning.frozen else 1
-    return 4 * moments + of_value * encoded.condition[0].numel() + 4  # and a checksum
