@@ -8,7 +8,6 @@ import pytest
 import torch
 from rasterizer_scenes import render_with_gradients
 
-from completesplat.benchmarks import workloads
 from completesplat.benchmarks.workloads import (
     OPACITIES,
     rendering_milliseconds,
