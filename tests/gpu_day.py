@@ -18,7 +18,7 @@ from completesplat.results.machine import machine
 NETWORKS = ["autoreconstructor=tiny", "autoreconstructor.encoder.channels=[8,8,16,16]", "denoiser=tiny"]
 NETWORKS += ["denoiser.channels=[16,32]", "denoiser.attention_levels=[1]", "conditioning.channels=[8,8,16,16]"]
 SCENES = ["data.scenes=4", "data.frames=4", "data.image_size=32", "data.batch_size=2", "repeats=1", "samples=2"]
-RASTERIZERS = ["sizes=[16]", "views=[1]", "repeats=1", "training_step=false"]
+RASTERIZERS = ["sizes=[16]", "views=[1]", "repeats=1"]
 PAPER = ["device=cpu", "compile=false", "conditioning=learned", "sampler.steps=2", *NETWORKS, *SCENES]
 DIFFUSION = ["steps=1", *NETWORKS, *SCENES]
 LARGE = [f"{part}=stable_diffusion" for part in ("autoreconstructor", "conditioning", "denoiser")]

@@ -1,7 +1,6 @@
-"""`completesplat bench paper` and `cost`: our durations beside the paper's on an A100, and those of whole trainings."""
+"""`completesplat bench paper`: our durations beside the paper's on an A100."""
 
 import gc
-import json
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -9,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Literal, NamedTuple, TypedDict
+from typing import Literal, NamedTuple
 
 import torch
 from hydra.utils import instantiate
@@ -17,21 +16,20 @@ from rich.console import Console
 from torch import Tensor, nn
 
 from completesplat.benchmarks.measuring import WARM_UP, Row, Work, milliseconds, report
-from completesplat.benchmarks.training_step import Training, autocast
 from completesplat.commands import quieten
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.trajectories import orbit
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Entries, Positive
+from completesplat.settings.schema import Positive
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stage import Stage
+from completesplat.training.steps import Training, autocast
 
 VIEWS = 100
 MEGABYTE = 1e6
-DAY_MS = 24 * 3600 * 1000
 
 
 class Figure(NamedTuple):
@@ -209,40 +207,3 @@ def works_of(module: Stage, scenes: SceneBatch, precision: str, samples: int) ->
         return module.rasterizer(gaussians, cameras).color
 
     return {"reconstruct": draw, "render": render, "stage1_step": step}
-
-
-class WholeTraining(TypedDict):
-    """A training: the measured step that it repeats, and its number of steps."""
-
-    step: Literal["stage1_step", "stage2_step"]
-    steps: Positive
-
-
-def cost(
-    measured: str, trainings: Mapping[str, WholeTraining], gpus: Annotated[Sequence[Positive], Entries(1)], out: Path
-) -> None:
-    """Write `cost.json`, and print the days that each training takes on each number of GPUs, from measured steps.
-
-    Raises:
-        CompleteSplatError: `measured` is not a result of `bench paper`, or has no training steps.
-    """
-    try:
-        results = json.loads(Path(measured).read_text())
-        machine, work, steps = results["machine"], results["workload"], results["rows"]
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        raise CompleteSplatError(f"measured={measured}: no result of bench paper ({error!r})") from error
-    rows: list[Row] = [
-        {"training": name, "steps": training["steps"], "way": step["way"], "ms": step["ms"]}
-        | {key: step[key] for key in ("memory_mb",) if key in step}
-        | {f"days_{count}": training["steps"] * step["ms"] / count / DAY_MS for count in gpus}
-        for name, training in trainings.items()
-        for step in steps
-        if step["name"] == training["step"] and "ms" in step
-    ]
-    if not rows:
-        raise CompleteSplatError(f"{measured} has no training steps: bench paper measures them with training=true")
-    title = f"{work['image_size']} x {work['image_size']} pixels, {work['batch']} scenes a step, on {work['device']}"
-    costs = {"machine": machine, "workload": work, "rows": rows}
-    report(out / "cost.json", costs, {title: rows}, work["device"])
-    print("At least this long: GPUs divide the scenes of a step without loss; reading data, validation and")
-    print("checkpoints are not counted.")

@@ -1,4 +1,4 @@
-"""`completesplat bench rasterizers`: speed and memory of the backends, and their share of a training step."""
+"""`completesplat bench rasterizers`: speed and memory of the backends."""
 
 import statistics
 import time
@@ -6,19 +6,17 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal, TypedDict
+from typing import Any
 
 from hydra.utils import instantiate
 from rich.console import Console
 
 from completesplat.benchmarks.measuring import Row, report
-from completesplat.benchmarks.training_step import share
 from completesplat.benchmarks.workloads import (
     OPACITIES,
     Backend,
     counted_work,
     machine_peaks,
-    peak_megabytes,
     rendering_milliseconds,
     splatter_scene,
 )
@@ -28,6 +26,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
 from completesplat.settings.schema import Positive
+from completesplat.training.steps import peak_megabytes
 
 # `gsplat_torch` is a baseline for this comparison; training cannot choose it.
 CLASSES = {
@@ -40,20 +39,9 @@ LONGEST_SECONDS = 4.0  # a backend that has run this long on a workload does not
 Tick = Callable[[str], None]
 
 
-class StepSettings(TypedDict):
-    """Settings of the training steps: backends, size of the scenes, and Lightning's precision."""
-
-    backends: Sequence[str]
-    size: Positive
-    batch: Positive
-    targets: Positive
-    precision: str
-
-
 def run(
     backends: Sequence[str], sizes: Sequence[Positive], views: Sequence[Positive], repeats: Positive,
-    training_step: StepSettings | Literal[False], model: Mapping[str, object], constants: Mapping[str, object],
-    out: Path,
+    constants: Mapping[str, object], out: Path,
 ) -> None:  # fmt: skip
     """Time the rasterizers, write `rasterizers.json`, and print tables.
 
@@ -61,14 +49,11 @@ def run(
         backends: keys of `CLASSES`; those that do not work on this machine are skipped, with the reason.
         sizes, views: sides of the images in pixels and numbers of views; every combination is timed.
         repeats: number of timed calls of each backend.
-        training_step: settings of the training steps; False skips them.
-        model: config of the module whose steps are timed.
         constants: config of the `RenderingConstants` that all backends share.
 
     Raises:
         CompleteSplatError: a backend does not exist.
     """
-    steps: list[Row] = []
     with Console(stderr=True).status("compiling") as status:
 
         def tick(text: str) -> None:
@@ -78,14 +63,7 @@ def run(
         working, absent = working_backends(backends, shared)
         quieten()
         rows = speed_rows(working, sizes, views, repeats, shared, tick)
-        if training_step:
-            size, batch, targets = training_step["size"], training_step["batch"], training_step["targets"]
-            for backend in [backend for backend in working if backend.name in training_step["backends"]]:
-                tick(f"a training step with {backend.name}")
-                steps.append(share(backend, model, size, batch, targets, training_step["precision"]))
-    results = {"not_measured": absent, "rows": rows} | ({"training_step": steps} if training_step else {})
-    tables = {"Speed": rows} | ({"Share of a training step": steps} if steps else {})
-    report(out / "rasterizers.json", results, tables)
+    report(out / "rasterizers.json", {"not_measured": absent, "rows": rows}, {"Speed": rows})
 
 
 def working_backends(names: Sequence[str], constants: RenderingConstants) -> tuple[list[Backend], dict[str, str]]:

@@ -1,11 +1,6 @@
 """Workloads of the rasterizers: scenes like splatter images, and the time and memory of one rendering."""
 
-import ctypes
-import math
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,18 +8,16 @@ from torch import Tensor
 
 from completesplat.benchmarks.measuring import milliseconds
 from completesplat.gaussians import Gaussians, concatenate
-from completesplat.geometry.cameras import Cameras, look_at, pinhole, pixel_centers, unproject
+from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unproject
 from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.rasterizers.kernels.array_layout import BLOCK
-from completesplat.rasterizers.kernels.drawing import Drawing, Parameters, release
+from completesplat.rasterizers.kernels.drawing import Drawing, Parameters
 from completesplat.rasterizers.tiled import pack_cameras
 from completesplat.training.stage import now
+from completesplat.training.steps import DISTANCE, FOV_DEGREES, orbit
 
-DISTANCE = 2.2  # from the cameras to the object's centre, world units
-FOV_DEGREES = 49.0
 OPACITIES = ("trained", "initial")
 MOST_REFERENCE_PAIRS = 2**28  # of a Gaussian and a pixel; the reference takes a second for a tenth of them
-MEBIBYTE = 2**20
 # Work of `tiled`'s kernels for both passes, counted in their sources. A sum, product, quotient or root is a FLOP.
 PIXEL_FLOPS = 26 + 50  # of a Gaussian at a pixel: forward and backward, in float32
 VISIBLE_FLOPS, REACHED_FLOPS = 2 * 136, 2 * 352  # projection and its gradient; in float64, which counts twice
@@ -87,15 +80,6 @@ def _layer(layer: int, source: Cameras, opacity: str, generator: torch.Generator
     )
 
 
-def orbit(size: int, views: int) -> Cameras:
-    """Return cameras [1 view] on an orbit about the object, for images of side `size`."""
-    angles = 0.5 + 2 * math.pi * torch.arange(views) / views
-    target = torch.tensor([0.0, 0.0, DISTANCE])
-    eyes = target + DISTANCE * torch.stack([angles.sin(), torch.full_like(angles, -0.2), -angles.cos()], dim=-1)
-    matrices = look_at(eyes, target, torch.tensor([0.0, -1.0, 0.0]))
-    return Cameras(matrices[None], pinhole(FOV_DEGREES, size).expand(1, views, 3, 3), (size, size))
-
-
 def rendering_milliseconds(rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> tuple[float, float]:
     """Return the times of the forward pass, and of both passes with gradients to all parameters of the Gaussians."""
     gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
@@ -134,29 +118,3 @@ def _ones(cameras: Cameras, channels: int) -> Tensor:
     # NumPy, because torch would wake its own threads, which then spin for a while on the cores that are timed.
     ones = np.ones((*cameras.intrinsics.shape[:2], channels, *cameras.image_size), np.float32)
     return torch.from_numpy(ones).to(cameras.intrinsics.device)
-
-
-def peak_megabytes(work: Callable[[], object], device: torch.device) -> float | None:
-    """Return the memory in MB that `work` adds to the process, or to the GPU; None if the system does not tell."""
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats()
-        before = torch.cuda.memory_allocated()
-        work()
-        return (torch.cuda.max_memory_allocated() - before) / MEBIBYTE
-    # Return memory that the process still holds after freeing it, because reusing it would not be counted.
-    release()
-    with suppress(AttributeError, OSError, TypeError):
-        ctypes.CDLL(None).malloc_trim(0)  # a function of glibc
-    try:
-        Path("/proc/self/clear_refs").write_text("5")  # Linux: the peak becomes the present memory
-    except OSError:
-        work()
-        return None
-    before = _peak_resident_kilobytes()
-    work()
-    return (_peak_resident_kilobytes() - before) / 1024
-
-
-def _peak_resident_kilobytes() -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))

@@ -99,8 +99,9 @@ class PerceptualDistance(nn.Module):
     ) -> Float[Tensor, " image"]:
         """Return the distance of each pair of sRGB images with values in [0, 1] and sides of at least 16 pixels."""
         # Weights moved to a device in inference mode (validation before the first step) could not be used in training.
-        with torch.inference_mode(False):
-            self.to(first.device)
+        if self.shift.device != first.device:
+            with torch.inference_mode(False):
+                self.to(first.device)
         layers = zip(self.heads, self.directions(first), self.directions(second), strict=True)
         maps = [nn.functional.conv2d((left - right).square(), head) for head, left, right in layers]
         return torch.stack([differences.mean((1, 2, 3)) for differences in maps]).sum(0)
@@ -138,3 +139,10 @@ class LearnedPerceptualSimilarity:
             pair = (images.flatten(0, 1).float() for images in (prediction.images, truth.images))
             distances: Tensor = self.distance(*pair)
             return distances.mean()
+
+
+class UntrainedPerceptualSimilarity(LearnedPerceptualSimilarity):
+    """The same network with random weights, to count the work of a step (`completesplat plan`)."""
+
+    def __init__(self) -> None:
+        self.distance = PerceptualDistance(VGG16Features(), load_heads())

@@ -47,6 +47,22 @@ class Fit(TypedDict):
     optimized_metric: str | None
 
 
+class Plan(Fit):
+    """Settings of `completesplat plan`."""
+
+    gpu: str
+    devices: Positive
+    share: Annotated[float, Range(0.01, 1)]
+    price: Annotated[float, Range(0)]
+    sequences: Positive
+    frames: Positive
+    pixel_bytes: Annotated[float, Range(0)]
+    loading_rate: Annotated[float, Range(1e-3)]
+    operation_us: Annotated[float, Range(0)]
+    usable: Annotated[float, Range(0.01, 1)]
+    gpus: Mapping[str, Mapping[str, Annotated[float, Range(1e-3)]]]
+
+
 class SceneSettings(TypedDict):
     """Settings that `completesplat predict` and `view` share."""
 
@@ -95,7 +111,7 @@ class Test(RunSettings):
     trust: bool
 
 
-VERBS: dict[str, type] = {"fit": Fit, "predict": Predict, "view": View, "test": Test}
+VERBS: dict[str, type] = {"fit": Fit, "plan": Plan, "predict": Predict, "view": View, "test": Test}
 
 
 def check_verb(verb: str, config: DictConfig) -> None:

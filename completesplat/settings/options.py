@@ -147,14 +147,14 @@ def settings_of_option(group: str, option: str, place: str | None = None) -> lis
 def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
     """Return a verb's own settings: its output folder, those in its file, and those of its task."""
     without = ("hydra", "verb", "description", "task")
-    settings = [*own_settings(read("base"), without), *own_settings(read(verb), without)]
+    settings = [*own_settings(with_bases("", verb), without)]
     settings += [] if task is None else own_settings(with_bases(f"{verb}_task", task), without)
     return list({setting.key: setting for setting in settings}.values())
 
 
 def with_bases(group: str, option: str) -> ConfFile:
-    """Return an option's file with the settings and choices that it inherits."""
-    written = read(f"{group}/{option}")
+    """Return an option's file, or a verb's in the group "", with the settings and choices that it inherits."""
+    written = read(f"{group}/{option}".lstrip("/"))
     inherited = [with_bases(group, base) for base in written.bases]
     choices = [choice for entry in inherited for choice in entry.choices] + written.choices
     settings: dict[str, Setting] = {}
@@ -165,7 +165,7 @@ def with_bases(group: str, option: str) -> ConfFile:
 
 def choices_of_verb(verb: str, task: str | None = None) -> list[Choice]:
     """Return the config groups of a verb and its task with their default options, without the group of tasks."""
-    choices = [choice for choice in read(verb).choices if choice.group != f"{verb}_task"]
+    choices = [choice for choice in with_bases("", verb).choices if choice.group != f"{verb}_task"]
     return choices + ([] if task is None else with_bases(f"{verb}_task", task).choices)
 
 

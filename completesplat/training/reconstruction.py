@@ -144,10 +144,13 @@ class ReconstructionModule(Stage):
         reconstruction: Reconstruction = self.model(images, *seen)
         return reconstruction
 
+    def draw_others(self, targets: int) -> int:
+        """Draw how many of the targets a posterior that sees views gets: mostly many, never all."""
+        return int(torch.randint(1, targets, (2,)).max())
+
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
-        """Return the loss. A posterior that sees views gets a random number of targets, mostly many, never all."""
-        targets = scenes.targets.images.shape[1]
-        others = int(torch.randint(1, targets, (2,)).max()) if self.sees_views else 0
+        """Return the loss."""
+        others = self.draw_others(scenes.targets.images.shape[1]) if self.sees_views else 0
         reconstruction = self(scenes, others)
         with torch.autocast(self.device.type, enabled=False):
             gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 from support import compose_config, strict_json
 
-from completesplat.benchmarks import rasterizers, training_step, workloads
+from completesplat.benchmarks import rasterizers, workloads
 from completesplat.benchmarks.rasterizers import (
     CLASSES,
     LONGEST_SECONDS,
@@ -53,7 +53,7 @@ def test_backends_keep_their_order_and_get_the_constants_and_an_unknown_name_is_
         assert all(backend.rasterizer.constants == constants for backend in backends)
     with pytest.raises(CompleteSplatError, match=r"'nonsense'.* reference, .* tiled, cuda"):
         working_backends(["tiled", "nonsense"], constants)
-    assert {*config.backends, *config.training_step.backends} == set(CLASSES)
+    assert {*config.backends} == set(CLASSES)
 
 
 class Clock:
@@ -146,10 +146,7 @@ QUICK = ["bench", "rasterizers", "sizes=[16]", "views=[1]", "repeats=1"]
 def test_results_are_written_and_printed(command, tmp_path, monkeypatch):
     """A backend that does not work on this machine is named with the reason."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    monkeypatch.setattr(training_step, "UNTIMED_STEPS", 0)
-    monkeypatch.setattr(training_step, "TIMED_STEPS", 1)
-    small = ["training_step.size=32", "training_step.batch=1", "training_step.targets=1"]
-    finished = command(*QUICK, "backends=[tiled,reference,cuda]", *small, f"out={tmp_path / 'out'}")
+    finished = command(*QUICK, "backends=[tiled,reference,cuda]", f"out={tmp_path / 'out'}")
     assert finished.status == 0, finished.err
     assert finished.out.splitlines()[-1] == str(tmp_path / "out")
     results = strict_json(tmp_path / "out/rasterizers.json")
@@ -158,8 +155,6 @@ def test_results_are_written_and_printed(command, tmp_path, monkeypatch):
         (name, opacity) for opacity in ("trained", "initial") for name in ("tiled", "reference")
     ]
     assert {(row["size"], row["gaussians"], row["views"]) for row in results["rows"]} == {(16, 512, 1)}
-    (step,) = results["training_step"]
-    assert (step["backend"], step["size"], step["batch"], step["views"]) == ("tiled", 32, 1, 2)
     missing = f"cuda: not measured, because {results['not_measured']['cuda']}"
-    texts = ("Speed", "Share of a training step", results["machine"]["processor"], missing)
+    texts = ("Speed", results["machine"]["processor"], missing)
     assert all(text in finished.out for text in texts)

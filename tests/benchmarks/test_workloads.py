@@ -10,9 +10,7 @@ from rasterizer_scenes import render_with_gradients
 
 from completesplat.benchmarks import workloads
 from completesplat.benchmarks.workloads import (
-    FOV_DEGREES,
     OPACITIES,
-    peak_megabytes,
     rendering_milliseconds,
     splatter_scene,
 )
@@ -21,7 +19,8 @@ from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers import Rendering, RenderingConstants
 from completesplat.rasterizers.kernels import drawing
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.training import stage
+from completesplat.training import stage, steps
+from completesplat.training.steps import FOV_DEGREES, peak_megabytes
 
 
 @pytest.mark.parametrize("opacity", OPACITIES)
@@ -89,7 +88,7 @@ def test_the_peak_is_the_memory_that_work_adds(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_without_proc_the_work_is_done_and_its_memory_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(workloads, "Path", lambda _: tmp_path / "nowhere/clear_refs")
+    monkeypatch.setattr(steps, "Path", lambda _: tmp_path / "nowhere/clear_refs")
     calls = []
     assert peak_megabytes(lambda: calls.append(1), CPU) is None
     assert calls == [1]

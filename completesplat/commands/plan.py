@@ -1,0 +1,260 @@
+"""`completesplat plan`: what a training takes, computed before it starts."""
+
+import copy
+import json
+import math
+import os
+import statistics
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.experimental.callback import Callback
+from hydra.utils import get_class
+from hydra.utils import instantiate as build
+from lightning.pytorch.callbacks import WeightAveraging
+from omegaconf import DictConfig, OmegaConf
+
+from completesplat.commands.fit import OTHER_WEIGHTS
+from completesplat.commands.protocol import write_json
+from completesplat.data.loading.distributed import batch_per_process
+from completesplat.errors import CompleteSplatError
+from completesplat.results.tables import Table, records_table, show
+from completesplat.scene import CachedScene, SceneBatch
+from completesplat.settings.checks import check_image_size, check_optimizer
+from completesplat.settings.options import did_you_mean
+from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.training.stage import Stage, now
+from completesplat.training.step_counts import StepCounts, count_step, encode
+from completesplat.training.steps import MEBIBYTE, Training, peak_megabytes, synthetic_batch
+
+HERE = "this"
+MOST_TIMED = 1e9  # bytes that a timed step may take on a CPU
+UNTIMED_STEPS, TIMED_STEPS = 2, 5
+BYTES, DAY = 1e9, 24 * 3600
+REMARKS = (
+    "FLOPs are those of both passes and the optimizer, without the rasterizer and elementwise operations.",
+    "Not counted: exchange of gradients between GPUs, validation, tests, checkpoints, waiting for data.",
+    "The paper, on one A100: 15.7 ms to reconstruct an image, 2.7 s a sample, 29.1 ms to render; stage 1 took 6 days, "
+    "stage 2 2 days, which is 157 ms a step.",
+)
+ASSUMED = ("gpu", "devices", "share", "operation_us", "price", "usable", "pixel_bytes", "loading_rate")
+ADDED = ("steps", "days", "gpu_hours", "price")
+
+
+def run(config: DictConfig, out: Path) -> None:
+    """Print the plan of a training and write `plan.json`."""
+    plan = plan_of(config)
+    write_json(out / "plan.json", plan)
+    show(plan_table({"plan": plan}), width=160)
+    print("Assumptions:", " ".join(f"{key}={value}" for key, value in plan["assumptions"].items()))
+    for line in plan["remarks"]:
+        print(line)
+
+
+class Total(Callback):
+    """Hydra callback that prints the plans of a sweep side by side, with a total, after the last job."""
+
+    def on_multirun_end(self, config: Any, **kwargs: object) -> None:
+        """Print the table of all `plan.json` in the sweep's folder, in the order of the jobs."""
+        paths = sorted(Path(config.hydra.sweep.dir).glob("*/plan.json"), key=lambda path: path.stat().st_mtime)
+        plans = {path.parent.name.removeprefix("experiment-"): json.loads(path.read_text()) for path in paths}
+        if plans:
+            show(plan_table(plans), width=60 + 30 * len(plans))
+
+
+def plan_table(plans: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return a table with a column for each plan; several have a total, as for the stages of one recipe."""
+    rows: list[dict[str, object]] = []
+    for key in [key for key in next(iter(plans.values())) if key not in ("assumptions", "remarks")]:
+        rows.append({"": key.replace("_", " "), **{name.replace("_", " "): plan[key] for name, plan in plans.items()}})
+        if len(plans) > 1:
+            rows[-1]["total"] = sum(plan[key] for plan in plans.values()) if key in ADDED else None
+    return records_table("completesplat plan", rows)
+
+
+def plan_of(config: DictConfig) -> dict[str, Any]:
+    """Return the figures of a training, with `assumptions` and `remarks`.
+
+    Raises:
+        CompleteSplatError: a setting does not fit, the GPU is unknown, or nothing says how long the training is.
+    """
+    check_image_size(config)
+    check_optimizer(config.optimizer)
+    if config.gpu != HERE and config.gpu not in config.gpus:
+        names = [*config.gpus, HERE]
+        raise CompleteSplatError(f"gpu={config.gpu}: there are {', '.join(names)}{did_you_mean(config.gpu, names)}")
+    data, accumulated = config.data, config.trainer.accumulate_grad_batches
+    batch = batch_per_process(data.batch_size, config.devices, accumulated)
+    sequences, frames = size_of_data(config)
+    steps, counts, limit = steps_of(config, sequences), counted(config, batch), memory_limit(config)
+    flops, measured, fits = counts.flops * config.devices, None, counts.peak <= limit
+    if config.gpu == HERE:
+        seconds, measured = timed(config, counts, batch)
+        seconds *= accumulated
+        speed = f"measured here, {flops / seconds / 1e12:.3g} TFLOP/s"
+    else:
+        seconds, speed = seconds_on(config, counts)
+    rate = data.batch_size * (1 if data.latent_cache is not None else 1 + data.targets) / seconds
+    hours, images = steps * seconds * config.devices / 3600, sequences * frames
+    stored = None if counts.latent_bytes is None else counts.latent_bytes * images / BYTES
+    assumed = {key: config[key] for key in ASSUMED}
+    return {
+        **{"trained_parameters": counts.trained, "frozen_parameters": counts.frozen, "flops_of_a_step": flops},
+        **{"operations_of_a_step": counts.operations},
+        **{f"{kind.replace(' ', '_')}_GB": size / BYTES for kind, size in counts.memory.items()},
+        **{"memory_GB": counts.peak / BYTES, "memory_measured_GB": measured, "usable_GB": limit / BYTES, "fits": fits},
+        **{"seconds_a_step": seconds, "images_a_second": rate},
+        **{"loading_processes": math.ceil(rate / config.loading_rate)},
+        **{"prepared_data_GB": images * data.image_size**2 * config.pixel_bytes / BYTES, "latents_GB": stored},
+        **{"steps": steps, "days": steps * seconds / DAY, "gpu_hours": hours, "price": hours * config.price},
+        "assumptions": {**assumed, "sequences": sequences, "frames": frames, "precision": precision(config)},
+        "remarks": [f"Time of a step: {speed}.", *([] if fits else advice(config, counts, batch, limit)), *REMARKS],
+    }
+
+
+def seconds_on(config: DictConfig, counts: StepCounts) -> tuple[float, str]:
+    """Return the seconds of a step on a GPU of the table, and in words what they are.
+
+    A step takes the time of its FLOPs and that of changing the weights: weights, gradients (also to clip them), the
+    optimizer's state and averages are read and written as fast as the memory allows. It takes at least as long as
+    starting its operations one after the other.
+    """
+    gpu, name = config.gpus[config.gpu], precision(config)
+    computing = counts.flops / (gpu["float32" if name.startswith("32") else "bfloat16"] * 1e12 * config.share)
+    changed = counts.memory["optimizer"] + counts.memory["averages"] + 3 * counts.memory["gradients"]
+    changing, starting = 2 * changed / (gpu.bandwidth * 1e12), counts.operations * config.operation_us * 1e-6
+    parts = f"{computing * 1e3:.3g} ms of FLOPs in {name} and {changing * 1e3:.3g} ms to change the weights"
+    if starting > computing + changing:
+        return starting, f"starting its operations, which hides {parts}; more or faster GPUs do not help"
+    return computing + changing, parts
+
+
+def precision(config: DictConfig) -> str:
+    """Return Lightning's name of the training's precision; the default is what the GPU supports, not this machine."""
+    chosen = str(config.trainer.precision)
+    default = str(config.trainer._get_node("precision")._value()).startswith("${best_precision")
+    return "bf16-mixed" if config.gpu != HERE and (default or chosen.startswith("16")) else chosen
+
+
+def size_of_data(config: DictConfig) -> tuple[int, int]:
+    """Return the numbers of training sequences and of frames of each: in `data.root`, to be made, or assumed."""
+    data = config.data
+    sequences, frames = data.get("scenes", config.sequences), data.get("frames", config.frames)
+    if not OmegaConf.is_missing(data, "root") and Path(data.root).is_dir():
+        sequences = len(build(data, _convert_="all").source("train").names)
+    return sequences, frames
+
+
+def steps_of(config: DictConfig, sequences: int) -> int:
+    """Return the optimizer steps of the training; raise CompleteSplatError if it has no end."""
+    trainer, data = config.trainer, config.data
+    epochs = trainer.get("max_epochs")
+    limits = [] if trainer.max_steps < 0 else [trainer.max_steps]
+    if epochs is not None and epochs >= 0:
+        limits.append(epochs * math.ceil(sequences * data.references_per_sequence / data.batch_size))
+    if not limits:
+        raise CompleteSplatError("the training has no end: give trainer.max_steps=N or trainer.max_epochs=N")
+    return int(min(limits))
+
+
+def untrained(config: DictConfig) -> DictConfig:
+    """Return a copy of a config whose module is built without reading weights and without compiling."""
+    config = copy.deepcopy(config)
+    OmegaConf.set_struct(config, False)
+    for part in (config.autoreconstructor, config.conditioning, config.model):
+        part.update(dict.fromkeys(OTHER_WEIGHTS & part.keys()))
+    config.model.update({key: False for key in ("compile", "channels_last") if key in config.model})
+    for entry in filter(None, config.loss.terms.values()):
+        if entry.get("term", {}).get("_target_") == "completesplat.losses.lpips.LearnedPerceptualSimilarity":
+            entry.term = {"_target_": "completesplat.losses.lpips.UntrainedPerceptualSimilarity"}
+    return config
+
+
+def counted(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
+    """Return the counts of a process that takes `batch` scenes at a time."""
+    copied = untrained(config)
+    gpu = config.gpu != HERE or torch.cuda.is_available()
+    copied.rasterizer = {"_target_": "completesplat.training.step_counts.StoreOnly", "gpu": gpu}
+    for key, value in changes.items():
+        OmegaConf.update(copied, key, value)
+    targets = [get_class(callback._target_) for callback in config.callbacks.values() if callback is not None]
+    averaged = any(issubclass(target, WeightAveraging) for target in targets)
+    data, make = config.data, partial(build, copied.model, _convert_="all")
+    sizes = (data.image_size, batch, data.targets, precision(config), config.trainer.accumulate_grad_batches)
+    counts = count_step(make, *sizes, data.latent_cache is not None, gpu)
+    more = {"averages": counts.memory["weights"] if averaged else 0}
+    more |= {"copies for ddp": counts.memory["gradients"] if config.devices > 1 else 0}
+    return replace(counts, memory={**counts.memory, **more})
+
+
+def memory_limit(config: DictConfig) -> float:
+    """Return the bytes that a process can use."""
+    if config.gpu != HERE:
+        return float(config.gpus[config.gpu].memory * BYTES * config.usable)
+    if torch.cuda.is_available():
+        return float(torch.cuda.get_device_properties(0).total_memory * config.usable)
+    return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * config.usable)
+
+
+def parts_of(counts: StepCounts) -> tuple[int, int]:
+    """Return the bytes that do not depend on the batch, and those that grow with it."""
+    grows = sum(counts.memory[kind] for kind in ("batch", "activations", "intermediate results"))
+    return counts.peak - grows, grows
+
+
+def advice(config: DictConfig, counts: StepCounts, batch: int, limit: float) -> list[str]:
+    """Return the settings with which a step fits into the memory: those that leave the training the same."""
+    key = f"{'denoiser' if 'completesplat' in config.model else 'autoreconstructor'}.gradient_checkpointing"
+    ways = [("", counts)]
+    if OmegaConf.select(config, key) is False:
+        ways.append((f"{key}=true", counted(config, batch, **{key: True})))
+    lines = []
+    for settings, found in ways:
+        fixed, grows = parts_of(found)
+        least = next((k for k in range(1, batch + 1) if batch % k == 0 and fixed + grows / k <= limit), None)
+        if least is not None:
+            times = least * config.trainer.accumulate_grad_batches
+            more = f"trainer.accumulate_grad_batches={times}" if least > 1 else ""
+            size = f"{(fixed + grows / least) / BYTES:.3g} GB"
+            lines.append(f"It fits with {' '.join(filter(None, [settings, more]))}: {size}.")
+    reason = f"weights, gradients, optimizer and averages alone take {parts_of(counts)[0] / BYTES:.3g} GB"
+    return lines or [f"No setting here makes it fit: {reason}."]
+
+
+def timed(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, float | None]:
+    """Return the median seconds of real steps on this machine with `batch` scenes, and their peak in GB, if known.
+
+    On a CPU, steps with fewer scenes are timed, and their memory not measured, if a whole batch takes more than 1 GB.
+
+    Raises:
+        CompleteSplatError: a step with one scene takes too much memory.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    limit = memory_limit(config) if device.type == "cuda" else MOST_TIMED
+    fixed, grows = parts_of(counts)
+    scenes = next((n for n in range(batch, 0, -1) if batch % n == 0 and fixed + grows * n / batch <= limit), None)
+    if scenes is None:
+        message = f"a step with one scene takes {(fixed + grows / batch) / BYTES:.3g} GB, at most {limit / BYTES:.3g}"
+        raise CompleteSplatError(f"gpu={HERE}: {message} GB are timed; give a GPU by name")
+    copied = untrained(config)
+    copied.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
+    module: Stage = build(copied.model, _convert_="all").to(device)
+    inputs: SceneBatch | CachedScene = synthetic_batch(config.data.image_size, scenes, config.data.targets).to(device)
+    if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch) and config.data.latent_cache is not None:
+        inputs = encode(module, inputs)
+    training, seconds = Training(module, precision(config)), []
+
+    def step() -> None:
+        start = now()
+        training.step(inputs)
+        seconds.append(now() - start)
+
+    for _ in range(UNTIMED_STEPS + TIMED_STEPS):
+        step()
+    growth = peak_megabytes(step, device)
+    peak = None if growth is None or scenes < batch else (fixed + growth * MEBIBYTE) / BYTES
+    return statistics.median(seconds[UNTIMED_STEPS:-1]) * batch / scenes, peak

@@ -1,0 +1,86 @@
+"""`completesplat plan`: what a training takes, before it starts."""
+
+import pytest
+from support import NETWORKS, compose_config, refused, strict_json
+
+from completesplat.commands.plan import plan_of, precision, steps_of
+from completesplat.settings.options import choices_of_verb
+
+SMALL = ["experiment=toy_diffusion", "data.image_size=32", *NETWORKS]
+
+
+def test_a_plan_is_printed_and_written_and_a_sweep_ends_in_a_total(command, tmp_path):
+    mine = "+gpus.mine={bfloat16: 1e-3, float32: 1, memory: 0.01, bandwidth: 1}"
+    swept = command("plan", "-m", *SMALL, "gpu=a100,mine", mine, f"out={tmp_path}")
+    assert swept.status == 0, swept.err
+    a100, mine = (strict_json(tmp_path / f"gpu-{name}/plan.json") for name in ("a100", "mine"))
+    assert "total" in swept.out
+    assert "8,000" in swept.out  # steps of both
+    assert a100["fits"]
+    assert not mine["fits"]
+    assert mine["flops_of_a_step"] == a100["flops_of_a_step"]
+    assert mine["seconds_a_step"] == pytest.approx(mine["flops_of_a_step"] / (1e9 * 0.4), rel=0.1)
+    assert mine["days"] == pytest.approx(4000 * mine["seconds_a_step"] / 86400)
+    assert mine["price"] == pytest.approx(2 * mine["gpu_hours"]) == pytest.approx(2 * 24 * mine["days"])
+    assert a100["seconds_a_step"] == pytest.approx(8e-6 * a100["operations_of_a_step"])  # too small for such a GPU
+    assert "The paper, on one A100: 15.7 ms" in swept.out
+
+
+def test_devices_share_the_batch_and_latents_need_no_encoder():
+    one, two = (plan_of(compose_config("plan", *SMALL, f"devices={n}")) for n in (1, 2))
+    cached = plan_of(compose_config("plan", *SMALL, "data.latent_cache=LATENTS"))
+    assert two["flops_of_a_step"] == pytest.approx(one["flops_of_a_step"], rel=1e-6)
+    assert two["activations_GB"] < 0.6 * one["activations_GB"]
+    assert two["copies_for_ddp_GB"] == two["gradients_GB"]
+    assert (one["copies_for_ddp_GB"], one["averages_GB"]) == (0, one["weights_GB"])
+    assert cached["flops_of_a_step"] < one["flops_of_a_step"]
+    assert cached["frozen_parameters"] == one["frozen_parameters"]
+
+
+def test_a_batch_that_does_not_fit_is_told_what_makes_it_fit():
+    table = "gpus.l40s={bfloat16: 1, float32: 1, memory: %s, bandwidth: 1}"
+    whole = plan_of(compose_config("plan", *SMALL))
+    half = (whole["memory_GB"] - 0.3 * whole["activations_GB"]) / 0.9
+    plan = plan_of(compose_config("plan", *SMALL, "gpu=l40s", table % half))
+    assert not plan["fits"]
+    assert any("It fits with trainer.accumulate_grad_batches=2" in line for line in plan["remarks"])
+    fitting = plan_of(compose_config("plan", *SMALL, "gpu=l40s", table % half, "trainer.accumulate_grad_batches=2"))
+    assert fitting["fits"]
+    assert fitting["flops_of_a_step"] == pytest.approx(whole["flops_of_a_step"], rel=1e-6)
+    none = plan_of(compose_config("plan", *SMALL, "gpu=l40s", table % 0.001))
+    assert any("No setting here makes it fit" in line for line in none["remarks"])
+
+
+def test_this_machine_is_timed():
+    plan = plan_of(compose_config("plan", *SMALL, "gpu=this", "data.batch_size=2"))
+    assert plan["seconds_a_step"] > 0
+    assert plan["memory_measured_GB"] is None or 0.3 < plan["memory_GB"] / plan["memory_measured_GB"] < 3
+
+
+def test_epochs_of_the_papers_data_are_the_papers_steps():
+    config = compose_config("plan", "experiment=paper_var_stage1")
+    assert steps_of(config, 723) == 138_000
+    assert steps_of(config, 1329) == 252_000
+    assert precision(config) == "bf16-mixed"
+    assert precision(compose_config("plan", "trainer.precision=32-true")) == "32-true"
+
+
+def test_it_takes_what_fit_takes():
+    assert choices_of_verb("plan") == choices_of_verb("fit")
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("gpu=h10", "did you mean h100"),
+        ("devices=0", "devices=0: must be at least 1"),
+        ("price=-1", "price=-1: must be at least 0"),
+        ("share=0", "share=0: must lie between"),
+        ("devices=3", "must be a multiple of 3 processes"),
+        ("trainer.max_steps=-1", "give trainer.max_steps=N or trainer.max_epochs=N"),
+        ("model=per_scene", "PerScene has nothing to train"),
+        ("model=reconstructor_only", "this model cannot be planned"),
+    ],
+)
+def test_unfit_settings_are_refused(setting, message):
+    assert message in refused("plan", "experiment=toy_var", "data.image_size=32", setting)

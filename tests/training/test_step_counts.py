@@ -1,0 +1,125 @@
+"""Counts of a step against a hand count, and steps of the paper's size on fake tensors, of the CPU and of a GPU."""
+
+import ctypes
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from support import compose_config
+from torch import nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
+
+from completesplat.commands.plan import counted, untrained
+from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.training.optimization import constant
+from completesplat.training.stage import Stage
+from completesplat.training.step_counts import LiveMemory, StoreOnly, Unfilled, count_step, fake_tensors
+from completesplat.training.steps import Training, synthetic_batch
+
+SIZE, BATCH = 16, 3
+PAPER = ("paper_var_stage1", "paper_var_stage2", "paper_diffusion", "paper_diffusion_masked")
+REGISTRY, CUDA, META = "_ZN3c104impl26device_guard_impl_registryE", 1, 14
+
+
+class TwoLayers(Stage):
+    """3 -> 8 channels by 3 x 3, 8 -> 4 by 1 x 1."""
+
+    def __init__(self) -> None:
+        super().__init__(StoreOnly(gpu=True), torch.optim.Adam, constant)
+        self.layers = nn.Sequential(nn.Conv2d(3, 8, 3, padding=1), nn.Conv2d(8, 4, 1))
+        self.frozen = nn.Linear(5, 1).requires_grad_(False)
+
+    def reconstruct(self, scenes, seed):
+        raise NotImplementedError
+
+    def training_step(self, batch, index):
+        return self.layers(batch.reference.images).mean()
+
+
+def test_counts_are_those_by_hand() -> None:
+    pixels = BATCH * SIZE**2
+    first, second = 2 * 3 * 8 * 9 * pixels, 2 * 8 * 4 * pixels  # images have no gradient, the first layer's output has
+    counts = count_step(TwoLayers, SIZE, BATCH, 0, "32-true", accumulated=2)
+    assert counts.flops == 2 * (2 * first + 3 * second)
+    assert (counts.trained, counts.frozen) == (8 * 27 + 8 + 4 * 8 + 4, 6)
+    kinds = counts.memory
+    assert (kinds["weights"], kinds["gradients"]) == (4 * (counts.trained + 6), 4 * counts.trained)
+    assert kinds["optimizer"] == 2 * 4 * counts.trained + 4 * 4  # and the number of the step for each tensor
+    assert kinds["activations"] == 4 * 8 * pixels + 4  # the first layer's output, and the loss
+    assert counts.peak >= sum(kinds.values()) >= 4 * (8 + 4) * pixels
+
+
+def test_fake_tensors_free_what_real_ones_do() -> None:
+    live = LiveMemory()
+    training, scenes = Training(TwoLayers(), "32-true"), synthetic_batch(SIZE, BATCH, 0)
+    training.step(scenes)
+    training.optimizer.zero_grad()
+    with live:
+        loss = training.loss(scenes)
+        forward = live.peak_since()
+    counts = count_step(TwoLayers, SIZE, BATCH, 0, "32-true")
+    assert live.bytes == counts.memory["activations"]
+    del loss
+    assert live.bytes == 0
+    static = counts.memory["activations"] + counts.memory["intermediate results"]
+    assert forward <= static <= 2 * forward
+
+
+@pytest.mark.parametrize("experiment", PAPER)
+def test_a_step_of_the_papers_size_runs_and_takes_no_memory(experiment: str) -> None:
+    config = compose_config("plan", f"experiment={experiment}")
+    counts = counted(config, config.data.batch_size)
+    assert counts.peak > 15e9
+    assert counts.memory["optimizer"] == pytest.approx(2 * 4 * counts.trained, rel=1e-3)  # fused Adam
+    assert counts.flops > 6 * 32 * 0.2e9
+
+
+@pytest.fixture
+def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Let torch without CUDA dispatch fake tensors of a GPU: its guard becomes that of the device "meta".
+
+    The backward pass would need a real GPU.
+    """
+    if not torch.backends.cuda.is_built():
+        library = ctypes.CDLL(str(Path(torch.__file__).parent / "lib/libc10.so"))
+        guards = (ctypes.c_void_p * (META + 1)).in_dll(library, REGISTRY)
+        guards[CUDA] = guards[META]
+    monkeypatch.setattr("torch.cuda.amp.common.amp_definitely_not_available", lambda: False)
+    monkeypatch.setattr("torch.cuda.is_bf16_supported", lambda *_, **__: True)
+    yield
+    if not torch.backends.cuda.is_built():
+        guards[CUDA] = None
+
+
+def on_gpu(config: DictConfig) -> Training:
+    with Unfilled(), torch.device("cuda"):
+        return Training(instantiate(config.model, _convert_="all"), "bf16-mixed")
+
+
+@pytest.mark.parametrize("experiment", PAPER[1:3])
+def test_a_forward_pass_on_a_gpu_finds_all_tensors_there_and_keeps_what_is_counted(
+    experiment: str, pretended_gpu: None
+) -> None:
+    config = compose_config("plan", f"experiment={experiment}")
+    copied = untrained(config)
+    copied.rasterizer = {"_target_": "completesplat.training.step_counts.StoreOnly", "gpu": True}
+    batch, live = 4, LiveMemory()
+    with sdpa_kernel(SDPBackend.MATH):
+        expected = counted(config, batch)
+        with fake_tensors(), live:
+            training = on_gpu(copied)
+            scenes = synthetic_batch(config.data.image_size, batch, config.data.targets).to("cuda")
+            before = live.bytes
+            loss = training.loss(scenes)
+            assert loss.device.type == "cuda"
+            assert live.bytes - before == pytest.approx(expected.memory["activations"], rel=0.02)
+            del loss
+            if isinstance(training.module, LatentDiffusion):
+                training.module.completesplat.latent_mean = torch.zeros(4, 1, 1, device="cpu")
+            else:
+                training.module.background = torch.full((3, 1, 1), 0.5)  # a constant that was left on the CPU
+            with pytest.raises(RuntimeError, match="two devices, cuda:0 and cpu"):
+                training.loss(scenes)
