@@ -1,13 +1,12 @@
 """`completesplat bench data`: reading speeds of published and packed forms of the same scenes."""
 
-import logging
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Literal, NamedTuple, TypedDict
+from typing import Annotated, NamedTuple, TypedDict
 
 from rich.console import Console
 
@@ -33,13 +32,6 @@ class Objects(TypedDict):
     references_per_sequence: Mapping[str, int]
 
 
-class Rooms(TypedDict):
-    """Clips in the layout of RealEstate10K: `write(out=...)` writes them, and `data(...)` makes their data module."""
-
-    write: Callable[..., Path]
-    data: MakeData
-
-
 class Epoch(NamedTuple):
     """Numbers of batches, scenes and images of one epoch, and the seconds that reading them took."""
 
@@ -50,65 +42,35 @@ class Epoch(NamedTuple):
 
 
 def run(
-    objects: Objects, rooms: Rooms | Literal[False],
-    workers: Annotated[Sequence[Natural], Entries(1)], repeats: Positive,
+    objects: Objects, workers: Annotated[Sequence[Natural], Entries(1)], repeats: Positive,
     codecs: Annotated[Sequence[Annotated[str, OneOf(tuple(CODECS))]], Entries(1)], out: Path,
 ) -> None:  # fmt: skip
-    """Write scenes, read them in all their forms, write `data.json`, and print tables.
+    """Write scenes, read them in all their forms, write `data.json`, and print a table.
 
     Args:
-        objects, rooms: makers of scenes and of their data modules; False skips the rooms.
+        objects: makers of scenes and of their data modules.
         workers: numbers of loading processes; everything is measured once with each number.
         repeats: number of timed epochs of each form.
         codecs: codecs of the packed stores.
     """
-    # Without this, each of dozens of data modules would log its number of sequences.
-    logger = logging.getLogger("completesplat.data")
-    level = logger.level
-    logger.setLevel(logging.WARNING)
-    results: dict[str, list[Row]] = {}
-    try:
-        with TemporaryDirectory(prefix="bench_data_", dir=out) as folder:
-            # Write everything before reading anything, because writing shows its own progress bars.
-            forms = {"rows": _objects(objects, codecs, Path(folder))}
-            if rooms:
-                forms["clips"] = _rooms(rooms, codecs, Path(folder))
-            with Console(stderr=True).status("reading") as status:
-                for key, makers in forms.items():
-                    results[key] = rows(makers, workers, repeats, lambda text: status.update(f"reading {text}"))
-    finally:
-        logger.setLevel(level)
-    titles = {"rows": "Training batches", "clips": "Training batches of clips"}
-    report(out / "data.json", results, {titles[key]: taken for key, taken in results.items()})
+    with TemporaryDirectory(prefix="bench_data_", dir=out) as folder:
+        forms = forms_of(objects, codecs, Path(folder))
+        with Console(stderr=True).status("reading") as status:
+            taken = rows(forms, workers, repeats, lambda text: status.update(f"reading {text}"))
+    report(out / "data.json", {"rows": taken}, {"Training batches": taken})
 
 
-def _objects(settings: Objects, codecs: Sequence[str], folder: Path) -> dict[str, MakeData]:
-    """Write objects in all forms; return makers of their data modules by form, the published form first."""
+def forms_of(settings: Objects, codecs: Sequence[str], folder: Path) -> dict[str, MakeData]:
+    """Write objects; return makers of the data modules of the published form, and of a packed one for each codec."""
     settings["write"](out=folder / "objects")
     data, references = partial(settings["data"], root=str(folder / "objects")), settings["references_per_sequence"]
-    packed = partial(data, references_per_sequence=references["prepared"])
-    raw = partial(data, references_per_sequence=references["raw"])
-    return {"raw": raw, **prepared(packed, folder / "prepared objects", codecs)}
-
-
-def _rooms(settings: Rooms, codecs: Sequence[str], folder: Path) -> dict[str, MakeData]:
-    root = settings["write"](out=folder / "rooms")
-    text = partial(settings["data"], root=str(root / "text"))
-    return {"text": text, **prepared(text, folder / "prepared rooms", codecs)}
-
-
-def prepared(data: MakeData, folder: Path, codecs: Sequence[str]) -> dict[str, MakeData]:
-    """Pack the training sequences of a data module into `folder`, once with each codec.
-
-    Returns:
-        Makers of the modules that read the prepared forms, by name.
-    """
+    forms: dict[str, MakeData] = {"raw": partial(data, references_per_sequence=references["raw"])}
     module = data()
-    sources, settings = {"train": module.source("train")}, module.packed_settings()
-    return {
-        f"prepared {codec}": partial(data, root=str(prepare(sources, settings, folder / codec, codec)))
-        for codec in codecs
-    }
+    packed, sources = partial(data, references_per_sequence=references["prepared"]), {"train": module.source("train")}
+    for codec in codecs:
+        store = prepare(sources, module.packed_settings(), folder / codec, codec)
+        forms[f"prepared {codec}"] = partial(packed, root=str(store))
+    return forms
 
 
 def rows(forms: Mapping[str, MakeData], workers: Sequence[int], repeats: int, tick: Callable[[str], None]) -> list[Row]:

@@ -110,9 +110,8 @@ def speed_rows(
                 rows[-1]["times_tiled"] = figures["forward_backward_ms"] / results["tiled"]["forward_backward_ms"]
             if name == "tiled":
                 work = counted_work(gaussians, cameras, constants)
-                shares = (
-                    amount / figures["forward_backward_ms"] / peak for amount, peak in zip(work, peaks, strict=True)
-                )
+                ms = figures["forward_backward_ms"]
+                shares = (amount / ms / peak for amount, peak in zip(work, peaks, strict=True))
                 share_of_peak, limit = max(zip(shares, ("compute", "memory"), strict=True))
                 rows[-1] |= {"share_of_peak": share_of_peak, "limit": limit}
     return rows
