@@ -101,11 +101,11 @@ def empty(shape: tuple[int, ...], dtype: type[np.number] = np.float32) -> np.nda
 
 
 def _take(size: int) -> mmap.mmap:
-    """Return a free block of one to two times the size, or a new one."""
+    """Return the smallest free block of one to two times the size, or a new one."""
     with _free_lock:
-        for i, memory in enumerate(_free):
-            if size <= len(memory) <= 2 * size:
-                return _free.pop(i)
+        fitting = [(len(memory), i) for i, memory in enumerate(_free) if size <= len(memory) <= 2 * size]
+        if fitting:
+            return _free.pop(min(fitting)[1])
         while sum(map(len, _free)) > MOST_FREE_BYTES:
             del _free[0]
     memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
