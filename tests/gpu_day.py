@@ -20,8 +20,7 @@ NETWORKS += ["denoiser.channels=[16,32]", "denoiser.attention_levels=[1]", "cond
 SCENES = ["data.scenes=4", "data.frames=4", "data.image_size=32", "data.batch_size=2", "repeats=1", "samples=2"]
 RASTERIZERS = ["sizes=[16]", "views=[1]", "repeats=1"]
 PAPER = ["device=cpu", "compile=false", "conditioning=learned", "sampler.steps=2", *NETWORKS, *SCENES]
-DIFFUSION = ["steps=1", *NETWORKS, *SCENES]
-LARGE = [f"{part}=stable_diffusion" for part in ("autoreconstructor", "conditioning", "denoiser")]
+PLAN = ["data.image_size=32", "data.batch_size=2", "data.targets=1"]
 STAGE1 = ["trainer.max_steps=2", "trainer.val_check_interval=2", "trainer.limit_val_batches=1", "data.batch_size=2"]
 STAGE1 += ["autoreconstructor.encoder.channels=[8,8,16]"]
 STAGE2 = [*STAGE1, "conditioning.channels=[8,8,16]", "denoiser.channels=[16,32]", "sampler.steps=2"]
@@ -48,9 +47,9 @@ def steps(out: Path, small: bool) -> Iterator[Step]:
     yield Step("tests", ["-m", "pytest", "-q", "-rs", "-m", "gpu", "tests/rasterizers"])
     yield verb("rasterizers", "bench", "rasterizers", *if_small(RASTERIZERS), out=out)
     yield verb("paper", "bench", "paper", *if_small(PAPER), out=out)
-    yield verb("diffusion", "bench", "diffusion", *if_small(DIFFUSION), out=out)
-    large = if_small(DIFFUSION, ["data.image_size=128", *LARGE])
-    yield verb("diffusion_large", "bench", "diffusion", *large, out=out)
+    for stage in ("var_stage1", "diffusion"):
+        experiment = f"experiment={'toy_var' if small else 'paper_' + stage}"
+        yield verb(f"plan_{stage}", "plan", "gpu=this", experiment, *if_small(PLAN, ["rasterizer=cuda"]), out=out)
     yield verb("data", "data", "toy", "kind=objects", "size=128", f"scenes={20 if small else 1000}", out=out)
     for size in (32, 48) if small else (64, 128):
         yield from training(out, size, small)
