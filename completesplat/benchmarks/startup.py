@@ -66,8 +66,6 @@ def run(weights: str, repeats: Positive, out: Path) -> None:
     ]
     title = "One sample, without a video, from a cold start, in one thread"
     report(out / "startup.json", {"commit": git_commit(), "rows": rows}, {title: rows})
-    starting = (times[PREDICT].cpu - times[AGAIN].cpu) / times[TORCH].cpu
-    print(f"predict without what it takes once more: {starting:.1f} times import torch, in CPU time")
 
 
 def timed(programs: Mapping[str, Sequence[str]], repeats: int) -> dict[str, Seconds]:

@@ -1,4 +1,4 @@
-"""Imports of commands: without the garbage collector, and of diffusers without modules that no prediction uses."""
+"""Imports of commands: without the garbage collector, and without modules that no prediction uses."""
 
 import gc
 import importlib.metadata
@@ -15,8 +15,9 @@ from importlib.util import spec_from_loader
 from types import ModuleType
 from typing import Any
 
-POSTPONED = ("requests", "scipy.integrate", "scipy.stats", "torch._dynamo", "torch.distributed._functional_collectives")
-"""Modules that diffusers imports: for decorators of its classes, and for schedulers with options of their own."""
+SCIPY = ("scipy.integrate", "scipy.linalg", "scipy.linalg.cython_blas", "scipy.stats")
+POSTPONED = ("requests", *SCIPY, "torch._dynamo", "torch.distributed._functional_collectives")
+"""Modules that diffusers and numba import: for decorators, schedulers and linear algebra that no prediction uses."""
 
 
 @contextmanager
@@ -37,7 +38,7 @@ def importing() -> Iterator[None]:
 
 @contextmanager
 def postponing() -> Iterator[None]:
-    """Import diffusers without `POSTPONED`, which took half of its import's time; their first use imports them.
+    """Import diffusers and numba without `POSTPONED`, which took half of the time; their first use imports them.
 
     Afterwards `sys.modules` holds the real modules or none. diffusers' blocks are not marked for torch.compile
     (`allow_in_graph`), so this is for commands that do not compile networks.
@@ -87,7 +88,7 @@ class _StandIn(ModuleType):
     __path__: MutableSequence[str] = []  # noqa: RUF012
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # `inspect` looks for such attributes in all modules
+        if name.startswith("__") and name != "__pyx_capi__":  # `inspect` looks for such attributes in all modules
             raise AttributeError(name)
         return getattr(_real(self.__name__), name)
 

@@ -29,7 +29,7 @@ def test_processes_are_timed_written_and_printed(command, tmp_path):
     assert torch["times_torch"] == 1
     assert 0 < again["cpu_seconds"] < predict["cpu_seconds"]
     assert predict["cpu_seconds"] > torch["cpu_seconds"] > 0
-    assert all(text in finished.out for text in ("from a cold start", "times import torch"))
+    assert "from a cold start" in finished.out
 
 
 @pytest.mark.processes

@@ -1,4 +1,4 @@
-"""Imports that are postponed: nothing that diffusers or another library then does with them differs."""
+"""Imports that are postponed: nothing that diffusers, numba or another library then does with them differs."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ IMPORTED = """
 import copy, pickle, sys
 from completesplat.commands.imports import POSTPONED, postponing
 with postponing():
-    import torch
+    import numba.np.arraymath, torch
     from diffusers import FlowMatchEulerDiscreteScheduler, UNet2DModel
     from diffusers.models.autoencoders import vae
 assert not set(POSTPONED) & set(sys.modules), set(POSTPONED) & set(sys.modules)
@@ -49,6 +49,11 @@ sigmas = scheduler.sigmas[:4].numpy()
 assert abs((sigmas - sigmas[-1]) / (sigmas[0] - sigmas[-1]) - expected).max() < 1e-5, (sigmas, expected)
 from diffusers.schedulers import scheduling_lms_discrete
 assert abs(scheduling_lms_discrete.integrate.quad(lambda x: x, 0, 1)[0] - 0.5) < 1e-9
+""",
+    "kernels multiply matrices": """
+import numpy as np
+product = numba.njit(lambda matrix: matrix @ matrix)(np.eye(2) + 1)
+assert product.tolist() == [[5, 4], [4, 5]] and sys.modules["scipy.linalg.cython_blas"].__pyx_capi__
 """,
     "functions stay excluded from compilation": """
 from diffusers.hooks.taylorseer_cache import TaylorSeerState
@@ -104,7 +109,7 @@ def run(program: str) -> None:
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_diffusers_works_as_if_it_had_imported_all(name: str) -> None:
+def test_libraries_work_as_if_they_had_imported_all(name: str) -> None:
     run(IMPORTED + SCRIPTS[name])
 
 
