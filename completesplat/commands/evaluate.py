@@ -151,6 +151,8 @@ def run_hidden_modes(
     module.to(device).eval()
     samples = evaluation["samples"]
     scenes, skipped = usable(data.hidden_modes(evaluation["views"], evaluation["spread_views"]), evaluation["scenes"])
+    if tested.scenes is not None:
+        tested.files.find([scene.scene.names[0] for scene in scenes], samples)
     progress = partial(track, description="Hidden modes", console=Console(stderr=True))
     measured = measure(
         predictors(module, samples, evaluation["batch"]),

@@ -98,8 +98,8 @@ def provenance(data: "SceneDataModule", out: Path) -> dict[str, object]:
 
 
 def drawing(module: Any) -> dict[str, object]:
-    """Return how samples are drawn; nulls for a model that draws none."""
-    if not module.draws_samples:
+    """Return how samples are drawn; nulls for a model that draws none, and for files."""
+    if not hasattr(module, "completesplat"):
         return dict.fromkeys(("sampler", "steps", "skip_weight", "guidance_weight"))
     sampler = module.completesplat.sampler
     return {

@@ -1,4 +1,4 @@
-"""Trained models for commands: a run's checkpoint with its data, weights with other data, or weights alone."""
+"""Models for commands: a run's checkpoint with its data, weights or files of scenes with other data, or weights."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +19,7 @@ from completesplat.weights.checkpoint_reading import load_part
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
+    from completesplat.training.scene_files import SceneFiles
     from completesplat.training.stage import Stage
 
 WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no effect"
@@ -26,9 +27,9 @@ WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no 
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained model with its data: a run's checkpoint, or weights.
+    """A trained model with its data: a run's checkpoint, weights, or the scenes in files that a program wrote.
 
-    `conf/test.yaml` explains the arguments; the configs `data` and `rasterizer` are used with `weights` only.
+    `conf/test.yaml` explains the arguments; the configs `data` and `rasterizer` are not used with `ckpt`.
     `config_of_run` explains what a run's config may name, and when it needs `trust`.
     """
 
@@ -36,6 +37,10 @@ class Trained:
     overrides: Sequence[str] = ()
     trust: bool = False
     weights: str | None = None
+    scenes: str | None = None
+    frame: str = "opencv"
+    align: str = "none"
+    method: str | None = None
     data: Mapping[str, object] | None = None
     rasterizer: Mapping[str, object] | None = None
     sampler: Mapping[str, object] | None = None
@@ -46,23 +51,36 @@ class Trained:
         """Return the model of `weights`."""
         return CompleteSplat.from_pretrained(str(self.weights))
 
+    @cached_property
+    def files(self) -> "SceneFiles":
+        """Return the stage that reads `scenes`; it sees the data's background, or else the stages' default."""
+        from completesplat.training.scene_files import SceneFiles
+
+        grey = (self.data or {}).get("background")
+        background = {} if grey is None else {"background": grey}
+        rasterizer = instantiate(self.rasterizer, _convert_="all")
+        return SceneFiles(Path(str(self.scenes)), self.frame, self.align, self.method, rasterizer, **background)
+
     def configuration(self) -> Any:
         """Return the config of the data, and with `ckpt` also of the model.
 
         Raises:
             WeightsError: the checkpoint, its run's config or the weights are missing or not trusted.
-            CompleteSplatError: neither is given, or both, or weights without data or with data that they cannot use.
+            CompleteSplatError: none or several of the three are given, weights or scenes lack data, or the weights cannot
+                use them.
         """
-        if (self.ckpt is None) == (self.weights is None):
-            raise CompleteSplatError("give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR data=NAME data.root=DIR")
+        if [self.ckpt, self.weights, self.scenes].count(None) != 2:
+            either = "ckpt=RUN/checkpoints/last.ckpt, weights=DIR, scenes=DIR"
+            raise CompleteSplatError(f"give one of {either}; the last two with data=NAME data.root=DIR")
         if self.ckpt is not None and self.data is not None:
             raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
         if self.ckpt is not None:
             return config_of_run(Path(self.ckpt), list(self.overrides), self.trust)
         if self.data is None:
-            raise CompleteSplatError("weights know no data: give data=NAME data.root=DIR")
+            raise CompleteSplatError("weights and scenes know no data: give data=NAME data.root=DIR")
         config = OmegaConf.create({"seed": self.seed, "data": self.data})
-        config.data.update(self.model.needed_of_data(config.data))
+        if self.weights is not None:
+            config.data.update(self.model.needed_of_data(config.data))
         return config
 
     def open(self) -> "tuple[Stage, SceneDataModule]":
@@ -85,14 +103,18 @@ class Trained:
         return stage
 
     def facts(self) -> dict[str, object]:
-        """Return `checkpoint_facts`; for a folder of weights, path and checksum but not how training ended."""
+        """Return `checkpoint_facts`; for weights and files of scenes, path and checksum but not how training ended."""
         if self.ckpt is not None:
             return checkpoint_facts(Path(self.ckpt))
+        if self.scenes is not None:
+            return self.files.facts()
         file = locate(str(self.weights))
         return {"checkpoint": {"path": self.weights, "sha256": sha256_of(file), "step": None}, "ema": None}
 
     def _stage(self) -> "Stage":
-        """Return a stage around the model of `weights`; its loss and optimizer are never used."""
+        """Return a stage around `scenes` or the model of `weights`; its loss and optimizer are never used."""
+        if self.scenes is not None:
+            return self.files
         from torch.optim import Adam
 
         from completesplat.baselines.splatter_image.model import DirectionalRasterizer

@@ -11,7 +11,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.options import did_you_mean
-from completesplat.settings.schema import Positive, Range, Seed, Share, arguments_of, check_settings, check_value
+from completesplat.settings.schema import OneOf, Positive, Range, Seed, Share, arguments_of, check_settings, check_value
 
 Container = DictConfig | ListConfig
 
@@ -107,6 +107,10 @@ class Test(RunSettings):
 
     ckpt: str | None
     weights: str | None
+    scenes: str | None
+    frame: Annotated[str, OneOf(("opencv", "opengl"))]
+    align: Annotated[str, OneOf(("none", "scale"))]
+    method: str | None
     seed: Annotated[int, Range(0, 2**32 - 1)]
     trust: bool
 

@@ -44,11 +44,10 @@ def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
     """
 
     def model(scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
-        if not isinstance(module, LatentDiffusion):
-            image = _render(module, module.reconstruct(scene, seed=seed), scene)
-            return image.expand(samples, *image.shape[1:])
-        gaussians = module.reconstruct(scene, seed=seed, samples=samples, batch=batch)
-        return torch.cat([_render(module, gaussians[i : i + batch], scene) for i in range(0, samples, batch)])
+        gaussians = module.draw(scene, [seed], samples, batch)
+        count = len(gaussians.means)
+        images = torch.cat([_render(module, gaussians[i : i + batch], scene) for i in range(0, count, batch)])
+        return images.expand(samples, *images.shape[1:])
 
     frozen = module.completesplat.autoreconstructor if isinstance(module, LatentDiffusion) else None
     network = frozen or getattr(module, "model", None)

@@ -198,9 +198,9 @@ class LatentDiffusion(Stage):
             for logger in self.loggers:
                 logger.log_metrics(values, step=self.global_step)
 
-    def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int) -> Gaussians:
+    def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int, batch: int | None = None) -> Gaussians:
         """See `Stage`; the samples of an image depend on no other image."""
-        return self.reconstruct(scenes, seeds, samples=samples)
+        return self.reconstruct(scenes, seeds, samples=samples, batch=batch)
 
     def reconstruct(self, scenes: SceneBatch, seed: int | Sequence[int], **settings: Any) -> Gaussians:
         """Draw one sample for each reference image, or several by `settings` of `CompleteSplat.generate`."""

@@ -104,8 +104,11 @@ class Stage(LightningModule):
     def reconstruct(self, scenes: SceneBatch, seed: int) -> Gaussians:
         """Return one set of Gaussians [batch] for each reference image, in its camera's frame."""
 
-    def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int) -> Gaussians:
-        """Return `samples` sets of Gaussians for each image and its seed, next to each other: [batch * samples]."""
+    def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int, batch: int | None = None) -> Gaussians:
+        """Return `samples` sets of Gaussians for each image and its seed, next to each other: [batch * samples].
+
+        A model that draws no samples returns one set. `batch` is the largest number to compute at a time (None: all).
+        """
         return self.reconstruct(scenes, seeds[0])
 
     @property

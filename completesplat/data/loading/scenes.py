@@ -199,8 +199,8 @@ class EvaluationScenes(Dataset[Loaded]):
         except DataError as error:
             return Loaded(None, (error,))
         try:
-            if self.depths and sequence.read_depth is not None:
-                scene = _with_depths(scene, torch.stack([sequence.read_depth(view) for view in (views[0], *views[1])]))
+            if self.depths:
+                scene = with_true_depths(scene, sequence, views)
         except DataError as error:
             return Loaded(scene, (), (error,))
         return Loaded(scene, ())
@@ -212,6 +212,13 @@ class EvaluationScenes(Dataset[Loaded]):
             with suppress(DataError):
                 counts.add(len(self.choose(self.store.source.read(name))[1]))
         return len(counts) <= 1
+
+
+def with_true_depths(scene: SceneBatch, sequence: PosedSequence, views: Choice) -> SceneBatch:
+    """Return the scene with the true depth of its views, if the data set has it; errors as `read_depth`."""
+    if sequence.read_depth is None:
+        return scene
+    return _with_depths(scene, torch.stack([sequence.read_depth(view) for view in (views[0], *views[1])]))
 
 
 def _with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]) -> SceneBatch:
