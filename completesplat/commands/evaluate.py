@@ -166,8 +166,8 @@ def run_hidden_modes(
     results = measured.results(samples)
     write_json(out / "hidden_modes.json", results)
     write_json(out / "shares.json", measured.shares())
-    used = {"scenes": measured.names, "skipped": skipped}
-    write_json(out / "protocol.json", _hidden_modes_protocol(tested, evaluation, module, data, used, out))
+    used = {"scenes": measured.names, "skipped": skipped, **provenance(data, out), **tested.facts()}
+    write_json(out / "protocol.json", _modes_protocol(evaluation, module, data) | used)
     draw(measured, samples, out / "hidden_modes.png")
     _log_modes(results, list(instantiate(logger or {}, _convert_="all").values()), out)
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
@@ -184,23 +184,13 @@ def _log_modes(results: Mapping[str, Mapping[str, float]], loggers: Sequence[Log
             logger.save()
 
 
-def _hidden_modes_protocol(
-    tested: Trained,
-    evaluation: HiddenModesEvaluation,
-    module: Stage,
-    data: SceneDataModule,
-    scenes: dict[str, list[str]],
-    out: Path,
-) -> dict[str, object]:
-    """Return the record of what was measured and how, with the names of the scenes."""
+def _modes_protocol(evaluation: HiddenModesEvaluation, module: Stage, data: SceneDataModule) -> dict[str, object]:
+    """Return the record of what was measured and how."""
     return {
         "name": evaluation["name"],
         "method": module.method,
         **data.describe(),
         "image_size": data.image_size,
-        **scenes,
         **{key: value for key, value in evaluation.items() if key in ("samples", "views", "spread_views", "seed")},
         **drawing(module),
-        **provenance(data, out),
-        **tested.facts(),
     }

@@ -53,25 +53,23 @@ class Trained:
 
     @cached_property
     def files(self) -> "SceneFiles":
-        """Return the stage that reads `scenes`; it sees the data's background, or else the stages' default."""
+        """Return the stage that reads `scenes`."""
         from completesplat.training.scene_files import SceneFiles
 
-        grey = (self.data or {}).get("background")
-        background = {} if grey is None else {"background": grey}
-        rasterizer = instantiate(self.rasterizer, _convert_="all")
-        return SceneFiles(Path(str(self.scenes)), self.frame, self.align, self.method, rasterizer, **background)
+        rendering = {"rasterizer": instantiate(self.rasterizer, _convert_="all")}
+        if self.data is not None and self.data.get("background") is not None:
+            rendering["background"] = self.data["background"]
+        return SceneFiles(str(self.scenes), self.frame, self.align, self.method, **rendering)
 
     def configuration(self) -> Any:
         """Return the config of the data, and with `ckpt` also of the model.
 
         Raises:
             WeightsError: the checkpoint, its run's config or the weights are missing or not trusted.
-            CompleteSplatError: none or several of the three are given, weights or scenes lack data, or the weights cannot
-                use them.
+            CompleteSplatError: none or several are given, no data with weights or scenes, or data that do not fit.
         """
         if [self.ckpt, self.weights, self.scenes].count(None) != 2:
-            either = "ckpt=RUN/checkpoints/last.ckpt, weights=DIR, scenes=DIR"
-            raise CompleteSplatError(f"give one of {either}; the last two with data=NAME data.root=DIR")
+            raise CompleteSplatError("give one: ckpt=FILE, or weights=DIR or scenes=DIR with data=NAME data.root=DIR")
         if self.ckpt is not None and self.data is not None:
             raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
         if self.ckpt is not None:

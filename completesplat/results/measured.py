@@ -31,7 +31,7 @@ ALIKE = ["name", "data_set", "subset", "split", "resolution", "crop", "backgroun
 ALIKE += ["views", "protocol_views", "scene_list"]
 """Entries of the protocol that are equal in all rows of a table, as are the data and the settings of the metrics."""
 DESCRIBED = [*ALIKE, "image_size", "scenes_listed", "samples", "criterion", "seed", "sampler", "steps", "skip_weight"]
-DESCRIBED += ["guidance_weight", "ema", "commit", "gaussians", "frame", "align"]
+DESCRIBED += ["guidance_weight", "ema", "commit", "frame", "align"]
 """Entries of the protocol that the note on a row states."""
 COLUMNS = [f"full_novel_{name}" for name in METRICS]
 COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips")] + ["full_reference_psnr"]
@@ -90,16 +90,17 @@ class Entry:
 
     def method(self, notes: Notes) -> Cell:
         """Return the method, its kind of sampling, and the number of the note that describes the protocol."""
-        protocol, label = self.run.protocol, f"{OURS}{self.predictor.replace('_', ' ')}"
+        protocol, label = self.run.protocol, self.predictor.replace("_", " ")
         if self.ours:
             samples = protocol.get("samples", 1)
             oracle, criterion = f", {samples}-best oracle by", str(protocol.get("criterion")).upper()
             kinds = {BEST_OF_K: f"{oracle} {criterion}", BEST_BY_METRIC: f"{oracle} each metric"}
             kinds[MEAN_OF_K] = f", mean of {samples} samples"
-            kinds[MODEL] = ", single sample" if protocol.get("sampler") or samples > 1 else ""
-            label = f"{'' if 'gaussians' in protocol else OURS}{_method(protocol)}{kinds[self.predictor]}"
+            kinds[MODEL] = ", single sample" if protocol.get("sampler") or samples != 1 else ""
+            label = f"{protocol.get('method', 'model')}{kinds[self.predictor]}"
             label += " (upper bound)" if self.upper_bound else ""
-        return Cell(f"{label} [{_note(self.run, notes)}]")
+        owner = "" if self.ours and protocol.get("frame") else OURS  # files may be of any program
+        return Cell(f"{owner}{label} [{_note(self.run, notes)}]")
 
     def cell(self, name: str, notes: Notes) -> Cell:
         """Return a cell with the score `REGION_VIEW_METRIC`, or with the number of the note on why it is missing."""
@@ -113,12 +114,6 @@ class Entry:
         times = {part: time_cell(self.scores.get(f"seconds_{part}")) for part in COST}
         sizes = {"scenes": Cell(str(protocol["scenes"])), "resolution": Cell(str(protocol["resolution"]))}
         return {"method": self.method(notes), "speed": Cell(ABSENT), **times, **sizes}
-
-
-def _method(protocol: Protocol) -> str:
-    """Return the method's name, marked if its Gaussians were read from files."""
-    source = f" ({protocol['gaussians']})" if "gaussians" in protocol else ""
-    return f"{protocol.get('method', 'model')}{source}"
 
 
 def _note(run: Result, notes: Notes) -> int:
@@ -196,7 +191,7 @@ def _mode_table(name: str, runs: Sequence[Result]) -> Table:
     rows: dict[str, dict[object, list[Cell]]] = {"ours": {}, "known": {}}
     for run in runs:
         for method, scores in run.entries.items():
-            label = _method(run.protocol) if method == MODEL else method.replace("_", " ")
+            label = str(run.protocol.get("method", "model")) if method == MODEL else method.replace("_", " ")
             cells = [Cell(f"{scores[key]:.3f}", value=scores[key]) for key in MODE_SCORES]
             cells += [Cell(f"{scores[key]:g}") for key in ("scenes", "samples")]
             # Methods other than the model may have the same scores in several runs, and are then shown once.

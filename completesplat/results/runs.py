@@ -49,7 +49,6 @@ class Protocol(TypedDict, total=False):
     missing: dict[str, str]
     machine: Machine
     checkpoint: dict[str, str]
-    gaussians: str
     data_fingerprint: str
 
 

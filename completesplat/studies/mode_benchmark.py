@@ -44,9 +44,8 @@ def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
     """
 
     def model(scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
-        gaussians = module.draw(scene, [seed], samples, batch)
-        count = len(gaussians.means)
-        images = torch.cat([_render(module, gaussians[i : i + batch], scene) for i in range(0, count, batch)])
+        sets = module.draw(scene, [seed], samples, batch)
+        images = torch.cat([_render(module, sets[i : i + batch], scene) for i in range(0, len(sets.means), batch)])
         return images.expand(samples, *images.shape[1:])
 
     frozen = module.completesplat.autoreconstructor if isinstance(module, LatentDiffusion) else None

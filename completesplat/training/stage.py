@@ -105,10 +105,7 @@ class Stage(LightningModule):
         """Return one set of Gaussians [batch] for each reference image, in its camera's frame."""
 
     def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int, batch: int | None = None) -> Gaussians:
-        """Return `samples` sets of Gaussians for each image and its seed, next to each other: [batch * samples].
-
-        A model that draws no samples returns one set. `batch` is the largest number to compute at a time (None: all).
-        """
+        """Return `samples` sets (one, if the model draws none) for each image and its seed, next to each other."""
         return self.reconstruct(scenes, seeds[0])
 
     @property

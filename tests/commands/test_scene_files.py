@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,12 +10,13 @@ import pytest
 import torch
 from scenes_for_training import scene_batch
 from support import call, refused, strict_json
-from written_commands import ROOT
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.gaussians import Gaussians
 from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.results.runs import flat
+from completesplat.scene import SceneBatch
 from completesplat.training.scene_files import SceneFiles
 from completesplat.training.stage import Stage
 
@@ -44,29 +46,136 @@ def given(pipeline, out: Path) -> list[str]:
     return [*data, f"evaluation.scoring.samples={SAMPLES}", "trainer.accelerator=cpu", f"out={out}"]
 
 
-@pytest.fixture
-def splats(own, tmp_path) -> Path:
-    return shutil.copytree(own / "splats", tmp_path / "splats")
-
-
-def numbers(entry: dict, place: str = "") -> dict[str, float]:
-    flat = {f"{place}{key}": value for key, value in entry.items() if not isinstance(value, dict)}
-    return flat | {k: v for key, part in entry.items() if isinstance(part, dict) for k, v in numbers(part, key).items()}
-
-
 def test_our_own_samples_in_files_score_as_the_model_does(command, pipeline, own, tmp_path):
     finished = command("test", f"scenes={own / 'splats'}", "method=Mine", *given(pipeline, tmp_path / "out"))
     assert finished.status == 0, finished.err
     ours, files = (strict_json(folder / "metrics.json") for folder in (own / "test", tmp_path / "out"))
+    _, described = ours.pop("protocol"), files.pop("protocol")
     assert ours["model"]["seconds"].pop("inference") > 0
-    protocols = [scores.pop("protocol") for scores in (ours, files)]
+    assert files["model"]["seconds"].keys() == {"rendering"}
     assert list(ours) == list(files)
     for row in ours:
-        expected, actual = ({k: v for k, v in numbers(scores[row]).items() if "rendering" not in k} for scores in (ours, files))
-        assert actual == pytest.approx(expected, rel=1e-3, abs=1e-3), row
-        psnr = [{k: v for k, v in numbers(scores[row]).items() if k.endswith("psnr")} for scores in (ours, files)]
-        assert psnr[1] == pytest.approx(psnr[0], abs=1e-3, rel=0)
-    said = {"method": "Mine", "frame": "opencv", "align": "none", "sampler": None, "gaussians": "read from files"}
-    assert {key: protocols[1][key] for key in said} == said
-    assert protocols[1]["checkpoint"]["path"] == str(own / "splats")
-    assert len(protocols[1]["checkpoint"]["sha256"]) == 64
+        expected, actual = (flat(scores[row]) for scores in (ours, files))
+        assert expected.keys() == actual.keys()
+        for name in expected:
+            if "seconds" not in name:
+                assert actual[name] == pytest.approx(expected[name], abs=1e-3), (row, name)
+    named = {"method": "Mine (read from files)", "frame": "opencv", "align": "none", "sampler": None}
+    assert {key: described[key] for key in named} == named
+    assert described["checkpoint"]["path"] == str(own / "splats")
+    assert len(described["checkpoint"]["sha256"]) == 64
+
+
+def written(folder: Path, samples: Sequence[Gaussians], scene: str = "scene 0 0") -> Path:
+    """Write samples of one scene, and return the folder of all scenes."""
+    (folder / scene).mkdir(parents=True)
+    for index, sample in enumerate(samples):
+        write_ply(folder / f"{scene}/sample_{index:02}.ply", sample)
+    return folder
+
+
+def in_front(count: int = 40, seed: int = 0) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+    means, quaternions, scales, rest = (torch.rand(count, n, generator=generator) for n in (3, 4, 3, 4))
+    means = (means - 0.5) * torch.tensor([1.0, 1.0, 0.5]) + torch.tensor([0.0, 0.0, 2.0])
+    return Gaussians(means, quaternions - 0.5, 0.05 + 0.2 * scales, 0.5 + 0.5 * rest[:, 3], rest[:, :3])
+
+
+def drawn(folder: Path, scenes: SceneBatch, samples: int, frame: str = "opencv", align: str = "none") -> Gaussians:
+    stage = SceneFiles(folder, frame, align, None, rasterizer=ReferenceRasterizer())
+    stage.find(scenes.names, samples)
+    return stage.draw(scenes, [0], samples)
+
+
+def test_files_with_opengls_axes_are_turned_about_x(tmp_path):
+    samples, flip = [in_front(40), in_front(25, seed=1)], torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    turned = [replace(one, means=one.means @ flip, quaternions=one.quaternions[:, [1, 0, 3, 2]]) for one in samples]
+    turned = [replace(one, quaternions=one.quaternions * torch.tensor([-1.0, 1, -1, 1])) for one in turned]
+    for one, other in zip(samples, turned, strict=True):  # i q = (-x, w, -z, y)
+        assert torch.allclose(other.covariances(), flip @ one.covariances() @ flip, atol=1e-6)
+    result = drawn(written(tmp_path, turned), scene_batch(batch=1), 2, frame="opengl")
+    assert result.opacities.shape == (2, 40)
+    assert not result.opacities[1, 25:].any()
+    for one, placed in zip(samples, result, strict=False):
+        placed = placed[: one.count]
+        assert torch.allclose(placed.means, one.means, atol=1e-5)
+        assert torch.allclose(placed.covariances(), one.covariances(), atol=1e-5)
+
+
+def test_one_factor_for_all_samples_of_a_scene_is_found_by_depth(tmp_path):
+    samples, scenes = [in_front(), in_front(seed=1)], scene_batch(batch=1)
+    camera = scenes.reference.cameras[0]
+    view = ReferenceRasterizer()(samples[0][None], camera[None][None])[0, 0]
+    depths = torch.where(view.alpha > 0.6, view.expected_depth(), torch.zeros(()))[None]
+    known = replace(scenes, reference=replace(scenes.reference, depths=depths))
+    smaller = [replace(one, means=one.means / 3, scales=one.scales / 3) for one in samples]
+    result = drawn(written(tmp_path / "a", smaller), known, 2, align="scale")
+    for name in ("means", "scales"):
+        expected = torch.stack([getattr(one, name) for one in samples])
+        assert torch.allclose(getattr(result, name), expected, rtol=1e-3, atol=1e-4)
+    for unknown in (scenes, replace(known, reference=replace(known.reference, depths=torch.zeros_like(depths)))):
+        with pytest.raises(CompleteSplatError, match=r"align=scale: scene 0 0: no true depth .* align=none"):
+            drawn(tmp_path / "a", unknown, 2, align="scale")
+
+
+def remove(folder: Path) -> None:
+    shutil.rmtree(folder)
+
+
+def behind(folder: Path) -> None:
+    for path in folder.glob("*.ply"):
+        sample = read_ply(path)
+        write_ply(path, replace(sample, means=sample.means * torch.tensor([1.0, -1.0, -1.0])))
+
+
+def empty(folder: Path) -> None:
+    write_ply(folder / "sample_01.ply", in_front(0))
+
+
+REFUSED = [
+    (remove, [], r"{scene}: no such folder, 3 files are wanted \(1 of 1 scenes have too few\); write them"),
+    (
+        lambda folder: (folder / "sample_00.ply").unlink(),
+        [],
+        r"{scene}: 2 files sample_\*.ply, 3 files are wanted .*; .*fewer",
+    ),
+    (behind, [], r"{scene}/sample_00.ply: all .* behind the reference camera; try frame=opengl"),
+    (empty, [], r"{scene}/sample_01.ply: holds 0 Gaussians; write it again"),
+    (lambda folder: (folder / "sample_02.ply").write_bytes(b"ply"), [], r"{scene}/sample_02.ply: no end of the header"),
+]
+
+
+@pytest.mark.parametrize(("damage", "settings", "message"), REFUSED, ids=range(len(REFUSED)))
+def test_scenes_that_cannot_be_scored_are_named_in_one_line(
+    command, pipeline, own, tmp_path, damage, settings, message
+):
+    (scene,) = shutil.copytree(own / "splats", tmp_path / "splats").iterdir()
+    damage(scene)
+    finished = command("test", f"scenes={tmp_path / 'splats'}", *settings, *given(pipeline, tmp_path / "out"))
+    (line,) = [line for line in finished.err.splitlines() if line.startswith("error: ")]
+    assert finished.status == 2
+    assert re.search(message.format(scene=scene), line), line
+    assert not (tmp_path / "out/metrics.json").exists()
+
+
+def test_settings_that_do_not_fit_are_refused(tmp_path):
+    one = "give one: ckpt=FILE, or weights=DIR or scenes=DIR with data=NAME data.root=DIR"
+    assert refused("test", "scenes=a", "ckpt=b") == one
+    assert refused("test", "scenes=a", "weights=b", "data=toy_objects") == one
+    assert refused("test", "scenes=a") == "weights and scenes know no data: give data=NAME data.root=DIR"
+    nowhere = ["data=toy_objects", f"data.root={tmp_path}", f"scenes={tmp_path / 'gone'}"]
+    assert refused("test", *nowhere).startswith(f"scenes={tmp_path / 'gone'}: no such folder; give one with SCENE/")
+    assert refused("test", "scenes=a", "frame=colmap") == "frame=colmap: choose one of opencv, opengl"
+    assert refused("test", "scenes=a", "align=all") == "align=all: choose one of none, scale"
+
+
+def test_hidden_modes_of_files(command, pipeline, own, tmp_path):
+    settings = ["evaluation=hidden_modes", "evaluation.samples=3", "align=scale", *FEW]
+    data = [setting for setting in given(pipeline, tmp_path / "out") if "scoring" not in setting]
+    finished = command("test", f"scenes={own / 'splats'}", *settings, *data)
+    assert finished.status == 0, finished.err
+    results = strict_json(tmp_path / "out/hidden_modes.json")
+    assert results.keys() == {"model", "true_sampler", "mean_predictor"}
+    assert strict_json(tmp_path / "out/protocol.json")["method"] == "splats (read from files)"
+    finished = command("test", f"scenes={own / 'splats'}", *settings, "evaluation.samples=4", *data)
+    assert "3 files sample_*.ply, 4 files are wanted" in finished.err

@@ -199,11 +199,9 @@ class EvaluationScenes(Dataset[Loaded]):
         except DataError as error:
             return Loaded(None, (error,))
         try:
-            if self.depths:
-                scene = with_true_depths(scene, sequence, views)
+            return Loaded(with_true_depths(scene, sequence, *views) if self.depths else scene, ())
         except DataError as error:
             return Loaded(scene, (), (error,))
-        return Loaded(scene, ())
 
     def stackable(self) -> bool:
         """Return whether all scenes that can be read have the same number of targets."""
@@ -214,11 +212,10 @@ class EvaluationScenes(Dataset[Loaded]):
         return len(counts) <= 1
 
 
-def with_true_depths(scene: SceneBatch, sequence: PosedSequence, views: Choice) -> SceneBatch:
-    """Return the scene with the true depth of its views, if the data set has it; errors as `read_depth`."""
-    if sequence.read_depth is None:
-        return scene
-    return _with_depths(scene, torch.stack([sequence.read_depth(view) for view in (views[0], *views[1])]))
+def with_true_depths(scene: SceneBatch, sequence: PosedSequence, reference: int, targets: list[int]) -> SceneBatch:
+    """Return the scene of these views with their true depth, if the data set has it."""
+    read = sequence.read_depth
+    return scene if read is None else _with_depths(scene, torch.stack([read(view) for view in (reference, *targets)]))
 
 
 def _with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]) -> SceneBatch:

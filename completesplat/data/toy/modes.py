@@ -100,16 +100,16 @@ class ToyHiddenModes:
         others = [view for view in range(len(frames)) if view != reference]
         spread = [others[place - 1] for place in evaluation_views(len(frames), self.spread_views)[1]]
         targets = sorted({*behind, *spread})
-        scene = with_true_depths(self.store.scene(sequence, reference, targets), sequence, (reference, targets))
+        scene = stack([with_true_depths(self.store.scene(sequence, reference, targets), sequence, reference, targets)])
         true_mode, views = list(PATCH_COLORS).index(toy.patch_color), tuple(map(targets.index, behind))
         # The scene that was drawn again must equal the one on the disk.
         drawn = torch.cat([self._render(toy, frames[reference])[None], truths[true_mode]])
-        stored = torch.cat([scene.reference.images[None], scene.targets.images[list(views)]])
+        stored = torch.cat([scene.reference.images, scene.targets.images[0, list(views)]])
         if (drawn - stored).square().mean((1, 2, 3)).sqrt().max() > SAME_IMAGE:
             raise self._other_set(name)
         hidden = [unseen(toy, frames[reference], frames[target], self.image_size) for target in targets]
         chances = torch.tensor(toy.chances, dtype=torch.float32)
-        return HiddenModes(stack([scene]), views, truths, region, chances, torch.stack(hidden), tuple(PATCH_COLORS), true_mode)
+        return HiddenModes(scene, views, truths, region, chances, torch.stack(hidden), tuple(PATCH_COLORS), true_mode)
 
     def _drawn_again(self, name: str) -> ToyScene:
         number, _, family = name.partition("_")
