@@ -15,7 +15,9 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.gaussians import Gaussians
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.results.runs import flat
+from completesplat.results.paper_figures import tables
+from completesplat.results.runs import find, flat
+from completesplat.results.tables import as_markdown
 from completesplat.scene import SceneBatch
 from completesplat.training.scene_files import SceneFiles
 from completesplat.training.stage import Stage
@@ -64,6 +66,10 @@ def test_our_own_samples_in_files_score_as_the_model_does(command, pipeline, own
     assert {key: described[key] for key in named} == named
     assert described["checkpoint"]["path"] == str(own / "splats")
     assert len(described["checkpoint"]["sha256"]) == 64
+    text = "\n".join(map(as_markdown, tables(find(tmp_path))))
+    assert "| Mine (read from files), single sample [1] |" in text
+    assert "| completesplat: copy reference [1] |" in text
+    assert "frame opencv, align none, data " in text
 
 
 def written(folder: Path, samples: Sequence[Gaussians], scene: str = "scene 0 0") -> Path:
@@ -82,7 +88,7 @@ def in_front(count: int = 40, seed: int = 0) -> Gaussians:
 
 
 def drawn(folder: Path, scenes: SceneBatch, samples: int, frame: str = "opencv", align: str = "none") -> Gaussians:
-    stage = SceneFiles(folder, frame, align, None, rasterizer=ReferenceRasterizer())
+    stage = SceneFiles(str(folder), frame, align, None, rasterizer=ReferenceRasterizer())
     stage.find(scenes.names, samples)
     return stage.draw(scenes, [0], samples)
 
