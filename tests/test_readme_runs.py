@@ -29,8 +29,18 @@ BRIEF |= {
     for of in ("minis", "views")
 }
 # What they need cannot be made here: CO3D, eight GPUs, VGG16 (`test_sweeps` has these two sweeps with a random one),
-# Splatter Image's published weights (`test_published` has made-up ones).
-NEEDS_MORE = ("evaluation=co3d", "trainer.devices=8", "PART1", "TABLE_OF_A", "splatter_image:", "model_hydrants.pth")
+# Splatter Image's published weights (`test_published` has made-up ones), images that lines of Python write
+# (`test_scene_files` runs these).
+NEEDS_MORE = (
+    "IMAGES",
+    "SPLATS",
+    "evaluation=co3d",
+    "trainer.devices=8",
+    "PART1",
+    "TABLE_OF_A",
+    "splatter_image:",
+    "model_hydrants.pth",
+)
 TAKES_MINUTES = ("completesplat bench",)
 
 

@@ -1,4 +1,4 @@
-"""Models for commands: a run's checkpoint with its data, weights or files of scenes with other data, or weights."""
+"""Models for commands: a run's checkpoint with its data, weights or files of scenes with other data, weights alone."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
