@@ -4,7 +4,7 @@ Each study raises the errors of `Trained.open`, `diffusion_of`, `first_scenes` a
 `completesplat.studies`.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, TypedDict, Unpack
@@ -19,6 +19,7 @@ from completesplat.export.images import SheetCell, image_sheet, write_png
 from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
 from completesplat.settings.schema import Entries, Positive, Range, Share
+from completesplat.studies import calibration as calibration_study
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies.samples import SampleRenderer, first_scenes
@@ -27,11 +28,14 @@ Weights = Annotated[Sequence[Share], Entries(1)]
 
 
 class Run(TypedDict):
-    """Run of stage 2 (`Trained`), how many of its first test scenes are used, and how many samples each scene gets."""
+    """Model of stage 2 with its data (`Trained`), number of first test scenes, and number of samples of each."""
 
-    ckpt: str
+    ckpt: str | None
     overrides: Sequence[str]
     trust: bool
+    weights: str | None
+    data: Mapping[str, object] | None
+    rasterizer: Mapping[str, object]
     scenes: Positive
     seed: int
     samples: Annotated[int, Range(2)]
@@ -86,13 +90,32 @@ def depth(
     show(records_table("Deviation of depth over samples, scene units", rows))
 
 
+def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Unpack[Run]) -> None:
+    """Write `calibration.json` and `calibration.png`, and print the tables; the settings are those of `generate`."""
+    renderer, scenes, settings = _open(run)
+    weights = {"skip_weight": skip_weight, "guidance_weight": guidance_weight}
+    with _status() as tick:
+        rows = calibration_study.rows(renderer, scenes, tick, **weights)
+    write_json(out / "calibration.json", {"settings": settings | weights, "rows": rows})
+    title = f"Calibration: {len(scenes)} scenes, {run['samples']} samples each"
+    title += f"; skip {skip_weight:g}, guidance {guidance_weight:g}"
+    calibration_study.plot_calibration(rows, out / "calibration.png", title)
+    ideal = f"calibrated: {1 / (1 + run['samples']):.3g} of the truths below and above all samples, ratio 1"
+    energies = [
+        {"region": row["region"]} | {f"{count} samples": score for count, score in row["energy_by_samples"].items()}
+        for row in rows
+    ]
+    show(records_table(f"Novel views; {ideal}", rows), records_table("Fair energy score", energies))
+
+
 def _open(run: Run) -> tuple[SampleRenderer, list[SceneBatch], dict[str, float]]:
     """Return the renderer of a run's samples, its first test scenes, and the settings to write beside the results.
 
     Renderer and scenes are on a GPU if there is one.
     """
     quieten()
-    stage, data = Trained(run["ckpt"], run["overrides"], run["trust"]).open()
+    source = run["ckpt"], run["overrides"], run["trust"], run["weights"], run["data"], run["rasterizer"]
+    stage, data = Trained(*source, seed=run["seed"]).open()
     stage.to("cuda" if torch.cuda.is_available() else "cpu").eval()
     scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
     settings: dict[str, float] = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}

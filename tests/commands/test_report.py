@@ -40,6 +40,18 @@ def test_depth_is_measured_with_the_papers_settings_and_one_is_drawn(report, tmp
     assert "Deviation of depth" in message
 
 
+def test_calibration_of_weights_has_both_regions_and_their_figure(report, pipeline, tmp_path):
+    given = ["ckpt=null", f"weights={pipeline.weights}", "data=toy_objects", f"data.root={pipeline.toy}"]
+    message, results = report("calibration", *given, "samples=3")
+    assert results["settings"] == {"scenes": 1, "samples": 3, "seed": 0, "skip_weight": 1, "guidance_weight": 0}
+    assert [row["region"] for row in results["rows"]] == ["full", "hidden"]
+    assert all(row["spread"] > 0 and sum(row["ranks"]) == pytest.approx(1) for row in results["rows"])
+    assert all([*row["energy_by_samples"]] == ["2", "3"] for row in results["rows"])
+    assert imageio.imread(tmp_path / "out/calibration.png").ndim == 3
+    assert "0.25 of the truths below" in message
+    assert "Fair energy score" in message
+
+
 @pytest.mark.parametrize(
     ("task", "setting", "message"),
     [
