@@ -219,12 +219,9 @@ def proper_scores(
 def novel_values(
     images: Float[Tensor, "sample view 3 height width"], truth: Views
 ) -> dict[str, tuple[Float[Tensor, "sample value"], Float[Tensor, " value"]]]:
-    """Return the values of novel views by region: those of the samples, and the true ones.
+    """Return values of the samples and true values by region; `truth` has the reference and then the novel views.
 
     Regions are all pixels (`full`) and, if true depth is known, those whose surface the reference hides (`hidden`).
-
-    Args:
-        truth: all views, the reference first.
     """
     novel, counted = truth[1:], {"full": torch.ones_like(truth.masks[1:, 0], dtype=torch.bool)}
     if truth.depths is not None and truth.depths.shape[-2:] == images.shape[-2:]:
