@@ -5,8 +5,7 @@ square error of the samples' mean is (k + 1) / k times their variance (Fortin et
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.metrics.proper_scores import energy_score
-from completesplat.metrics.scoring import novel_values, proper_scores
+from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
+from completesplat.metrics.scoring import novel_values
 from completesplat.scene import SceneBatch
+from completesplat.studies.controls import Tick
 from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import SampleRenderer, mean_over_scenes
 
@@ -25,38 +25,37 @@ Truth = Float[Tensor, " value"]
 BINS = 10
 
 
-def rows(
-    renderer: SampleRenderer, scenes: Sequence[SceneBatch], tick: Callable[[str], None], **settings: float
-) -> list[dict[str, Any]]:
+def rows(renderer: SampleRenderer, scenes: Sequence[SceneBatch], tick: Tick, **settings: float) -> list[dict[str, Any]]:
     """Return a row for each region of novel views (`novel_values`), with means over the scenes.
 
-    `below_all` and `above_all` are the first and the last of `ranks`; `spread` and `error` are the roots of the mean
-    `squares`. `bins` has `BINS` pairs of them for as many values each, in the order of the samples' variance.
-
-    Args:
-        **settings: skip and guidance weight (`CompleteSplat.generate`).
+    `energy_N` is the energy score of N samples, `below_all` and `above_all` are the ends of the rank histogram `ranks`,
+    `spread` and `error` the roots of the mean `squares`. `bins` has `BINS` pairs of these, each of as many values, in
+    the order of the samples' variance. The settings are skip and guidance weight (`CompleteSplat.generate`).
     """
     measured = defaultdict[str, list[Any]](list)
     for index, scene in enumerate(scenes):
         tick(scene.names[0])
-        renderer_of_scene = replace(renderer, seed=renderer.seed + index)  # chance differs from scene to scene
-        images, truth = renderer_of_scene(scene, **settings)[:, 1:], scene.all_views()[0]
-        proper, ranks = proper_scores(images, truth)
-        for region, (samples, true) in novel_values(images, truth).items():
-            both = {name: proper[region, "novel", name] for name in ("energy", "crps")}
-            by_rank = {str(rank): share for rank, share in enumerate(ranks[region])}
+        images = renderer(scene, seed=renderer.seed + index, **settings)[:, 1:]  # else all scenes share their noise
+        for region, (samples, true) in novel_values(images, scene.all_views()[0]).items():
+            figures = energies(samples, true) | {"crps": crps(samples, true)}
             means = torch.stack(squares(samples, true)).double().mean(1)
-            measured[region].append((both, by_rank, energy_by_samples(samples, true), means, halves(samples, true)))
+            measured[region].append((figures, rank_histogram(samples, true), means, halves(samples, true)))
     results = []
     for region, of_scenes in measured.items():
-        scores, shares, energies = (mean_over_scenes([scene[i] for scene in of_scenes]) for i in range(3))
-        spread, error = torch.stack([scene[3] for scene in of_scenes]).mean(0).sqrt().tolist()
-        ends = {"below_all": shares["0"], "above_all": [*shares.values()][-1]}
-        ratio = {"spread": spread, "error": error, "spread_over_error": spread / error if error else None}
-        row = {"region": region, "scenes": len(of_scenes), **scores, **ends, **ratio, "ranks": [*shares.values()]}
-        bins = binned(*torch.cat([scene[4] for scene in of_scenes], 1))
-        results.append(row | {"energy_by_samples": energies, "bins": bins})
+        figures_of_scenes, *others = zip(*of_scenes, strict=True)
+        ranks, (spread, error) = (torch.stack(each).mean(0).tolist() for each in others[:2])
+        row = {"region": region, "scenes": len(of_scenes), **mean_over_scenes(figures_of_scenes)}
+        row |= {"below_all": ranks[0], "above_all": ranks[-1], "spread": spread**0.5, "error": error**0.5}
+        row |= {"spread_over_error": (spread / error) ** 0.5 if error else None}
+        results.append(row | {"ranks": ranks, "bins": binned(*torch.cat(others[2], 1))})
     return results
+
+
+def energies(samples: Samples, truth: Truth) -> dict[str, float]:
+    """Return the fair energy score of 2, 4, 8, ... and of all samples, each the mean over groups of so many."""
+    counts = {2**power: 1 for power in range(1, len(samples).bit_length())} | {len(samples): 1}
+    groups = {n: samples[: len(samples) // n * n].view(-1, n, len(truth)) for n in counts}
+    return {f"energy_{n}": sum(energy_score(part, truth) for part in parts) / len(parts) for n, parts in groups.items()}
 
 
 def squares(samples: Samples, truth: Truth) -> tuple[Truth, Truth]:
@@ -67,24 +66,17 @@ def squares(samples: Samples, truth: Truth) -> tuple[Truth, Truth]:
 def halves(samples: Samples, truth: Truth) -> Float[Tensor, "3 value"]:
     """Return the variance of the first half of the samples, and the `squares` of the others.
 
-    The order of the first says nothing about chance in the others. Values in bins of one variance would be chosen by
-    chance: calibrated samples would seem to differ too little in the lowest bin. Below four samples the halves overlap.
+    If bins by a variance had the same variance as their spread, chance would choose it: calibrated samples would seem
+    to differ too little in the lowest bin. With fewer than four samples the halves overlap.
     """
     half = len(samples) // 2
     return torch.stack([samples[: max(half, 2)].var(0), *squares(samples[min(half, len(samples) - 2) :], truth)])
 
 
-def binned(order: Truth, spreads: Truth, errors: Truth) -> list[tuple[float, float]]:
+def binned(order: Truth, spreads: Truth, errors: Truth) -> list[list[float]]:
     """Return the roots of mean spread and error, of `BINS` bins with as many values each, from the lowest order."""
     values = torch.stack([spreads, errors])[:, order.argsort(stable=True)].double()
-    return [tuple(part.mean(1).sqrt().tolist()) for part in values.tensor_split(min(BINS, len(order)), 1)]
-
-
-def energy_by_samples(samples: Samples, truth: Truth) -> dict[str, float]:
-    """Return the fair energy score of 2, 4, 8, ... and of all samples, each the mean over groups of so many."""
-    counts = {2**power: 1 for power in range(1, len(samples).bit_length())} | {len(samples): 1}
-    groups = {n: samples[: len(samples) // n * n].view(-1, n, len(truth)) for n in counts}
-    return {str(n): sum(energy_score(part, truth) for part in parts) / len(parts) for n, parts in groups.items()}
+    return [part.mean(1).sqrt().tolist() for part in values.tensor_split(min(BINS, len(order)), 1)]
 
 
 def plot_calibration(rows: Sequence[dict[str, Any]], path: Path, title: str) -> None:
@@ -98,8 +90,8 @@ def plot_calibration(rows: Sequence[dict[str, Any]], path: Path, title: str) -> 
             bins.plot([0, end], [0, end], color="crimson", label="calibrated")
             bins.plot(*zip(*row["bins"], strict=True), "o-", label="as many values each")
             bins.set(title=f"{name}: spread and error", xlabel="standard deviation of samples", ylabel="error of mean")
-            scores = row["energy_by_samples"]
-            energy.plot([*map(int, scores)], [*scores.values()], "o-", label="fair: flat but for chance")
+            scores = {int(key[7:]): score for key, score in row.items() if key.startswith("energy_")}
+            energy.plot([*scores], [*scores.values()], "o-", label="fair: flat but for chance")
             energy.set(title=f"{name}: energy score", xlabel="number of samples", ylim=(0, 1.3 * max(scores.values())))
             for panel in (ranks, bins, energy):
                 panel.legend()

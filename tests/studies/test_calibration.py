@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.metrics.proper_scores import energy_score
 from completesplat.scene import SceneBatch, Views
-from completesplat.studies.calibration import energy_by_samples, plot_calibration, rows
+from completesplat.studies.calibration import energies, plot_calibration, rows
 from completesplat.studies.samples import SampleRenderer
 
 SIZE, SAMPLES = 32, 8
@@ -36,8 +37,8 @@ class Normal(SampleRenderer):
 
     scale: float = 1.0
 
-    def __call__(self, scene: SceneBatch, **_) -> torch.Tensor:
-        return self.scale * drawn(self.samples, 4, 3, SIZE, SIZE, seed=1000 + self.seed)
+    def __call__(self, scene: SceneBatch, seed: int) -> torch.Tensor:
+        return self.scale * drawn(self.samples, 4, 3, SIZE, SIZE, seed=1000 + seed)
 
 
 def measured(scale: float, samples: int = SAMPLES):
@@ -72,14 +73,11 @@ def test_samples_of_half_the_spread_are_too_sure():
 
 def test_the_energy_score_is_that_of_groups_and_flat():
     truth, samples = drawn(3000, seed=0), drawn(6, 3000, seed=1)
-    scores = energy_by_samples(samples, truth)
-    assert list(scores) == ["2", "4", "6"]
+    scores = energies(samples, truth)
+    assert list(scores) == ["energy_2", "energy_4", "energy_6"]
     # Distances are sqrt(2) per value: for any number of samples sqrt(2) - sqrt(2) / 2.
     assert list(scores.values()) == pytest.approx([math.sqrt(0.5)] * 3, abs=0.03)
-    assert energy_by_samples(samples[:4], truth)["4"] == scores["4"]
-    for row in measured(1):
-        assert list(row["energy_by_samples"]) == ["2", "4", "8"]
-        assert row["energy_by_samples"]["8"] == pytest.approx(row["energy"])
+    assert energies(samples[:4], truth)["energy_4"] == scores["energy_4"] == energy_score(samples[:4], truth)
 
 
 def test_samples_without_spread_or_error_have_a_figure(tmp_path):
