@@ -7,7 +7,7 @@ Each study raises the errors of `Trained.open`, `diffusion_of`, `first_scenes` a
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, TypedDict, Unpack
+from typing import Annotated, Unpack
 
 import torch
 from rich.console import Console
@@ -18,6 +18,7 @@ from completesplat.commands.trained import Trained, diffusion_of
 from completesplat.export.images import image_sheet, write_png
 from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
+from completesplat.settings.checks import Test
 from completesplat.settings.schema import Entries, Positive, Range, Share
 from completesplat.studies import calibration as calibration_study
 from completesplat.studies import controls as controls_study
@@ -29,10 +30,11 @@ from completesplat.studies.samples import SampleRenderer, first_scenes
 Weights = Annotated[Sequence[Share], Entries(1)]
 
 
-class Run(TypedDict):
+class Run(Test):
     """Arguments of `Trained`, how many of its first test scenes are used, and how many samples each scene gets."""
 
-    trained: Mapping[str, Any]
+    data: Mapping[str, object] | None
+    rasterizer: Mapping[str, object]
     scenes: Positive
     samples: Annotated[int, Range(2)]
 
@@ -105,16 +107,13 @@ def front(out: Path, **run: Unpack[Run]) -> None:
 
 @contextmanager
 def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], dict[str, float], Tick]]:
-    """Yield a renderer of samples, the first test scenes, settings to write with the results, and a status.
-
-    Renderer and scenes are on a GPU if there is one.
-    """
+    """Yield renderer and first test scenes (on a GPU if there is one), settings to write with results, and a status."""
     quieten()
-    trained = Trained(**run["trained"])
-    stage, data = trained.open()
+    source = run["ckpt"], run["overrides"], run["trust"], run["weights"], run["data"], run["rasterizer"]
+    stage, data = Trained(*source, seed=run["seed"]).open()
     stage.to("cuda" if torch.cuda.is_available() else "cpu").eval()
     scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
-    settings: dict[str, float] = {"scenes": run["scenes"], "samples": run["samples"], "seed": trained.seed}
-    renderer = SampleRenderer(diffusion_of(stage), stage.rasterizer, stage.background, run["samples"], trained.seed)
+    settings: dict[str, float] = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
+    renderer = SampleRenderer(diffusion_of(stage), stage.rasterizer, stage.background, run["samples"], run["seed"])
     with Console(stderr=True).status("drawing") as status:
         yield renderer, scenes, settings, lambda text: status.update(f"drawing: {text}")

@@ -103,7 +103,7 @@ class RunSettings(TypedDict):
 
 
 class Test(RunSettings):
-    """Settings of `completesplat test`, and of `report` where it has them."""
+    """Settings of `completesplat test`, and of studies of samples."""
 
     ckpt: str | None
     weights: str | None
@@ -111,7 +111,7 @@ class Test(RunSettings):
     trust: bool
 
 
-VERBS: dict[str, type] = {"fit": Fit, "plan": Plan, "predict": Predict, "view": View, "test": Test, "report": Test}
+VERBS: dict[str, type] = {"fit": Fit, "plan": Plan, "predict": Predict, "view": View, "test": Test}
 
 
 def check_verb(verb: str, config: DictConfig) -> None:
