@@ -66,8 +66,8 @@ def squares(samples: Samples, truth: Truth) -> tuple[Truth, Truth]:
 def halves(samples: Samples, truth: Truth) -> Float[Tensor, "3 value"]:
     """Return the variance of the first half of the samples, and the `squares` of the others.
 
-    If bins by a variance had the same variance as their spread, chance would choose it: calibrated samples would seem
-    to differ too little in the lowest bin. With fewer than four samples the halves overlap.
+    If one variance chose the bins and was their spread too, the lowest bin would have values whose variance is small by
+    chance, and calibrated samples would seem too sure there. With fewer than four samples the halves overlap.
     """
     half = len(samples) // 2
     return torch.stack([samples[: max(half, 2)].var(0), *squares(samples[min(half, len(samples) - 2) :], truth)])
