@@ -4,10 +4,10 @@ Each study raises the errors of `Trained.open`, `diffusion_of`, `first_scenes` a
 `completesplat.studies`.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, TypedDict, Unpack
+from typing import Annotated, Unpack
 
 import torch
 from rich.console import Console
@@ -15,43 +15,39 @@ from rich.console import Console
 from completesplat.commands import quieten
 from completesplat.commands.protocol import write_json
 from completesplat.commands.trained import Trained, diffusion_of
-from completesplat.export.images import SheetCell, image_sheet, write_png
+from completesplat.export.images import image_sheet, write_png
 from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
+from completesplat.settings.checks import Test
 from completesplat.settings.schema import Entries, Positive, Range, Share
+from completesplat.studies import calibration as calibration_study
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
+from completesplat.studies import front as front_study
+from completesplat.studies.controls import Tick
 from completesplat.studies.samples import SampleRenderer, first_scenes
 
 Weights = Annotated[Sequence[Share], Entries(1)]
 
 
-class Run(TypedDict):
-    """Run of stage 2 (`Trained`), how many of its first test scenes are used, and how many samples each scene gets."""
+class Run(Test):
+    """Arguments of `Trained`, how many of its first test scenes are used, and how many samples each scene gets."""
 
-    ckpt: str
-    overrides: Sequence[str]
-    trust: bool
+    data: Mapping[str, object] | None
+    rasterizer: Mapping[str, object]
     scenes: Positive
-    seed: int
     samples: Annotated[int, Range(2)]
 
 
 def controls(
-    skip_weights: Weights,
-    guidance_weights: Weights,
-    near_degrees: float,
-    shown: int,
-    out: Path,
-    **run: Unpack[Run],
+    skip_weights: Weights, guidance_weights: Weights, near_degrees: float, shown: int, out: Path, **run: Unpack[Run]
 ) -> None:
     """Write `controls.json`, `controls.png` and `controls_grid.png`, and print the table.
 
     All pairs of the weights and the paper's three are measured; `conf/report_task/controls.yaml` explains the settings.
     """
     weights = controls_study.grid(skip_weights, guidance_weights)
-    renderer, scenes, settings = _open(run)
-    with _status() as tick:
+    with _opened(run) as (renderer, scenes, settings, tick):
         rows = controls_study.rows(renderer, weights, scenes, near_degrees, tick)
         tick("the grid")
         grid = controls_study.strips(renderer, weights, scenes[0], shown)
@@ -59,7 +55,7 @@ def controls(
     title = f"Controls: {len(scenes)} scenes, {run['samples']} samples each; (skip, guidance) of the paper in red"
     controls_study.plot_controls(rows, out / "controls.png", title)
     title = f"{scenes[0].names[0]}: reference view of one sample, far view of {min(shown, run['samples'])}"
-    _write_sheet(grid, out / "controls_grid.png", title)
+    write_png(out / "controls_grid.png", image_sheet(None, grid, title))
     show(records_table("Faithfulness (PSNR, dB) and diversity", rows))
 
 
@@ -74,37 +70,50 @@ def depth(
 ) -> None:
     """Write `depth.json` and `depth.png`, and print the table; `conf/report_task/depth.yaml` explains the settings."""
     weights = controls_study.grid([skip_weight], [guidance_weight])
-    renderer, scenes, settings = _open(run)
-    with _status() as tick:
+    with _opened(run) as (renderer, scenes, settings, tick):
         rows = depth_study.rows(renderer, weights, scenes, far_degrees, tick)
         tick("the figure")
         sheet = depth_study.strips(renderer, scenes[:shown_scenes], skip_weight, guidance_weight, shown)
     write_json(out / "depth.json", {"settings": settings | {"far_degrees": far_degrees}, "rows": rows})
     title = f"Render, depth and normals in a far view, and deviation of {run['samples']} samples' depth"
     title += f" in the reference and the far view; skip {skip_weight:g}, guidance {guidance_weight:g}"
-    _write_sheet(sheet, out / "depth.png", title)
+    write_png(out / "depth.png", image_sheet(None, sheet, title))
     show(records_table("Deviation of depth over samples, scene units", rows))
 
 
-def _open(run: Run) -> tuple[SampleRenderer, list[SceneBatch], dict[str, float]]:
-    """Return the renderer of a run's samples, its first test scenes, and the settings to write beside the results.
+def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Unpack[Run]) -> None:
+    """Write `calibration.json` and `calibration.png`, and print the table; the settings are those of `generate`."""
+    weights = {"skip_weight": skip_weight, "guidance_weight": guidance_weight}
+    with _opened(run) as (renderer, scenes, settings, tick):
+        rows = calibration_study.rows(renderer, scenes, tick, **weights)
+    write_json(out / "calibration.json", {"settings": settings | weights, "rows": rows})
+    title = (
+        f"{run['samples']} samples of each of {len(scenes)} scenes; skip {skip_weight:g}, guidance {guidance_weight:g}"
+    )
+    calibration_study.plot_calibration(rows, out / "calibration.png", title)
+    ideal = f"calibrated: {1 / (1 + run['samples']):.3g} of the truths below and above all samples, ratio 1"
+    show(records_table(f"Novel views; {ideal}", rows))
 
-    Renderer and scenes are on a GPU if there is one.
-    """
-    quieten()
-    stage, data = Trained(run["ckpt"], run["overrides"], run["trust"]).open()
-    stage.to("cuda" if torch.cuda.is_available() else "cpu").eval()
-    scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
-    settings: dict[str, float] = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
-    model = diffusion_of(stage)
-    return SampleRenderer(model, stage.rasterizer, stage.background, run["samples"], run["seed"]), scenes, settings
 
-
-def _write_sheet(rows: Sequence[Sequence[SheetCell | None]], path: Path, title: str) -> None:
-    write_png(path, image_sheet([""] * max(map(len, rows)), rows, title))
+def front(out: Path, **run: Unpack[Run]) -> None:
+    """Write `front.json` and `front.png`, and print the table; `completesplat.studies.front` explains the rungs."""
+    with _opened(run) as (renderer, scenes, settings, tick):
+        rows, sheet = front_study.rows(renderer, scenes, tick)
+    write_json(out / "front.json", {"settings": settings, "rows": rows})
+    title = f"{scenes[0].names[0]}: two samples and {front_study.AMPLIFIED} times their difference, from the front"
+    write_png(out / "front.png", image_sheet(None, sheet, f"{title}; then in the farthest view"))
+    show(records_table("Reference view: PSNR, dB; mean absolute difference of two samples, in 1/255", rows))
 
 
 @contextmanager
-def _status() -> Iterator[Callable[[str], None]]:
+def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], dict[str, float], Tick]]:
+    """Yield renderer and first test scenes (on a GPU if there is one), settings to write with results, and a status."""
+    quieten()
+    source = run["ckpt"], run["overrides"], run["trust"], run["weights"], run["data"], run["rasterizer"]
+    stage, data = Trained(*source, seed=run["seed"]).open()
+    stage.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
+    settings: dict[str, float] = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
+    renderer = SampleRenderer(diffusion_of(stage), stage.rasterizer, stage.background, run["samples"], run["seed"])
     with Console(stderr=True).status("drawing") as status:
-        yield lambda text: status.update(f"drawing: {text}")
+        yield renderer, scenes, settings, lambda text: status.update(f"drawing: {text}")

@@ -79,14 +79,16 @@ def strip(images: Float[Tensor, "_ 3 height width"], label: str = "", width: int
 
 
 def image_sheet(
-    headings: Sequence[str], rows: Sequence[Sequence[SheetCell | None]], title: str | None = None
+    headings: Sequence[str] | None, rows: Sequence[Sequence[SheetCell | None]], title: str | None = None
 ) -> Image.Image:
     """Return images in rows and columns, each enlarged by a whole factor to about 144 px, with its label above it.
 
     Args:
+        headings: of the columns; None: no headings.
         rows: at least one, none longer than `headings`; None leaves a cell empty. All images have the same size.
         title: the first line; None leaves no space for it.
     """
+    headings = [""] * max(map(len, rows)) if headings is None else headings
     first = next(cell.image for row in rows for cell in row if cell is not None)
     factor = max(1, round(READABLE_SIDE / max(first.shape[-2:])))
     height, width = (side * factor for side in first.shape[-2:])

@@ -113,14 +113,14 @@ def pinhole(fov_degrees: float, size: int) -> Float[Tensor, "3 3"]:
     return torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
 
 
-def nearest_to_axes(cameras: Cameras) -> Float[Tensor, "3"] | None:
-    """Return the point (float64) with the least squared distances to all optical axes; None if they are parallel."""
+def nearest_to_axes(cameras: Cameras, least_spread: float = PARALLEL) -> Float[Tensor, "3"] | None:
+    """Return the point (float64) with the least squared distances to all optical axes; None if they hardly spread."""
     axes, centers = cameras.camera_to_world[:, :3, 2].double(), cameras.centers.double()
     across = torch.eye(3, dtype=axes.dtype, device=axes.device) - axes[:, :, None] * axes[:, None]
-    total = across.sum(0)
-    if torch.linalg.eigvalsh(total)[0] < PARALLEL * len(axes):
+    mean = across.mean(0)
+    if torch.linalg.eigvalsh(mean)[0] < least_spread:
         return None
-    point: Tensor = torch.linalg.solve(total, (across @ centers[..., None]).sum(0))[:, 0]
+    point: Tensor = torch.linalg.solve(mean, (across @ centers[..., None]).mean(0))[:, 0]
     return point
 
 

@@ -1,7 +1,6 @@
 """Mode coverage of samples, for scenes in which every possible mode is known."""
 
-from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int64
@@ -15,7 +14,7 @@ REJECTED = -1
 
 @dataclass(frozen=True)
 class HiddenModeScores:
-    """Scores of one scene's samples, or their means over scenes.
+    """Scores of one scene's samples.
 
     `coverage`: share of the modes (of positive probability) that at least one sample belongs to. `total_variation`:
     half the sum of absolute differences between the samples' shares and the modes' probabilities. Rejected samples are
@@ -63,12 +62,6 @@ def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> Hidd
         sharpness=(distances(samples, modes).min(dim=1).values.mean() / from_mean).item(),
         rejected=rejected.item(),
     )
-
-
-def mean_scores(of_scenes: Sequence[HiddenModeScores]) -> HiddenModeScores:
-    """Average the scores of at least one scene; every scene has the same weight."""
-    means = (sum(values) / len(of_scenes) for values in zip(*map(astuple, of_scenes), strict=True))
-    return HiddenModeScores(*means)
 
 
 def draw_modes(

@@ -206,26 +206,29 @@ def noisy_mean(
 def proper_scores(
     images: Float[Tensor, "sample view 3 height width"], truth: Views
 ) -> tuple[Scores, dict[str, list[float]]]:
-    """Return `energy` and `crps` of the novel views, and their rank histograms by region.
+    """Return `energy` and `crps` of the novel views, and their rank histograms, by the regions of `novel_values`."""
+    scores: Scores = {}
+    ranks = {}
+    for region, (drawn, true) in novel_values(images, truth).items():
+        scores[region, "novel", "energy"] = energy_score(drawn, true)
+        scores[region, "novel", "crps"] = crps(drawn, true)
+        ranks[region] = rank_histogram(drawn, true).tolist()
+    return scores, ranks
+
+
+def novel_values(
+    images: Float[Tensor, "sample view 3 height width"], truth: Views
+) -> dict[str, tuple[Float[Tensor, "sample value"], Float[Tensor, " value"]]]:
+    """Return values of the samples and true values by region; `truth` has the reference and then the novel views.
 
     Regions are all pixels (`full`) and, if true depth is known, those whose surface the reference hides (`hidden`).
-
-    Args:
-        truth: all views, the reference first.
     """
     novel, counted = truth[1:], {"full": torch.ones_like(truth.masks[1:, 0], dtype=torch.bool)}
     if truth.depths is not None and truth.depths.shape[-2:] == images.shape[-2:]:
         hidden, _ = hidden_from(truth.cameras[0], truth.depths[0], novel.cameras, truth.depths[1:])
         counted |= {"hidden": hidden} if hidden.any() else {}
-    scores: Scores = {}
-    ranks = {}
-    for region, pixels in counted.items():
-        drawn = images.movedim(2, -1)[:, pixels].flatten(1).float()
-        true = novel.images.movedim(1, -1)[pixels].flatten().float()
-        scores[region, "novel", "energy"] = energy_score(drawn, true)
-        scores[region, "novel", "crps"] = crps(drawn, true)
-        ranks[region] = rank_histogram(drawn, true).tolist()
-    return scores, ranks
+    values = images.movedim(2, -1).float(), novel.images.movedim(1, -1).float()
+    return {name: (values[0][:, pixels].flatten(1), values[1][pixels].flatten()) for name, pixels in counted.items()}
 
 
 def _region(images: Tensor, truth: Views, region: str) -> Tensor:

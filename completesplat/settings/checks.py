@@ -103,7 +103,7 @@ class RunSettings(TypedDict):
 
 
 class Test(RunSettings):
-    """Settings of `completesplat test`."""
+    """Settings of `completesplat test`, and of studies of samples."""
 
     ckpt: str | None
     weights: str | None

@@ -20,7 +20,7 @@ from completesplat.data.loading.training_statistics import world_up
 from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.errors import DataError
 from completesplat.export.images import INK, MARGIN, PAPER, SheetCell, image_sheet, write_png
-from completesplat.geometry.cameras import Cameras, project, transform_points, unproject
+from completesplat.geometry.cameras import Cameras, nearest_to_axes, project, transform_points, unproject
 
 CELL = 216
 GREY, MASK = (190, 190, 190), (255, 220, 0)
@@ -95,15 +95,12 @@ def visible_segments(
 
 def _common_point(cameras: Cameras) -> Float[Tensor, "3"] | None:
     """Return the point nearest to all optical axes, or None if they miss it, face away or are almost parallel."""
-    forward, centers = cameras.world_to_camera[:, 2, :3], cameras.centers
-    across = torch.eye(3).to(forward) - forward[:, :, None] * forward[:, None, :]
-    mean = across.mean(dim=0)
-    if torch.linalg.eigvalsh(mean)[0] < LEAST_SPREAD**2:
+    point = nearest_to_axes(cameras, LEAST_SPREAD**2)
+    if point is None:
         return None
-    point = torch.linalg.solve(mean, (across @ centers[:, :, None]).mean(dim=0)[:, 0])
-    offsets = point - centers
-    depths = (offsets * forward).sum(dim=-1)
-    misses = (across @ offsets[:, :, None]).square().sum(dim=(1, 2))
+    forward, point = cameras.world_to_camera[:, 2, :3], point.to(cameras.centers)
+    depths = ((point - cameras.centers) * forward).sum(dim=-1)
+    misses = (point - cameras.centers - depths[:, None] * forward).square().sum(dim=-1)
     met = (depths > 0).all() and misses.mean().sqrt() < LARGEST_MISS * depths.mean()
     return point if met else None
 

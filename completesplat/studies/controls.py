@@ -68,7 +68,7 @@ def strips(
 
     The far view is the target whose direction differs most from the reference's. The first row is the truth.
     """
-    far = 1 + farthest(scene.reference.cameras[0], scene.targets.cameras[0])
+    far = farthest(scene)
     skips, weights = (sorted(set(values)) for values in zip(*settings, strict=True))
     rows = [strip(scene.all_views().images[0, [0, far]], "truth: reference, far")]
     for skip in skips[::-1]:

@@ -84,7 +84,7 @@ def strips(
     rows = []
     for scene in scenes:
         rendering = renderer.render(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
-        far, true = 1 + farthest(scene.reference.cameras[0], scene.targets.cameras[0]), scene.all_views()
+        far, true = farthest(scene), scene.all_views()
         depth, images = surface_depth(rendering), renderer.over_background(rendering)[:, far]
         depths, (nearest, deepest) = color_depth(depth[:shown, far])
         normals = color_normals(normals_from_depth(depth[:shown, far], true.cameras[0, far]))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -11,20 +12,16 @@ from torch import Tensor
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
+from completesplat.diffusion.sampling import in_parts
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.export.images import SheetCell, image_sheet, write_png
 from completesplat.gaussians import Gaussians
-from completesplat.metrics.mode_coverage import (
-    REJECTED,
-    HiddenModeScores,
-    classify,
-    draw_modes,
-    mean_of,
-    mean_scores,
-    scores,
-)
+from completesplat.metrics.mode_coverage import REJECTED, classify, draw_modes, mean_of, scores
 from completesplat.metrics.proper_scores import energy_score
 from completesplat.scene import SceneBatch
+from completesplat.splatter_image import SplatterImage
+from completesplat.studies.samples import mean_over_scenes
+from completesplat.tensors import concatenate
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.stage import Stage
 
@@ -32,77 +29,83 @@ Renders = Float[Tensor, "sample view 3 height width"]
 Predictor = Callable[[SceneBatch, SceneBatch, int], Renders]
 """Function from a scene, another scene (batches of one) and a seed to renders of all targets in [0, 1]."""
 
+Rung = Callable[[SceneBatch, SceneBatch, int], Gaussians]
+"""Function of the same arguments to Gaussians [sample], or [1] if nothing is drawn."""
 
-def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
-    """Return `model` as it is tested, and simpler predictors, which show where modes are lost.
 
-    A variational autoreconstructor adds `posterior_mean`; `posterior_samples`, with latents drawn from the posterior of
-    a scene; and `other_scene`, with latents of another scene but the image and the skips of this one. A posterior that
-    sees views takes all targets, so it knows the true mode; `reference_only` is its mean without them. If the
-    posterior's samples show the modes and the model's do not, stage 2 is at fault; if neither do, stage 1 is. A
-    deterministic model returns `samples` equal renders. Samples are computed and rendered `batch` at a time.
+def rungs(model: VariationalAutoReconstructor, samples: int, batch: int, masked: bool = False) -> dict[str, Rung]:
+    """Return functions that decode different latents with the skips of the scene's image, by name.
+
+    `posterior_mean` and `posterior_samples` take latents from the scene's posterior, `other_scene` from another
+    scene's. A posterior that sees views takes all targets; `reference_only` is its mean without them.
+
+    Args:
+        batch: number of latents that are decoded at a time.
+        masked: whether the model sees only the visible part of the reference image.
     """
 
+<<<<<<< HEAD
     def model(scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
         sets = module.draw(scene, [seed], samples, batch)
         images = torch.cat([_render(module, sets[i : i + batch], scene) for i in range(0, len(sets.means), batch)])
         return images.expand(samples, *images.shape[1:])
+=======
+    def seen(scene: SceneBatch) -> Float[Tensor, "1 3 _ _"]:
+        return scene.reference.images * scene.visible if masked else scene.reference.images
+>>>>>>> wt-calib
 
-    frozen = module.completesplat.autoreconstructor if isinstance(module, LatentDiffusion) else None
-    network = frozen or getattr(module, "model", None)
-    if not isinstance(network, VariationalAutoReconstructor):
-        return {"model": model}
-    ladder = _Ladder(module, network, samples, batch)
-    methods: dict[str, Predictor] = {
-        "model": model,
-        "posterior_mean": lambda scene, other, seed: ladder.mean(scene, network.sees_views),
-        "posterior_samples": lambda scene, other, seed: ladder.drawn(scene, scene, seed),
-        "other_scene": lambda scene, other, seed: ladder.drawn(scene, other, seed),
+    def posterior(scene: SceneBatch, with_views: bool = model.sees_views) -> Posterior:
+        return model.posterior(seen(scene), scene.all_views() if with_views else None, scene.depth_range)[0]
+
+    def decoded(latents: Float[Tensor, "sample channel _ _"], scene: SceneBatch) -> Gaussians:
+        features = model.encoder.features(seen(scene) * 2 - 1, model.reconstructor.feature_levels)
+
+        def decode(part: slice) -> Gaussians:
+            count = len(latents[part])
+            skips = [feature.expand(count, -1, -1, -1) for feature in features]
+            cameras = scene.reference.cameras.map(lambda tensor: tensor.expand(count, -1, -1))
+            splatter_image: SplatterImage = model.reconstructor(latents[part], skips)
+            return splatter_image.gaussians(cameras, scene.depth_range.expand(count, -1))
+
+        return concatenate(in_parts(decode, len(latents), batch))
+
+    def drawn(scene: SceneBatch, encoded: SceneBatch, seed: int) -> Gaussians:
+        q = posterior(encoded)
+        # On the CPU, so that a seed means the same on every device.
+        noise = torch.randn(samples, *q.mean.shape[1:], generator=torch.Generator().manual_seed(seed))
+        return decoded(q.mean + noise.to(q.mean) * q.std, scene)
+
+    methods: dict[str, Rung] = {
+        "posterior_mean": lambda scene, other, seed: decoded(posterior(scene).mean, scene),
+        "posterior_samples": lambda scene, other, seed: drawn(scene, scene, seed),
+        "other_scene": lambda scene, other, seed: drawn(scene, other, seed),
     }
-    if network.sees_views:
-        methods["reference_only"] = lambda scene, other, seed: ladder.mean(scene, False)
+    if model.sees_views:
+        methods["reference_only"] = lambda scene, other, seed: decoded(posterior(scene, False).mean, scene)
     return methods
 
 
-@dataclass(frozen=True)
-class _Ladder:
-    """Predictors that render an autoreconstructor's output for different latents."""
+def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
+    """Return `model` as it is tested, and the `rungs` of its autoreconstructor, which show where modes are lost.
 
-    module: Stage
-    model: VariationalAutoReconstructor
-    samples: int
-    batch: int
+    A posterior that sees views knows the true mode. If the posterior's samples show the modes and the model's do not,
+    stage 2 is at fault; if neither do, stage 1 is. A deterministic method returns `samples` equal renders. Samples are
+    computed and rendered `batch` at a time.
+    """
+    drawn = {"samples": samples, "batch": batch} if isinstance(module, LatentDiffusion) else {}
+    methods: dict[str, Rung] = {"model": lambda scene, other, seed: module.reconstruct(scene, seed=seed, **drawn)}
+    frozen = module.completesplat.autoreconstructor if isinstance(module, LatentDiffusion) else None
+    network = frozen or getattr(module, "model", None)
+    if isinstance(network, VariationalAutoReconstructor):
+        methods |= rungs(network, samples, batch, getattr(module, "masked", False))
 
-    def mean(self, scene: SceneBatch, with_views: bool) -> Renders:
-        image = self._rendered(self._posterior(scene, with_views).mean, scene)
-        return image.expand(self.samples, *image.shape[1:])
+    def rendered(method: Rung, scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
+        gaussians, cameras = method(scene, other, seed), scene.targets.cameras[0]
+        parts = [gaussians[i : i + batch] for i in range(0, len(gaussians.means), batch)]
+        renders = torch.cat([module.render_from(part, cameras).over(module.background) for part in parts])
+        return renders.clamp(0, 1).expand(samples, -1, -1, -1, -1)
 
-    def drawn(self, scene: SceneBatch, encoded: SceneBatch, seed: int) -> Renders:
-        posterior = self._posterior(encoded, self.model.sees_views)
-        # On the CPU, so that a seed means the same on every device.
-        noise = torch.randn(self.samples, *posterior.mean.shape[1:], generator=torch.Generator().manual_seed(seed))
-        latents = posterior.mean + noise.to(posterior.mean) * posterior.std
-        return torch.cat([self._rendered(part, scene) for part in torch.split(latents, self.batch)])
-
-    def _posterior(self, scene: SceneBatch, with_views: bool) -> Posterior:
-        views = scene.all_views() if with_views else None
-        return self.model.posterior(self._seen(scene), views, scene.depth_range)[0]
-
-    def _seen(self, scene: SceneBatch) -> Float[Tensor, "1 3 _ _"]:
-        masked = getattr(self.module, "masked", False)
-        return scene.reference.images * scene.visible if masked else scene.reference.images
-
-    def _rendered(self, latents: Float[Tensor, "sample channel _ _"], scene: SceneBatch) -> Renders:
-        count = len(latents)
-        features = self.model.encoder.features(self._seen(scene) * 2 - 1, self.model.reconstructor.feature_levels)
-        splatter_image = self.model.reconstructor(latents, [feature.expand(count, -1, -1, -1) for feature in features])
-        cameras = scene.reference.cameras.map(lambda tensor: tensor.expand(count, -1, -1))
-        return _render(self.module, splatter_image.gaussians(cameras, scene.depth_range.expand(count, -1)), scene)
-
-
-def _render(module: Stage, gaussians: Gaussians, scene: SceneBatch) -> Renders:
-    images: Renders = module.render_from(gaussians, scene.targets.cameras[0]).over(module.background).clamp(0, 1)
-    return images
+    return {name: partial(rendered, method) for name, method in methods.items()}
 
 
 REGIONS = ("hidden", "visible")
@@ -110,14 +113,13 @@ REGIONS = ("hidden", "visible")
 
 @dataclass
 class Measured:
-    """Measurements so far: scores by method and scene.
+    """Measurements so far, by method: each scene's `HiddenModeScores` and energy scores in views that show the modes.
 
-    `energies` are the energy scores in views that show the modes, of the pixels that the reference hides and of the
-    others; `classes` are those of all samples, by method and the modes' probabilities; `rows` are those of the figure.
+    Energy scores are of pixels that the reference hides and of the others. `classes` are those of all samples, by
+    method and the modes' probabilities; `rows` are those of the figure.
     """
 
-    scores: dict[str, list[HiddenModeScores]] = field(default_factory=dict)
-    energies: dict[str, dict[str, list[float]]] = field(default_factory=dict)
+    scores: dict[str, list[dict[str, float | None]]] = field(default_factory=dict)
     classes: dict[str, dict[tuple[float, ...], list[Tensor]]] = field(default_factory=dict)
     rows: list[list[SheetCell]] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
@@ -125,15 +127,14 @@ class Measured:
     def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
         """Add the scores of renders of the views that show the modes."""
         pixels, modes = in_region(images, scene.region), in_region(scene.truths, scene.region)
-        self.scores.setdefault(method, []).append(scores(pixels, modes, scene.probabilities))
+        figures: dict[str, float | None] = asdict(scores(pixels, modes, scene.probabilities))
         alike = self.classes.setdefault(method, {}).setdefault(tuple(scene.probabilities.tolist()), [])
         alike.append(classify(pixels, modes, scene.probabilities))
         unseen, truth = scene.unseen[list(scene.views)], scene.truths[scene.true_mode]
-        energies = self.energies.setdefault(method, {name: [] for name in REGIONS})
         for name, region in zip(REGIONS, (unseen, ~unseen), strict=True):
-            if region.any():
-                true = in_region(truth[None], region)[0].flatten()
-                energies[name].append(energy_score(in_region(images, region).flatten(1), true))
+            drawn, true = in_region(images, region).flatten(1), in_region(truth[None], region)[0].flatten()
+            figures[f"energy_{name}"] = energy_score(drawn, true) if region.any() else None
+        self.scores.setdefault(method, []).append(figures)
 
     def show(self, images: Renders, scene: HiddenModes, count: int) -> None:
         """Keep the input, every mode, and some samples with their modes, in the view that shows the modes best."""
@@ -146,14 +147,10 @@ class Measured:
         self.rows.append(cells)
 
     def results(self, samples: int) -> dict[str, dict[str, float]]:
-        """Return means over the scenes by method."""
+        """Return means over the scenes by method; an energy score without pixels is 0."""
         counts = {"scenes": len(self.names), "samples": samples}
-        return {
-            method: asdict(mean_scores(scene_scores))
-            | {f"energy_{name}": sum(values) / max(1, len(values)) for name, values in self.energies[method].items()}
-            | counts
-            for method, scene_scores in self.scores.items()
-        }
+        means = {method: mean_over_scenes(of_scenes) for method, of_scenes in self.scores.items()}
+        return {method: {name: x or 0.0 for name, x in values.items()} | counts for method, values in means.items()}
 
     def shares(self) -> dict[str, list[dict[str, object]]]:
         """Return by method the modes' shares of samples, over all scenes whose modes have the same probabilities.
@@ -234,5 +231,4 @@ def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenMode
 def draw(measured: Measured, samples: int, path: Path) -> None:
     """Write a PNG with a row for each scene of `Measured.rows`."""
     title = f"Hidden modes: {len(measured.names)} scenes, {samples} samples each. Input; then from behind: every mode, "
-    headings = [""] * max(map(len, measured.rows))
-    write_png(path, image_sheet(headings, measured.rows, f"{title}samples with their modes"))
+    write_png(path, image_sheet(None, measured.rows, f"{title}samples with their modes"))

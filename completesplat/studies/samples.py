@@ -46,14 +46,14 @@ class SampleRenderer:
         return self.rasterize(self.generate(scene, **settings), scene)
 
     def generate(self, scene: SceneBatch, **settings: Any) -> Gaussians:
-        """Draw samples of one scene."""
+        """Draw samples of one scene; the settings may hold another `seed`."""
         inputs = scene.reference.images, scene.reference.cameras, scene.depth_range
-        return self.model.generate(*inputs, samples=self.samples, seed=self.seed, **settings)
+        return self.model.generate(*inputs, **{"samples": self.samples, "seed": self.seed, **settings})
 
     @torch.no_grad()
     def rasterize(self, gaussians: Gaussians, scene: SceneBatch) -> Rendering:
         """Render the samples of one scene in the reference view and all targets."""
-        cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(self.samples, *tensor.shape[1:]))
+        cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(len(gaussians.means), *tensor.shape[1:]))
         return self.rasterizer(gaussians, cameras)
 
 
@@ -74,10 +74,8 @@ def object_psnr(
 ) -> float | None:
     """Return the samples' PSNR (dB) over the true object's pixels of all views together; None without pixels."""
     inside = (masks > 0.5).expand_as(true)
-    if not inside.any():
-        return None
-    error = (images - true).square().mean(0)[inside].mean().item()
-    return min(-10 * math.log10(error), PSNR_LIMIT) if error > 0 else PSNR_LIMIT
+    error = (images - true).square().mean(0)[inside].mean().item()  # NaN without pixels
+    return -10 * math.log10(max(error, 10 ** (-PSNR_LIMIT / 10))) if inside.any() else None
 
 
 def near(reference: Cameras, targets: Cameras, degrees: float) -> Bool[Tensor, " view"]:
@@ -85,9 +83,9 @@ def near(reference: Cameras, targets: Cameras, degrees: float) -> Bool[Tensor, "
     return _cosines(reference, targets) >= math.cos(math.radians(degrees))
 
 
-def farthest(reference: Cameras, targets: Cameras) -> int:
-    """Return the index of the target [view] whose direction differs most from the reference's."""
-    return int(_cosines(reference, targets).argmin())
+def farthest(scene: SceneBatch) -> int:
+    """Return the index, in all views of a batch of one, of that whose direction differs most from the reference's."""
+    return 1 + int(_cosines(scene.reference.cameras[0], scene.targets.cameras[0]).argmin())
 
 
 def _cosines(reference: Cameras, targets: Cameras) -> Float[Tensor, " view"]:

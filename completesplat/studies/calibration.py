@@ -1,0 +1,98 @@
+"""Calibration of samples: whether the truth could be one of them, and whether they differ as much as they err.
+
+If the truth and k samples have one distribution, each of the k + 1 ranks of the truth is equally probable, and the mean
+square error of the samples' mean is (k + 1) / k times their variance (Fortin et al. 2014).
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
+from completesplat.metrics.scoring import novel_values
+from completesplat.scene import SceneBatch
+from completesplat.studies.controls import Tick
+from completesplat.studies.figures import written_figure
+from completesplat.studies.samples import SampleRenderer, mean_over_scenes
+
+Samples = Float[Tensor, "sample value"]
+Truth = Float[Tensor, " value"]
+BINS = 10
+
+
+def rows(renderer: SampleRenderer, scenes: Sequence[SceneBatch], tick: Tick, **settings: float) -> list[dict[str, Any]]:
+    """Return a row for each region of novel views (`novel_values`), with means over the scenes.
+
+    `energy_N` is the energy score of N samples, `below_all` and `above_all` are the ends of the rank histogram `ranks`,
+    `spread` and `error` the roots of the mean `squares`. `bins` has `BINS` pairs of these, each of as many values, in
+    the order of the samples' variance. The settings are skip and guidance weight (`CompleteSplat.generate`).
+    """
+    measured = defaultdict[str, list[Any]](list)
+    for index, scene in enumerate(scenes):
+        tick(scene.names[0])
+        images = renderer(scene, seed=renderer.seed + index, **settings)[:, 1:]  # else all scenes share their noise
+        for region, (samples, true) in novel_values(images, scene.all_views()[0]).items():
+            figures = energies(samples, true) | {"crps": crps(samples, true)}
+            means = torch.stack(squares(samples, true)).double().mean(1)
+            measured[region].append((figures, rank_histogram(samples, true), means, halves(samples, true)))
+    results = []
+    for region, of_scenes in measured.items():
+        figures_of_scenes, *others = zip(*of_scenes, strict=True)
+        ranks, (spread, error) = (torch.stack(each).mean(0).tolist() for each in others[:2])
+        row = {"region": region, "scenes": len(of_scenes), **mean_over_scenes(figures_of_scenes)}
+        row |= {"below_all": ranks[0], "above_all": ranks[-1], "spread": spread**0.5, "error": error**0.5}
+        row |= {"spread_over_error": (spread / error) ** 0.5 if error else None}
+        results.append(row | {"ranks": ranks, "bins": binned(*torch.cat(others[2], 1))})
+    return results
+
+
+def energies(samples: Samples, truth: Truth) -> dict[str, float]:
+    """Return the fair energy score of 2, 4, 8, ... and of all samples, each the mean over groups of so many."""
+    counts = {2**power: 1 for power in range(1, len(samples).bit_length())} | {len(samples): 1}
+    groups = {n: samples[: len(samples) // n * n].view(-1, n, len(truth)) for n in counts}
+    return {f"energy_{n}": sum(energy_score(part, truth) for part in parts) / len(parts) for n, parts in groups.items()}
+
+
+def squares(samples: Samples, truth: Truth) -> tuple[Truth, Truth]:
+    """Return the samples' variance times (k + 1) / k, and the squared error of their mean, which it predicts."""
+    return samples.var(0) * (len(samples) + 1) / len(samples), (samples.mean(0) - truth).square()
+
+
+def halves(samples: Samples, truth: Truth) -> Float[Tensor, "3 value"]:
+    """Return the variance of the first half of the samples, and the `squares` of the others.
+
+    If one variance chose the bins and was their spread too, the lowest bin would have values whose variance is small by
+    chance, and calibrated samples would seem too sure there. With fewer than four samples the halves overlap.
+    """
+    half = len(samples) // 2
+    return torch.stack([samples[: max(half, 2)].var(0), *squares(samples[min(half, len(samples) - 2) :], truth)])
+
+
+def binned(order: Truth, spreads: Truth, errors: Truth) -> list[list[float]]:
+    """Return the roots of mean spread and error, of `BINS` bins with as many values each, from the lowest order."""
+    values = torch.stack([spreads, errors])[:, order.argsort(stable=True)].double()
+    return [part.mean(1).sqrt().tolist() for part in values.tensor_split(min(BINS, len(order)), 1)]
+
+
+def plot_calibration(rows: Sequence[dict[str, Any]], path: Path, title: str) -> None:
+    """Write a PNG with three panels for each region: ranks, spread against error, and energy by number of samples."""
+    with written_figure(path, title, (13, 0.5 + 3.7 * len(rows))) as figure:
+        for (ranks, bins, energy), row in zip(figure.subplots(len(rows), 3, squeeze=False), rows, strict=True):
+            name, count, end = f"novel views, {row['region']}", len(row["ranks"]), 1.05 * max(map(max, row["bins"]))
+            ranks.bar(range(count), row["ranks"])
+            ranks.axhline(1 / count, color="crimson", label="calibrated")
+            ranks.set(title=f"{name}: ranks of the truth", xlabel="samples below the truth", ylabel="share of values")
+            bins.plot([0, end], [0, end], color="crimson", label="calibrated")
+            bins.plot(*zip(*row["bins"], strict=True), "o-", label="as many values each")
+            bins.set(title=f"{name}: spread and error", xlabel="standard deviation of samples", ylabel="error of mean")
+            scores = {int(key[7:]): score for key, score in row.items() if key.startswith("energy_")}
+            energy.plot([*scores], [*scores.values()], "o-", label="fair: flat but for chance")
+            energy.set(title=f"{name}: energy score", xlabel="number of samples", ylim=(0, 1.3 * max(scores.values())))
+            for panel in (ranks, bins, energy):
+                panel.legend()
+                panel.grid(alpha=0.3)
