@@ -70,6 +70,8 @@ class Trained:
         """
         if [self.ckpt, self.weights, self.scenes].count(None) != 2:
             raise CompleteSplatError("give one: ckpt=FILE, or weights=DIR or scenes=DIR with data=NAME data.root=DIR")
+        if self.scenes is None and (self.frame, self.align, self.method) != ("opencv", "none", None):
+            raise CompleteSplatError("frame, align and method are of files: give scenes=DIR")
         if self.ckpt is not None and self.data is not None:
             raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
         if self.ckpt is not None:

@@ -47,3 +47,6 @@ class HiddenModeScenes(Protocol):
             DataError: it is unreadable, its reference view distinguishes the modes, or no view shows them well.
             CompleteSplatError: the files were not made by the data set.
         """
+
+    def versions(self, index: int) -> SceneBatch:
+        """Return one scene in every mode [mode], with targets that are evenly spread; raise as `__getitem__`."""

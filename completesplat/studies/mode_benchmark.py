@@ -44,15 +44,8 @@ def rungs(model: VariationalAutoReconstructor, samples: int, batch: int, masked:
         masked: whether the model sees only the visible part of the reference image.
     """
 
-<<<<<<< HEAD
-    def model(scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
-        sets = module.draw(scene, [seed], samples, batch)
-        images = torch.cat([_render(module, sets[i : i + batch], scene) for i in range(0, len(sets.means), batch)])
-        return images.expand(samples, *images.shape[1:])
-=======
     def seen(scene: SceneBatch) -> Float[Tensor, "1 3 _ _"]:
         return scene.reference.images * scene.visible if masked else scene.reference.images
->>>>>>> wt-calib
 
     def posterior(scene: SceneBatch, with_views: bool = model.sees_views) -> Posterior:
         return model.posterior(seen(scene), scene.all_views() if with_views else None, scene.depth_range)[0]
@@ -92,8 +85,7 @@ def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
     stage 2 is at fault; if neither do, stage 1 is. A deterministic method returns `samples` equal renders. Samples are
     computed and rendered `batch` at a time.
     """
-    drawn = {"samples": samples, "batch": batch} if isinstance(module, LatentDiffusion) else {}
-    methods: dict[str, Rung] = {"model": lambda scene, other, seed: module.reconstruct(scene, seed=seed, **drawn)}
+    methods: dict[str, Rung] = {"model": lambda scene, other, seed: module.draw(scene, [seed], samples, batch)}
     frozen = module.completesplat.autoreconstructor if isinstance(module, LatentDiffusion) else None
     network = frozen or getattr(module, "model", None)
     if isinstance(network, VariationalAutoReconstructor):

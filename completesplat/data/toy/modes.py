@@ -21,6 +21,7 @@ from completesplat.data.toy.writing import DRAW, FORMAT_VERSION, to_bytes
 from completesplat.data.validation import at, field, read_json
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
+from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
 
 # A ray that stops before a point by more than this share of the point's distance meets a surface in front of it.
@@ -91,14 +92,10 @@ class ToyHiddenModes:
 
     def __getitem__(self, index: int) -> HiddenModes:
         name = self.store.names[index]
-        toy, sequence = self._drawn_again(name), self.store.source.read(name)
-        reference, _ = self.choose(sequence)
+        toy, sequence, reference = self._read(name)
         frames = sequence.frames
-        if self._differs(self._truths(toy, frames[reference]), LEAK).any():
-            raise DataError("the reference view tells the patch's colour", sequence=name)
         behind, truths, region = self._from_behind(toy, name, frames, reference)
-        others = [view for view in range(len(frames)) if view != reference]
-        spread = [others[place - 1] for place in evaluation_views(len(frames), self.spread_views)[1]]
+        spread = self._spread(len(frames), reference)
         targets = sorted({*behind, *spread})
         scene = stack([with_true_depths(self.store.scene(sequence, reference, targets), sequence, reference, targets)])
         true_mode, views = list(PATCH_COLORS).index(toy.patch_color), tuple(map(targets.index, behind))
@@ -110,6 +107,26 @@ class ToyHiddenModes:
         hidden = [unseen(toy, frames[reference], frames[target], self.image_size) for target in targets]
         chances = torch.tensor(toy.chances, dtype=torch.float32)
         return HiddenModes(scene, views, truths, region, chances, torch.stack(hidden), tuple(PATCH_COLORS), true_mode)
+
+    def versions(self, index: int) -> SceneBatch:
+        """See `HiddenModeScenes`."""
+        toy, sequence, reference = self._read(self.store.names[index])
+        spread = self._spread(len(sequence.frames), reference)
+        scene = self.store.scene(sequence, reference, spread)
+        truths = torch.stack([self._truths(toy, sequence.frames[view]) for view in spread], dim=1)
+        return stack([replace(scene, targets=replace(scene.targets, images=images)) for images in truths])
+
+    def _read(self, name: str) -> tuple[ToyScene, PosedSequence, int]:
+        """Return a scene, drawn again and as it is on the disk, and its reference view."""
+        toy, sequence = self._drawn_again(name), self.store.source.read(name)
+        reference, _ = self.choose(sequence)
+        if self._differs(self._truths(toy, sequence.frames[reference]), LEAK).any():
+            raise DataError("the reference view tells the patch's colour", sequence=name)
+        return toy, sequence, reference
+
+    def _spread(self, frames: int, reference: int) -> list[int]:
+        others = [view for view in range(frames) if view != reference]
+        return [others[place - 1] for place in evaluation_views(frames, self.spread_views)[1]]
 
     def _drawn_again(self, name: str) -> ToyScene:
         number, _, family = name.partition("_")
