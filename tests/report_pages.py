@@ -32,7 +32,7 @@ def write_results(root: Path) -> None:
     _write(root / "modes/hidden_modes.json", {"model": modes})
     _write(root / "modes/protocol.json", PROTOCOL)
     image(root / "modes/hidden_modes.png", 200, (2400, 60))
-    _write(root / "samplers/samplers.json", {"rows": [{"sampler": "ddim", "steps": 50, "psnr": 17.25, "more": {}}]})
+    _write(root / "controls/controls.json", {"rows": [{"sampler": "ddim", "steps": 50, "psnr": 17.25, "more": {}}]})
     settings = {"image": HOSTILE, "seed": 7, "skip_weight": 0.5, "steps": 20}
     _write(root / "predictions/run.json", {"command": ["completesplat predict", "image=x.jpg"]})
     _write(root / "predictions/x/scene.json", {"settings": settings})

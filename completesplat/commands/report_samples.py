@@ -6,31 +6,36 @@ Each study raises the errors of `Trained.open`, `diffusion_of`, `first_scenes` a
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Unpack
 
 import torch
 from rich.console import Console
+from rich.progress import track
 
 from completesplat.commands import quieten
 from completesplat.commands.protocol import write_json
 from completesplat.commands.trained import Trained, diffusion_of
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.export.images import image_sheet, write_png
 from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
-from completesplat.settings.checks import Test
+from completesplat.settings.checks import ModelSettings
 from completesplat.settings.schema import Entries, Positive, Range, Share
 from completesplat.studies import calibration as calibration_study
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies import front as front_study
+from completesplat.studies import noise_levels
 from completesplat.studies.controls import Tick
 from completesplat.studies.samples import SampleRenderer, first_scenes
+from completesplat.training.stage import Stage
 
 Weights = Annotated[Sequence[Share], Entries(1)]
 
 
-class Run(Test):
+class Run(ModelSettings):
     """Arguments of `Trained`, how many of its first test scenes are used, and how many samples each scene gets."""
 
     data: Mapping[str, object] | None
@@ -105,15 +110,33 @@ def front(out: Path, **run: Unpack[Run]) -> None:
     show(records_table("Reference view: PSNR, dB; mean absolute difference of two samples, in 1/255", rows))
 
 
+def modes(spread_views: Positive, out: Path, **run: Unpack[Run]) -> None:
+    """Write `modes.json` and `modes.png`, and print the table; `completesplat.studies.noise_levels` explains it."""
+    stage, data = _opened_stage(run)
+    data.setup("test")
+    known, status = data.hidden_modes(1, spread_views), partial(track, console=Console(stderr=True))
+    scenes = noise_levels.scenes_in_all_modes(known, run["scenes"], partial(status, description="Scenes in all modes"))
+    table = noise_levels.rows(diffusion_of(stage), [x.to(stage.device) for x in scenes], run["samples"], run["seed"])
+    settings = {"scenes": len(scenes), "samples": run["samples"], "seed": run["seed"], "spread_views": spread_views}
+    write_json(out / "modes.json", {"settings": settings, "rows": table})
+    noise_levels.plot(table, out / "modes.png", f"Hidden modes of {len(scenes)} scenes in noisy latents")
+    show(records_table("Share of the true mode in noisy latents", table))
+
+
 @contextmanager
 def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], dict[str, float], Tick]]:
     """Yield renderer and first test scenes (on a GPU if there is one), settings to write with results, and a status."""
-    quieten()
-    source = run["ckpt"], run["overrides"], run["trust"], run["weights"], run["data"], run["rasterizer"]
-    stage, data = Trained(*source, seed=run["seed"]).open()
-    stage.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    stage, data = _opened_stage(run)
     scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
     settings: dict[str, float] = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
     renderer = SampleRenderer(diffusion_of(stage), stage.rasterizer, stage.background, run["samples"], run["seed"])
     with Console(stderr=True).status("drawing") as status:
         yield renderer, scenes, settings, lambda text: status.update(f"drawing: {text}")
+
+
+def _opened_stage(run: Run) -> tuple[Stage, SceneDataModule]:
+    """Return the stage, on a GPU if there is one, and the data."""
+    quieten()
+    given = run["overrides"], run["trust"], run["weights"]
+    stage, data = Trained(run["ckpt"], *given, data=run["data"], rasterizer=run["rasterizer"], seed=run["seed"]).open()
+    return stage.to("cuda" if torch.cuda.is_available() else "cpu").eval(), data

@@ -18,7 +18,7 @@ from completesplat.results.machine import Machine
 
 SCORES, MODES = "metrics.json", "hidden_modes.json"
 RECORD, CONFIG, PLAN, SCENE = "run.json", "config.yaml", "multirun.yaml", "scene.json"
-ROWS = ("samplers.json", "calibration.json", "controls.json", "depth.json", "front.json", "views.json")
+ROWS = ("calibration.json", "controls.json", "depth.json", "front.json", "modes.json")
 """Files that `completesplat report NAME` writes beside its figure: settings and rows."""
 PROTOCOL = "protocol"  # key of the entry that says how results were measured; the others are predictors
 MODEL, UPPER_BOUND = "model", "upper_bound"

@@ -102,17 +102,22 @@ class RunSettings(TypedDict):
     overrides: Sequence[str]
 
 
-class Test(RunSettings):
-    """Settings of `completesplat test`, and of studies of samples."""
+class ModelSettings(RunSettings):
+    """Settings of `completesplat test` and of studies of samples that say which model they take."""
 
     ckpt: str | None
     weights: str | None
+    seed: Annotated[int, Range(0, 2**32 - 1)]
+    trust: bool
+
+
+class Test(ModelSettings):
+    """Settings of `completesplat test`."""
+
     scenes: str | None
     frame: Annotated[str, OneOf(("opencv", "opengl"))]
     align: Annotated[str, OneOf(("none", "scale"))]
     method: str | None
-    seed: Annotated[int, Range(0, 2**32 - 1)]
-    trust: bool
 
 
 VERBS: dict[str, type] = {"fit": Fit, "plan": Plan, "predict": Predict, "view": View, "test": Test}

@@ -57,12 +57,12 @@ def rows(model: CompleteSplat, scenes: Sequence[SceneBatch], draws: int, seed: i
             sums[index] += shares(model, modes, condition, level, draws, generator)
     drawn = model.sampler.draw_timesteps(TIMESTEPS_DRAWN, torch.device("cpu"))
     steps = model.sampler.set_up().timesteps.cpu()
-    limits = [0, *levels[:-1], total]
-    table = []
-    for level, (best, predicted), low, high in zip(LEVELS, sums / len(scenes), limits, limits[1:], strict=False):
+    limits = [-1, *levels[:-1], total]
+    table: list[Row] = []
+    for share, (best, predicted), low, high in zip(LEVELS, sums / len(scenes), limits, limits[1:], strict=False):
         inside = [((times > low) & (times <= high)).double() for times in (drawn, steps)]
-        counted: Row = {"training_share": inside[0].mean().item(), "steps": inside[1].sum().item()}
-        table.append({"level": level, "best_share": best.item(), "denoiser_share": predicted.item()} | counted)
+        counted = {"training_share": inside[0].mean().item(), "steps": inside[1].sum().item()}
+        table.append({"level": share, "best_share": best.item(), "denoiser_share": predicted.item(), **counted})
     return table
 
 

@@ -62,6 +62,15 @@ def test_front_has_a_rung_for_each_latent_that_one_scene_has(report, tmp_path):
     assert "mean absolute difference of two samples" in " ".join(message.split())
 
 
+def test_modes_are_told_apart_best_where_there_is_little_noise(report, tmp_path):
+    message, results = report("modes", "spread_views=2")
+    assert results["settings"] == {"scenes": 1, "samples": 2, "seed": 0, "spread_views": 2}
+    assert all(0 <= row["best_share"] <= 1 for row in results["rows"])
+    assert sum(row["training_share"] for row in results["rows"]) == pytest.approx(1)
+    assert imageio.imread(tmp_path / "out/modes.png").ndim == 3
+    assert "Share of the true mode" in message
+
+
 @pytest.mark.parametrize(
     ("task", "setting", "message"),
     [
