@@ -28,10 +28,8 @@ from completesplat.rasterizers import RenderingConstants
 from completesplat.settings.schema import Positive
 from completesplat.training.steps import peak_megabytes
 
-# `gsplat_torch` is a baseline for this comparison; training cannot choose it.
 CLASSES = {
     "reference": "completesplat.rasterizers.reference.ReferenceRasterizer",
-    "gsplat_torch": "completesplat.benchmarks.gsplat_torch.GsplatTorchRasterizer",
     "tiled": "completesplat.rasterizers.tiled.TiledRasterizer",
     "cuda": "completesplat.rasterizers.cuda.CudaRasterizer",
 }

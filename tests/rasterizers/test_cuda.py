@@ -23,12 +23,12 @@ import numpy as np
 import pytest
 import torch
 from degenerate_gaussians import DRAWN, NEVER_DRAWN, SIZE, camera, changed, healthy
+from gsplat_on_cpu import TILE_SIZE, pairs, weights_along_rays
 from hydra.utils import instantiate
 from rasterizer_scenes import scenes
 from support import compose_config
 from torch import Tensor
 
-from completesplat.benchmarks import gsplat_torch
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras, transform_points
@@ -129,7 +129,7 @@ def front_end(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
 @pytest.fixture
 def torch_front_end(front_end: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """`front_end` with gsplat's torch versions of its CUDA operations, and the benchmark's stand-ins for two parts."""
+    """`front_end` with gsplat's torch versions of its CUDA operations, and stand-ins for two parts."""
     import gsplat
     from gsplat.cuda import _torch_impl, _wrapper
 
@@ -147,7 +147,6 @@ def torch_front_end(front_end: list[dict[str, Any]], monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(gsplat.rendering, "isect_tiles", lambda *arguments, **_: _torch_impl._isect_tiles(*arguments))
     monkeypatch.setattr(gsplat.rendering, "isect_offset_encode", _torch_impl._isect_offset_encode)
     monkeypatch.setattr(gsplat.rendering, "rasterize_to_pixels", pixels)
-    monkeypatch.setattr(gsplat_torch, "TILE_SIZE", 16)
     monkeypatch.setattr(_wrapper, "rasterize_to_indices_in_range", indices_in_range)
     nerfacc = ModuleType("nerfacc")
     monkeypatch.setitem(sys.modules, "nerfacc", nerfacc)
@@ -157,18 +156,16 @@ def torch_front_end(front_end: list[dict[str, Any]], monkeypatch: pytest.MonkeyP
 
 
 def indices_in_range(start, end, left, means2d, conics, opacities, width, height, tile_size, offsets, indices):
-    assert (start, tile_size) == (0, 16)
+    assert (start, tile_size) == (0, TILE_SIZE)
     assert (left == 1).all()
-    flat = [t.flatten(0, 2) for t in (means2d, conics)]
-    unread = torch.zeros(len(flat[0]), 5)
-    splats = gsplat_torch._Splats(flat[0], unread[:, :2].long(), unread[:, 0], flat[1], opacities.flatten(), unread)
+    splats = means2d.flatten(0, 2), conics.flatten(0, 2), opacities.flatten()
     grid, constants = tuple(offsets.shape[-2:]), RenderingConstants()
-    numbers, places = gsplat_torch.pairs(splats.detach(), indices, offsets.flatten(), grid, (height, width), constants)
+    numbers, places = pairs(*splats, indices, offsets.flatten(), grid, (height, width), constants)
     return numbers % means2d.shape[2], places % (height * width), places // (height * width)
 
 
 def weights_and_transmittances(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, None]:
-    return gsplat_torch.weights_along_rays(alphas, ray_indices), None
+    return weights_along_rays(alphas, ray_indices), None
 
 
 def sums_along_rays(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
