@@ -31,8 +31,8 @@ BRIEF |= {
     for of in ("minis", "views")
 }
 # What they need cannot be made here: CO3D, eight GPUs, VGG16 (`test_sweeps` has these two sweeps with a random one),
-# Splatter Image's published weights (`test_published` has made-up ones), images that lines of Python write
-# (`test_scene_files` runs these).
+# Splatter Image's published weights (`test_published` has made-up ones), images that Python lines of a README write
+# (`test_scene_files` runs them).
 NEEDS_MORE = (
     "IMAGES",
     "SPLATS",

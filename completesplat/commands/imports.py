@@ -17,7 +17,7 @@ from typing import Any
 
 SCIPY = ("scipy.integrate", "scipy.linalg", "scipy.linalg.cython_blas", "scipy.stats")
 POSTPONED = ("requests", *SCIPY, "torch._dynamo", "torch.distributed._functional_collectives")
-"""Modules that diffusers and numba import: for decorators, schedulers and linear algebra that no prediction uses."""
+"""Modules that diffusers and numba import although no prediction uses them."""
 
 
 @contextmanager
@@ -38,10 +38,10 @@ def importing() -> Iterator[None]:
 
 @contextmanager
 def postponing() -> Iterator[None]:
-    """Import diffusers and numba without `POSTPONED`, which took half of the time; their first use imports them.
+    """Put stand-ins for `POSTPONED` into `sys.modules`, because these modules took half of the time of imports.
 
-    Afterwards `sys.modules` holds the real modules or none. diffusers' blocks are not marked for torch.compile
-    (`allow_in_graph`), so this is for commands that do not compile networks.
+    The first use of a stand-in imports the real module. Afterwards `sys.modules` holds the real modules or none.
+    Only for commands that compile no network: diffusers' blocks are not marked for torch.compile (`allow_in_graph`).
     """
     finder, stand_ins = _Submodules(), {name: _StandIn(name) for name in POSTPONED}
     vars(stand_ins["torch._dynamo"]).update(allow_in_graph=lambda marked: marked, disable=_disable)
@@ -88,7 +88,7 @@ class _StandIn(ModuleType):
     __path__: MutableSequence[str] = []  # noqa: RUF012
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") and name != "__pyx_capi__":  # `inspect` looks for such attributes in all modules
+        if name.startswith("__") and name != "__pyx_capi__":  # `inspect` looks for these; numba reads the last
             raise AttributeError(name)
         return getattr(_real(self.__name__), name)
 

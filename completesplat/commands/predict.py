@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numba.np.arraymath  # numba would import it with its first kernel, and scipy with it  # noqa: F401
+import numba.np.arraymath  # else the first kernel imports it, and scipy with it  # noqa: F401
 from hydra.utils import instantiate
 from jaxtyping import Float
 from omegaconf import DictConfig

@@ -98,7 +98,7 @@ def provenance(data: "SceneDataModule", out: Path) -> dict[str, object]:
 
 
 def drawing(module: Any) -> dict[str, object]:
-    """Return how samples are drawn; nulls for a model that draws none, and for files."""
+    """Return the settings of the sampler; nulls for deterministic models and for scenes from files."""
     if not hasattr(module, "completesplat"):
         return dict.fromkeys(("sampler", "steps", "skip_weight", "guidance_weight"))
     sampler = module.completesplat.sampler

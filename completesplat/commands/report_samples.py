@@ -36,7 +36,7 @@ Weights = Annotated[Sequence[Share], Entries(1)]
 
 
 class Run(ModelSettings):
-    """Arguments of `Trained`, how many of its first test scenes are used, and how many samples each scene gets."""
+    """Arguments of `Trained`, number of test scenes (the first ones), and number of samples of each scene."""
 
     data: Mapping[str, object] | None
     rasterizer: Mapping[str, object]
@@ -87,7 +87,7 @@ def depth(
 
 
 def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Unpack[Run]) -> None:
-    """Write `calibration.json` and `calibration.png`, and print the table; the settings are those of `generate`."""
+    """Write `calibration.json` and its figure, and print the table; `CompleteSplat.generate` explains both weights."""
     weights = {"skip_weight": skip_weight, "guidance_weight": guidance_weight}
     with _opened(run) as (renderer, scenes, settings, tick):
         rows = calibration_study.rows(renderer, scenes, tick, **weights)
@@ -96,12 +96,12 @@ def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Un
         f"{run['samples']} samples of each of {len(scenes)} scenes; skip {skip_weight:g}, guidance {guidance_weight:g}"
     )
     calibration_study.plot_calibration(rows, out / "calibration.png", title)
-    ideal = f"calibrated: {1 / (1 + run['samples']):.3g} of the truths below and above all samples, ratio 1"
+    ideal = f"calibrated: {1 / (1 + run['samples']):.3g} of the true values below and above all samples, ratio 1"
     show(records_table(f"Novel views; {ideal}", rows))
 
 
 def front(out: Path, **run: Unpack[Run]) -> None:
-    """Write `front.json` and `front.png`, and print the table; `completesplat.studies.front` explains the rungs."""
+    """Write `front.json` and `front.png`, and print the table; `studies.front.rows` explains the rungs."""
     with _opened(run) as (renderer, scenes, settings, tick):
         rows, sheet = front_study.rows(renderer, scenes, tick)
     write_json(out / "front.json", {"settings": settings, "rows": rows})
@@ -111,21 +111,21 @@ def front(out: Path, **run: Unpack[Run]) -> None:
 
 
 def modes(spread_views: Positive, out: Path, **run: Unpack[Run]) -> None:
-    """Write `modes.json` and `modes.png`, and print the table; `completesplat.studies.noise_levels` explains it."""
+    """Write `modes.json` and `modes.png`, and print the table; `studies.noise_levels.rows` explains its columns."""
     stage, data = _opened_stage(run)
     data.setup("test")
-    known, status = data.hidden_modes(1, spread_views), partial(track, console=Console(stderr=True))
-    scenes = noise_levels.scenes_in_all_modes(known, run["scenes"], partial(status, description="Scenes in all modes"))
-    table = noise_levels.rows(diffusion_of(stage), [x.to(stage.device) for x in scenes], run["samples"], run["seed"])
+    progress = partial(track, description="Scenes in all modes", console=Console(stderr=True))
+    scenes = noise_levels.scenes_in_all_modes(data.hidden_modes(1, spread_views), run["scenes"], progress)
+    rows = noise_levels.rows(diffusion_of(stage), [x.to(stage.device) for x in scenes], run["samples"], run["seed"])
     settings = {"scenes": len(scenes), "samples": run["samples"], "seed": run["seed"], "spread_views": spread_views}
-    write_json(out / "modes.json", {"settings": settings, "rows": table})
-    noise_levels.plot(table, out / "modes.png", f"Hidden modes of {len(scenes)} scenes in noisy latents")
-    show(records_table("Share of the true mode in noisy latents", table))
+    write_json(out / "modes.json", {"settings": settings, "rows": rows})
+    noise_levels.plot(rows, out / "modes.png", f"Hidden modes of {len(scenes)} scenes in noisy latents")
+    show(records_table("Share of the true mode in noisy latents", rows))
 
 
 @contextmanager
 def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], dict[str, float], Tick]]:
-    """Yield renderer and first test scenes (on a GPU if there is one), settings to write with results, and a status."""
+    """Yield renderer and first test scenes (on a GPU if there is one), settings for the results file, and a status."""
     stage, data = _opened_stage(run)
     scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
     settings: dict[str, float] = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
@@ -137,6 +137,6 @@ def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], dict[s
 def _opened_stage(run: Run) -> tuple[Stage, SceneDataModule]:
     """Return the stage, on a GPU if there is one, and the data."""
     quieten()
-    given = run["overrides"], run["trust"], run["weights"]
-    stage, data = Trained(run["ckpt"], *given, data=run["data"], rasterizer=run["rasterizer"], seed=run["seed"]).open()
+    model = run["ckpt"], run["overrides"], run["trust"], run["weights"]
+    stage, data = Trained(*model, data=run["data"], rasterizer=run["rasterizer"], seed=run["seed"]).open()
     return stage.to("cuda" if torch.cuda.is_available() else "cpu").eval(), data

@@ -1,4 +1,4 @@
-"""Models for commands: a run's checkpoint with its data, weights or files of scenes with other data, weights alone."""
+"""Models for commands, from a run's checkpoint, from weights or from files of scenes, and the data to use with them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,9 +27,9 @@ WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no 
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained model with its data: a run's checkpoint, weights, or the scenes in files that a program wrote.
+    """A model with its data: a run's checkpoint, weights, or files of scenes that any program wrote.
 
-    `conf/test.yaml` explains the arguments; the configs `data` and `rasterizer` are not used with `ckpt`.
+    `conf/test.yaml` explains the arguments; with `ckpt`, those of its run replace `data` and `rasterizer`.
     `config_of_run` explains what a run's config may name, and when it needs `trust`.
     """
 
@@ -66,18 +66,18 @@ class Trained:
 
         Raises:
             WeightsError: the checkpoint, its run's config or the weights are missing or not trusted.
-            CompleteSplatError: none or several are given, no data with weights or scenes, or data that do not fit.
+            CompleteSplatError: not exactly one of them is given, or data are missing, superfluous or unsuitable.
         """
         if [self.ckpt, self.weights, self.scenes].count(None) != 2:
-            raise CompleteSplatError("give one: ckpt=FILE, or weights=DIR or scenes=DIR with data=NAME data.root=DIR")
+            raise CompleteSplatError("give one of ckpt=FILE, weights=DIR and scenes=DIR; all but ckpt need data=NAME")
         if self.scenes is None and (self.frame, self.align, self.method) != ("opencv", "none", None):
-            raise CompleteSplatError("frame, align and method are of files: give scenes=DIR")
+            raise CompleteSplatError("frame, align, method: these apply to files only; give scenes=DIR")
         if self.ckpt is not None and self.data is not None:
             raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
         if self.ckpt is not None:
             return config_of_run(Path(self.ckpt), list(self.overrides), self.trust)
         if self.data is None:
-            raise CompleteSplatError("weights and scenes know no data: give data=NAME data.root=DIR")
+            raise CompleteSplatError("weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR")
         config = OmegaConf.create({"seed": self.seed, "data": self.data})
         if self.weights is not None:
             config.data.update(self.model.needed_of_data(config.data))
@@ -103,7 +103,7 @@ class Trained:
         return stage
 
     def facts(self) -> dict[str, object]:
-        """Return `checkpoint_facts`; for weights and files of scenes, path and checksum but not how training ended."""
+        """Return `checkpoint_facts`; for weights and files of scenes, path and checksum without facts of training."""
         if self.ckpt is not None:
             return checkpoint_facts(Path(self.ckpt))
         if self.scenes is not None:

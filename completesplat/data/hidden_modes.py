@@ -49,4 +49,4 @@ class HiddenModeScenes(Protocol):
         """
 
     def versions(self, index: int) -> SceneBatch:
-        """Return one scene in every mode [mode], with targets that are evenly spread; raise as `__getitem__`."""
+        """Return one scene in every mode [mode], with evenly spread targets; raise the errors of `__getitem__`."""

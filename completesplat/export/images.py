@@ -84,7 +84,7 @@ def image_sheet(
     """Return images in rows and columns, each enlarged by a whole factor to about 144 px, with its label above it.
 
     Args:
-        headings: of the columns; None: no headings.
+        headings: headings of the columns, if any.
         rows: at least one, none longer than `headings`; None leaves a cell empty. All images have the same size.
         title: the first line; None leaves no space for it.
     """

@@ -114,7 +114,7 @@ def pinhole(fov_degrees: float, size: int) -> Float[Tensor, "3 3"]:
 
 
 def nearest_to_axes(cameras: Cameras, least_spread: float = PARALLEL) -> Float[Tensor, "3"] | None:
-    """Return the point (float64) with the least squared distances to all optical axes; None if they hardly spread."""
+    """Return the point (float64) nearest to all optical axes (least squares); None if the axes are too parallel."""
     axes, centers = cameras.camera_to_world[:, :3, 2].double(), cameras.centers.double()
     across = torch.eye(3, dtype=axes.dtype, device=axes.device) - axes[:, :, None] * axes[:, None]
     mean = across.mean(0)

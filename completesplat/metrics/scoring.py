@@ -206,7 +206,7 @@ def noisy_mean(
 def proper_scores(
     images: Float[Tensor, "sample view 3 height width"], truth: Views
 ) -> tuple[Scores, dict[str, list[float]]]:
-    """Return `energy` and `crps` of the novel views, and their rank histograms, by the regions of `novel_values`."""
+    """Return `energy`, `crps` and rank histograms of the novel views, for each region of `novel_values`."""
     scores: Scores = {}
     ranks = {}
     for region, (drawn, true) in novel_values(images, truth).items():
@@ -219,16 +219,16 @@ def proper_scores(
 def novel_values(
     images: Float[Tensor, "sample view 3 height width"], truth: Views
 ) -> dict[str, tuple[Float[Tensor, "sample value"], Float[Tensor, " value"]]]:
-    """Return values of the samples and true values by region; `truth` has the reference and then the novel views.
+    """Return the values of the samples and the true values by region; the first view of `truth` is the reference.
 
-    Regions are all pixels (`full`) and, if true depth is known, those whose surface the reference hides (`hidden`).
+    Regions are all pixels (`full`) and, if true depth is known, those that the reference view does not show (`hidden`).
     """
-    novel, counted = truth[1:], {"full": torch.ones_like(truth.masks[1:, 0], dtype=torch.bool)}
+    novel, masks = truth[1:], {"full": torch.ones_like(truth.masks[1:, 0], dtype=torch.bool)}
     if truth.depths is not None and truth.depths.shape[-2:] == images.shape[-2:]:
         hidden, _ = hidden_from(truth.cameras[0], truth.depths[0], novel.cameras, truth.depths[1:])
-        counted |= {"hidden": hidden} if hidden.any() else {}
+        masks |= {"hidden": hidden} if hidden.any() else {}
     values = images.movedim(2, -1).float(), novel.images.movedim(1, -1).float()
-    return {name: (values[0][:, pixels].flatten(1), values[1][pixels].flatten()) for name, pixels in counted.items()}
+    return {name: (values[0][:, mask].flatten(1), values[1][mask].flatten()) for name, mask in masks.items()}
 
 
 def _region(images: Tensor, truth: Views, region: str) -> Tensor:

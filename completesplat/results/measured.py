@@ -99,7 +99,7 @@ class Entry:
             kinds[MODEL] = ", single sample" if protocol.get("sampler") or samples != 1 else ""
             label = f"{protocol.get('method', 'model')}{kinds[self.predictor]}"
             label += " (upper bound)" if self.upper_bound else ""
-        owner = "" if self.ours and protocol.get("frame") else OURS  # files may be of any program
+        owner = "" if self.ours and protocol.get("frame") else OURS  # any program may have written the files
         return Cell(f"{owner}{label} [{_note(self.run, notes)}]")
 
     def cell(self, name: str, notes: Notes) -> Cell:

@@ -103,7 +103,7 @@ class RunSettings(TypedDict):
 
 
 class ModelSettings(RunSettings):
-    """Settings of `completesplat test` and of studies of samples that say which model they take."""
+    """Settings of `completesplat test` and of reports on samples that choose the model."""
 
     ckpt: str | None
     weights: str | None

@@ -1,4 +1,4 @@
-"""Calibration of samples: whether the truth could be one of them, and whether they differ as much as they err.
+"""Calibration of samples: ranks of the truth among them, and their spread against the error of their mean.
 
 If the truth and k samples have one distribution, each of the k + 1 ranks of the truth is equally probable, and the mean
 square error of the samples' mean is (k + 1) / k times their variance (Fortin et al. 2014).
@@ -28,23 +28,23 @@ BINS = 10
 def rows(renderer: SampleRenderer, scenes: Sequence[SceneBatch], tick: Tick, **settings: float) -> list[dict[str, Any]]:
     """Return a row for each region of novel views (`novel_values`), with means over the scenes.
 
-    `energy_N` is the energy score of N samples, `below_all` and `above_all` are the ends of the rank histogram `ranks`,
-    `spread` and `error` the roots of the mean `squares`. `bins` has `BINS` pairs of these, each of as many values, in
-    the order of the samples' variance. The settings are skip and guidance weight (`CompleteSplat.generate`).
+    `energy_N` is the energy score of N samples, `below_all` and `above_all` are the ends of the rank histogram `ranks`.
+    `spread` and `error` are the roots of the means of `squares`; `bins` has them for `BINS` equally large groups of
+    values, ordered by the samples' variance. The settings are skip and guidance weight (`CompleteSplat.generate`).
     """
     measured = defaultdict[str, list[Any]](list)
     for index, scene in enumerate(scenes):
         tick(scene.names[0])
-        images = renderer(scene, seed=renderer.seed + index, **settings)[:, 1:]  # else all scenes share their noise
+        images = renderer(scene, seed=renderer.seed + index, **settings)[:, 1:]  # new noise for each scene
         for region, (samples, true) in novel_values(images, scene.all_views()[0]).items():
-            figures = energies(samples, true) | {"crps": crps(samples, true)}
+            scores = energies(samples, true) | {"crps": crps(samples, true)}
             means = torch.stack(squares(samples, true)).double().mean(1)
-            measured[region].append((figures, rank_histogram(samples, true), means, halves(samples, true)))
+            measured[region].append((scores, rank_histogram(samples, true), means, halves(samples, true)))
     results = []
     for region, of_scenes in measured.items():
-        figures_of_scenes, *others = zip(*of_scenes, strict=True)
-        ranks, (spread, error) = (torch.stack(each).mean(0).tolist() for each in others[:2])
-        row = {"region": region, "scenes": len(of_scenes), **mean_over_scenes(figures_of_scenes)}
+        scores_of_scenes, *others = zip(*of_scenes, strict=True)
+        ranks, (spread, error) = (torch.stack(values).mean(0).tolist() for values in others[:2])
+        row = {"region": region, "scenes": len(of_scenes), **mean_over_scenes(scores_of_scenes)}
         row |= {"below_all": ranks[0], "above_all": ranks[-1], "spread": spread**0.5, "error": error**0.5}
         row |= {"spread_over_error": (spread / error) ** 0.5 if error else None}
         results.append(row | {"ranks": ranks, "bins": binned(*torch.cat(others[2], 1))})
@@ -52,29 +52,29 @@ def rows(renderer: SampleRenderer, scenes: Sequence[SceneBatch], tick: Tick, **s
 
 
 def energies(samples: Samples, truth: Truth) -> dict[str, float]:
-    """Return the fair energy score of 2, 4, 8, ... and of all samples, each the mean over groups of so many."""
+    """Return the fair energy scores of 2, 4, 8, ... and all samples: means over disjoint groups of this size."""
     counts = {2**power: 1 for power in range(1, len(samples).bit_length())} | {len(samples): 1}
     groups = {n: samples[: len(samples) // n * n].view(-1, n, len(truth)) for n in counts}
     return {f"energy_{n}": sum(energy_score(part, truth) for part in parts) / len(parts) for n, parts in groups.items()}
 
 
 def squares(samples: Samples, truth: Truth) -> tuple[Truth, Truth]:
-    """Return the samples' variance times (k + 1) / k, and the squared error of their mean, which it predicts."""
+    """Return the variance of k samples times (k + 1) / k, and the squared error of their mean; ideally equal."""
     return samples.var(0) * (len(samples) + 1) / len(samples), (samples.mean(0) - truth).square()
 
 
 def halves(samples: Samples, truth: Truth) -> Float[Tensor, "3 value"]:
-    """Return the variance of the first half of the samples, and the `squares` of the others.
+    """Return the variance of the first half of the samples, which orders `bins`, and the `squares` of the second half.
 
-    If one variance chose the bins and was their spread too, the lowest bin would have values whose variance is small by
-    chance, and calibrated samples would seem too sure there. With fewer than four samples the halves overlap.
+    If the same samples gave both, the lowest bin would hold values whose variance is small by chance, and calibrated
+    samples would seem overconfident there. With fewer than four samples the halves overlap.
     """
     half = len(samples) // 2
     return torch.stack([samples[: max(half, 2)].var(0), *squares(samples[min(half, len(samples) - 2) :], truth)])
 
 
 def binned(order: Truth, spreads: Truth, errors: Truth) -> list[list[float]]:
-    """Return the roots of mean spread and error, of `BINS` bins with as many values each, from the lowest order."""
+    """Return root mean spread and error of `BINS` equally large bins of the values, sorted by `order`."""
     values = torch.stack([spreads, errors])[:, order.argsort(stable=True)].double()
     return [part.mean(1).sqrt().tolist() for part in values.tensor_split(min(BINS, len(order)), 1)]
 
@@ -88,10 +88,10 @@ def plot_calibration(rows: Sequence[dict[str, Any]], path: Path, title: str) -> 
             ranks.axhline(1 / count, color="crimson", label="calibrated")
             ranks.set(title=f"{name}: ranks of the truth", xlabel="samples below the truth", ylabel="share of values")
             bins.plot([0, end], [0, end], color="crimson", label="calibrated")
-            bins.plot(*zip(*row["bins"], strict=True), "o-", label="as many values each")
+            bins.plot(*zip(*row["bins"], strict=True), "o-", label="bins of equal size")
             bins.set(title=f"{name}: spread and error", xlabel="standard deviation of samples", ylabel="error of mean")
             scores = {int(key[7:]): score for key, score in row.items() if key.startswith("energy_")}
-            energy.plot([*scores], [*scores.values()], "o-", label="fair: flat but for chance")
+            energy.plot([*scores], [*scores.values()], "o-", label="fair score: should be flat")
             energy.set(title=f"{name}: energy score", xlabel="number of samples", ylim=(0, 1.3 * max(scores.values())))
             for panel in (ranks, bins, energy):
                 panel.legend()

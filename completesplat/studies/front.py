@@ -1,4 +1,4 @@
-"""Differences of samples in the reference view, where the image says what they should show, and where they arise."""
+"""Differences between samples in the reference view, where all should show the input image, and their causes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,15 +22,15 @@ def rows(
 ) -> tuple[list[dict[str, Any]], list[list[SheetCell | None]]]:
     """Return a row for each rung with means of `figures` over the scenes, and a sheet of the first scene.
 
-    The rungs are those of the autoreconstructor (`rungs`; the other scene is the previous one, if there are several),
-    and the model's samples with full skips and without. The sheet shows two samples of each rung and `AMPLIFIED` times
-    their difference, in the reference view and then in the farthest.
+    The rungs are those of `mode_benchmark.rungs`, then the model's samples at skip weights 1 and 0. The other scene is
+    the previous one; with one scene there is no rung `other_scene`. The sheet shows two samples of each rung and
+    `AMPLIFIED` times their difference, in the reference view and then in the farthest view.
     """
     methods = rungs(renderer.model.autoreconstructor, renderer.samples, renderer.samples)
     methods["samples"] = lambda scene, other, seed: renderer.generate(scene, seed=seed, skip_weight=1.0)
     methods["samples_without_skips"] = lambda scene, other, seed: renderer.generate(scene, seed=seed, skip_weight=0.0)
 
-    def rendered(name: str, index: int) -> Renders:
+    def render(name: str, index: int) -> Renders:
         gaussians = methods[name](scenes[index], scenes[index - 1], renderer.seed + index)
         return renderer.over_background(renderer.rasterize(gaussians, scenes[index]))
 
@@ -38,16 +38,16 @@ def rows(
     sheet = [strip(scenes[0].all_views().images[0, views], "truth: reference, far")]
     for name in [name for name in methods if name != "other_scene" or len(scenes) > 1]:
         tick(name)
-        means = mean_over_scenes([figures(rendered(name, index), scene) for index, scene in enumerate(scenes)])
+        means = mean_over_scenes([figures(render(name, index), scene) for index, scene in enumerate(scenes)])
         results.append({"rung": name, **means})
-        one, other = rendered(name, 0)[[0, -1]][:, views]
-        cells = torch.stack([one, other, (AMPLIFIED * (one - other).abs()).clamp(max=1)], 1)
+        first, last = render(name, 0)[[0, -1]][:, views]
+        cells = torch.stack([first, last, (AMPLIFIED * (first - last).abs()).clamp(max=1)], 1)
         sheet.append(strip(cells.flatten(0, 1), name))
     return results, sheet
 
 
 def figures(images: Renders, scene: SceneBatch) -> Row:
-    """Return PSNR (dB) in the reference view and `difference` there and in the farthest, of all and object pixels."""
+    """Return PSNR (dB) in the reference view, and `difference` in it and the farthest, of all and of object pixels."""
     true, result = scene.all_views()[0], Row()
     for region, masks in (("", torch.ones_like(true.masks)), ("_object", true.masks)):
         result[f"reference{region}_psnr"] = object_psnr(images[:, :1], true.images[:1], masks[:1])
@@ -57,7 +57,7 @@ def figures(images: Renders, scene: SceneBatch) -> Row:
 
 
 def difference(images: Float[Tensor, "sample 3 height width"], mask: Bool[Tensor, "1 height width"]) -> float | None:
-    """Return the mean absolute difference of two samples inside a mask, in 1/255; None without pixels."""
+    """Return the absolute difference (1/255), mean over pairs of samples and pixels of a mask; None without pixels."""
     values = images[:, mask.expand_as(images[0])]
     pairs = torch.pdist(values, 1) / max(1, values.shape[1])
     return 255 * pairs.sum().item() / max(1, len(pairs)) if mask.any() else None

@@ -30,11 +30,11 @@ Predictor = Callable[[SceneBatch, SceneBatch, int], Renders]
 """Function from a scene, another scene (batches of one) and a seed to renders of all targets in [0, 1]."""
 
 Rung = Callable[[SceneBatch, SceneBatch, int], Gaussians]
-"""Function of the same arguments to Gaussians [sample], or [1] if nothing is drawn."""
+"""Function from the same arguments to Gaussians [sample], or [1] if it draws nothing."""
 
 
 def rungs(model: VariationalAutoReconstructor, samples: int, batch: int, masked: bool = False) -> dict[str, Rung]:
-    """Return functions that decode different latents with the skips of the scene's image, by name.
+    """Return, by name, functions that decode different latents with the skips of the scene's image.
 
     `posterior_mean` and `posterior_samples` take latents from the scene's posterior, `other_scene` from another
     scene's. A posterior that sees views takes all targets; `reference_only` is its mean without them.
@@ -44,37 +44,37 @@ def rungs(model: VariationalAutoReconstructor, samples: int, batch: int, masked:
         masked: whether the model sees only the visible part of the reference image.
     """
 
-    def seen(scene: SceneBatch) -> Float[Tensor, "1 3 _ _"]:
+    def input_image(scene: SceneBatch) -> Float[Tensor, "1 3 _ _"]:
         return scene.reference.images * scene.visible if masked else scene.reference.images
 
-    def posterior(scene: SceneBatch, with_views: bool = model.sees_views) -> Posterior:
-        return model.posterior(seen(scene), scene.all_views() if with_views else None, scene.depth_range)[0]
+    def encode(scene: SceneBatch, with_views: bool = model.sees_views) -> Posterior:
+        return model.posterior(input_image(scene), scene.all_views() if with_views else None, scene.depth_range)[0]
 
-    def decoded(latents: Float[Tensor, "sample channel _ _"], scene: SceneBatch) -> Gaussians:
-        features = model.encoder.features(seen(scene) * 2 - 1, model.reconstructor.feature_levels)
+    def decode(latents: Float[Tensor, "sample channel _ _"], scene: SceneBatch) -> Gaussians:
+        features = model.encoder.features(input_image(scene) * 2 - 1, model.reconstructor.feature_levels)
 
-        def decode(part: slice) -> Gaussians:
+        def decode_part(part: slice) -> Gaussians:
             count = len(latents[part])
             skips = [feature.expand(count, -1, -1, -1) for feature in features]
             cameras = scene.reference.cameras.map(lambda tensor: tensor.expand(count, -1, -1))
             splatter_image: SplatterImage = model.reconstructor(latents[part], skips)
             return splatter_image.gaussians(cameras, scene.depth_range.expand(count, -1))
 
-        return concatenate(in_parts(decode, len(latents), batch))
+        return concatenate(in_parts(decode_part, len(latents), batch))
 
-    def drawn(scene: SceneBatch, encoded: SceneBatch, seed: int) -> Gaussians:
-        q = posterior(encoded)
+    def decode_samples(scene: SceneBatch, encoded: SceneBatch, seed: int) -> Gaussians:
+        q = encode(encoded)
         # On the CPU, so that a seed means the same on every device.
         noise = torch.randn(samples, *q.mean.shape[1:], generator=torch.Generator().manual_seed(seed))
-        return decoded(q.mean + noise.to(q.mean) * q.std, scene)
+        return decode(q.mean + noise.to(q.mean) * q.std, scene)
 
     methods: dict[str, Rung] = {
-        "posterior_mean": lambda scene, other, seed: decoded(posterior(scene).mean, scene),
-        "posterior_samples": lambda scene, other, seed: drawn(scene, scene, seed),
-        "other_scene": lambda scene, other, seed: drawn(scene, other, seed),
+        "posterior_mean": lambda scene, other, seed: decode(encode(scene).mean, scene),
+        "posterior_samples": lambda scene, other, seed: decode_samples(scene, scene, seed),
+        "other_scene": lambda scene, other, seed: decode_samples(scene, other, seed),
     }
     if model.sees_views:
-        methods["reference_only"] = lambda scene, other, seed: decoded(posterior(scene, False).mean, scene)
+        methods["reference_only"] = lambda scene, other, seed: decode(encode(scene, False).mean, scene)
     return methods
 
 
@@ -91,13 +91,13 @@ def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
     if isinstance(network, VariationalAutoReconstructor):
         methods |= rungs(network, samples, batch, getattr(module, "masked", False))
 
-    def rendered(method: Rung, scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
+    def render(method: Rung, scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
         gaussians, cameras = method(scene, other, seed), scene.targets.cameras[0]
         parts = [gaussians[i : i + batch] for i in range(0, len(gaussians.means), batch)]
         renders = torch.cat([module.render_from(part, cameras).over(module.background) for part in parts])
         return renders.clamp(0, 1).expand(samples, -1, -1, -1, -1)
 
-    return {name: partial(rendered, method) for name, method in methods.items()}
+    return {name: partial(render, method) for name, method in methods.items()}
 
 
 REGIONS = ("hidden", "visible")
@@ -105,10 +105,10 @@ REGIONS = ("hidden", "visible")
 
 @dataclass
 class Measured:
-    """Measurements so far, by method: each scene's `HiddenModeScores` and energy scores in views that show the modes.
+    """Measurements of the scenes so far, in the views that show the modes.
 
-    Energy scores are of pixels that the reference hides and of the others. `classes` are those of all samples, by
-    method and the modes' probabilities; `rows` are those of the figure.
+    `scores` has each scene's `HiddenModeScores` and energy scores (of pixels that the reference hides, and of the
+    others) by method, `classes` the modes of all samples by method and probabilities, `rows` the rows of the figure.
     """
 
     scores: dict[str, list[dict[str, float | None]]] = field(default_factory=dict)
@@ -141,7 +141,7 @@ class Measured:
     def results(self, samples: int) -> dict[str, dict[str, float]]:
         """Return means over the scenes by method; an energy score without pixels is 0."""
         counts = {"scenes": len(self.names), "samples": samples}
-        means = {method: mean_over_scenes(of_scenes) for method, of_scenes in self.scores.items()}
+        means = {method: mean_over_scenes(scene_scores) for method, scene_scores in self.scores.items()}
         return {method: {name: x or 0.0 for name, x in values.items()} | counts for method, values in means.items()}
 
     def shares(self) -> dict[str, list[dict[str, object]]]:
@@ -153,13 +153,13 @@ class Measured:
         """
         rows: dict[str, list[dict[str, object]]] = {}
         for method, kinds in self.classes.items():
-            for probabilities, each in kinds.items():
-                classes, p = torch.cat(each), torch.tensor(probabilities)
+            for probabilities, parts in kinds.items():
+                classes, p = torch.cat(parts), torch.tensor(probabilities)
                 counts = torch.stack([(classes == mode).sum() for mode in range(len(p))])
                 shares = counts / counts.sum().clamp(min=1)
                 row = {
                     "probabilities": p.tolist(),
-                    "scenes": len(each),
+                    "scenes": len(parts),
                     "shares": shares.tolist(),
                     "rejected": (classes == REJECTED).float().mean().item(),
                     "total_variation": (0.5 * (shares - p).abs().sum()).item() if counts.any() else 1.0,

@@ -46,7 +46,7 @@ class SampleRenderer:
         return self.rasterize(self.generate(scene, **settings), scene)
 
     def generate(self, scene: SceneBatch, **settings: Any) -> Gaussians:
-        """Draw samples of one scene; the settings may hold another `seed`."""
+        """Draw samples of one scene; a `seed` in the settings replaces the renderer's."""
         inputs = scene.reference.images, scene.reference.cameras, scene.depth_range
         return self.model.generate(*inputs, **{"samples": self.samples, "seed": self.seed, **settings})
 
@@ -84,7 +84,7 @@ def near(reference: Cameras, targets: Cameras, degrees: float) -> Bool[Tensor, "
 
 
 def farthest(scene: SceneBatch) -> int:
-    """Return the index, in all views of a batch of one, of that whose direction differs most from the reference's."""
+    """Return the index in `all_views` of the target whose direction differs most from the reference's, of one scene."""
     return 1 + int(_cosines(scene.reference.cameras[0], scene.targets.cameras[0]).argmin())
 
 

@@ -1,4 +1,4 @@
-"""Gaussian scenes that any program wrote, scored as the samples of a model are."""
+"""Stage that reads Gaussians of any program from files, to score them like the samples of a model."""
 
 import hashlib
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ from completesplat.training.optimization import constant
 from completesplat.training.stage import Stage
 from completesplat.weights import sha256_of
 
-FILES, LEAST_IN_FRONT = "sample_*.ply", 0.1  # share of the Gaussians: a few stray ones may lie anywhere
+FILES, LEAST_IN_FRONT = "sample_*.ply", 0.1  # of a scene's Gaussians: with less, the axes are wrong
 FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 
 
 class SceneFiles(Stage):
-    """Samples from the files `sample_*.ply` of each test scene; it has nothing to train.
+    """Stage whose samples are the files `sample_*.ply` of each test scene; it trains nothing.
 
     Args:
         folder, frame, align, name: `scenes`, `frame`, `align` and `method` of `conf/test.yaml`.
@@ -47,18 +47,18 @@ class SceneFiles(Stage):
 
     @property
     def method(self) -> str:
-        """Return the name of the method that wrote the files, marked as such."""
+        """Return the name of the method, marked as read from files."""
         return f"{self.folder.resolve().name if self.name is None else self.name} (read from files)"
 
     def find(self, scenes: Sequence[str], samples: int) -> None:
         """Find the first `samples` files of these scenes, by name; raise CompleteSplatError if a scene has fewer."""
         folders = {scene: self.folder / safe_name(scene) for scene in scenes}
         self.files = {scene: sorted(folder.glob(FILES))[:samples] for scene, folder in folders.items()}
-        if few := [scene for scene, paths in self.files.items() if len(paths) < samples]:
-            folder, count = folders[few[0]], len(self.files[few[0]])
+        if incomplete := [scene for scene, paths in self.files.items() if len(paths) < samples]:
+            folder, count = folders[incomplete[0]], len(self.files[incomplete[0]])
             present = f"{count} files {FILES}" if folder.is_dir() else "no such folder"
-            wanted = f"{samples} files are wanted ({len(few)} of {len(scenes)} scenes have too few)"
-            raise CompleteSplatError(f"{folder}: {present}, {wanted}; write them, or score fewer samples")
+            needed = f"{samples} files are needed ({len(incomplete)} of {len(scenes)} scenes have too few)"
+            raise CompleteSplatError(f"{folder}: {present}, {needed}; write them, or score fewer samples")
 
     def on_test_start(self) -> None:
         self.find(self.data.store("test").names, self.evaluation.samples)  # before any scene is scored
@@ -69,10 +69,10 @@ class SceneFiles(Stage):
         return self.draw(scenes, [seed], 1)
 
     def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int, batch: int | None = None) -> Gaussians:
-        """Read the first files of each scene; Gaussians of opacity 0 fill up the smaller sets."""
+        """Read the first files of each scene, and pad the smaller sets with Gaussians of opacity 0."""
         sets = [gaussians for i in range(len(scenes.names)) for gaussians in self._read(scenes[i], samples)]
         most = max(gaussians.count for gaussians in sets)
-        return stack([one.map(lambda x: pad(x, (0, 0) * (x.ndim - 1) + (0, most - len(x)))) for one in sets])
+        return stack([part.map(lambda x: pad(x, (0, 0) * (x.ndim - 1) + (0, most - len(x)))) for part in sets])
 
     def _read(self, scene: SceneBatch, samples: int) -> list[Gaussians]:
         """Read one scene's samples and place them in the reference camera's frame, in the data's units."""
@@ -88,23 +88,23 @@ class SceneFiles(Stage):
             raise CompleteSplatError(f"{paths[0]}: nearly all Gaussians lie behind the camera; try frame={other}")
         factor = self._scale(sets[0], scene.reference) if self.align == "scale" else 1.0
         if factor is None:
-            reason = "no true depth where its first sample shows something"
+            reason = "no true depth at the pixels that its first sample covers"
             raise CompleteSplatError(f"align=scale: {scene.names}: {reason}; use align=none")
-        return [replace(one, means=factor * one.means, scales=factor * one.scales) for one in sets]
+        return [replace(x, means=factor * x.means, scales=factor * x.scales) for x in sets]
 
     def _scale(self, gaussians: Gaussians, reference: Views) -> float | None:
-        """Return the factor by which the rendered depth fits the true one best (least squares); None if none does."""
+        """Return the factor that fits rendered depth to true depth best (least squares); None without common pixels."""
         depth = surface_depth(self.render_from(gaussians[None], reference.cameras[None])[0, 0])
         true = torch.zeros_like(depth) if reference.depths is None else reference.depths
-        products = (depth * true)[known := true.isfinite() & (true > 0) & (depth > 0)]
-        return (products.sum() / depth[known].square().sum()).item() if known.any() else None
+        products = (depth * true)[mask := true.isfinite() & (true > 0) & (depth > 0)]
+        return (products.sum() / depth[mask].square().sum()).item() if mask.any() else None
 
     def on_test_epoch_end(self) -> None:
-        self.seconds.pop("inference", None)  # the time of reading files, which says nothing about the method
+        self.seconds.pop("inference", None)  # this was the time of reading files
         super().on_test_epoch_end()
 
     def facts(self) -> dict[str, object]:
-        """Return facts for the protocol; the checksum is of the sorted lines of `sha256sum` for the used files."""
+        """Return facts for the protocol; the checksum covers the sorted lines of `sha256sum` for the used files."""
         paths = [path.relative_to(self.folder) for scene in self.files.values() for path in scene]
         lines = sorted(f"{sha256_of(self.folder / path)}  {path.as_posix()}\n" for path in paths)
         checksum = hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -105,7 +105,7 @@ class Stage(LightningModule):
         """Return one set of Gaussians [batch] for each reference image, in its camera's frame."""
 
     def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int, batch: int | None = None) -> Gaussians:
-        """Return `samples` sets (one, if the model draws none) for each image and its seed, next to each other."""
+        """Return `samples` sets for each image and its seed [batch * samples], but one each if nothing is drawn."""
         return self.reconstruct(scenes, seeds[0])
 
     @property

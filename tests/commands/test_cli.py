@@ -61,7 +61,7 @@ def test_help_shows_all_verbs_and_the_settings_of_each(command):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["report", "controls"], "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR data=NAME data.root=DIR"),
+        (["report", "controls"], "give one of ckpt=FILE, weights=DIR"),
         (["test", "ckpt=nowhere/checkpoints/last.ckpt"], "no such checkpoint"),
         (["data", "toy", "kind=nonsense"], "no toy data of kind 'nonsense'"),
     ],

@@ -1,4 +1,4 @@
-"""Imports that are postponed: nothing that diffusers, numba or another library then does with them differs."""
+"""Postponed imports: diffusers, numba and other libraries work as if the modules had been imported."""
 
 import subprocess
 import sys
@@ -109,7 +109,7 @@ def run(program: str) -> None:
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_libraries_work_as_if_they_had_imported_all(name: str) -> None:
+def test_libraries_work_with_postponed_imports(name: str) -> None:
     run(IMPORTED + SCRIPTS[name])
 
 

@@ -40,18 +40,18 @@ def test_depth_is_measured_with_the_papers_settings_and_one_is_drawn(report, tmp
     assert "Deviation of depth" in message
 
 
-def test_calibration_of_weights_has_both_regions_and_their_figure(report, pipeline, tmp_path):
-    given = ["ckpt=null", f"weights={pipeline.weights}", "data=toy_objects", f"data.root={pipeline.toy}"]
-    message, results = report("calibration", *given, "samples=3")
+def test_calibration_of_weights_has_both_regions_and_a_figure(report, pipeline, tmp_path):
+    settings = ["ckpt=null", f"weights={pipeline.weights}", "data=toy_objects", f"data.root={pipeline.toy}"]
+    message, results = report("calibration", *settings, "samples=3")
     assert results["settings"] == {"scenes": 1, "samples": 3, "seed": 0, "skip_weight": 1, "guidance_weight": 0}
     assert [row["region"] for row in results["rows"]] == ["full", "hidden"]
     assert all(row["spread"] > 0 and sum(row["ranks"]) == pytest.approx(1) for row in results["rows"])
     assert all(row["energy_2"] > 0 and row["energy_3"] > 0 for row in results["rows"])
     assert imageio.imread(tmp_path / "out/calibration.png").ndim == 3
-    assert "0.25 of the truths below" in message
+    assert "0.25 of the true values below" in message
 
 
-def test_front_has_a_rung_for_each_latent_that_one_scene_has(report, tmp_path):
+def test_front_of_one_scene_has_all_rungs_but_that_of_another_scene(report, tmp_path):
     message, results = report("front")
     rows = {row["rung"]: row for row in results["rows"]}
     assert list(rows) == ["posterior_mean", "posterior_samples", "samples", "samples_without_skips"]
@@ -62,7 +62,7 @@ def test_front_has_a_rung_for_each_latent_that_one_scene_has(report, tmp_path):
     assert "mean absolute difference of two samples" in " ".join(message.split())
 
 
-def test_modes_are_told_apart_best_where_there_is_little_noise(report, tmp_path):
+def test_modes_has_shares_by_noise_level_and_a_figure(report, tmp_path):
     message, results = report("modes", "spread_views=2")
     assert results["settings"] == {"scenes": 1, "samples": 2, "seed": 0, "spread_views": 2}
     assert all(0 <= row["best_share"] <= 1 for row in results["rows"])

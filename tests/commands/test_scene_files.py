@@ -1,4 +1,4 @@
-"""`completesplat test scenes=FOLDER`: scenes that any program wrote, scored as our own samples are."""
+"""`completesplat test scenes=FOLDER`: scenes that any program wrote, scored like samples of our models."""
 
 import re
 import shutil
@@ -28,8 +28,8 @@ FEW = [f"evaluation.{few}" for few in ("batch=2", "views=1", "spread_views=2", "
 
 
 @pytest.fixture(scope="module")
-def own(pipeline, built_once):
-    """Folder with the results of a test of weights (`test`), and the samples that it drew as files (`splats`)."""
+def model_test(pipeline, built_once):
+    """Folder with the results of testing weights (`test`) and the drawn samples as files (`splats`)."""
 
     def fill(folder: Path) -> None:
         def write(self, name, gaussians, *images) -> None:
@@ -39,20 +39,20 @@ def own(pipeline, built_once):
 
         with pytest.MonkeyPatch.context() as monkeypatch:
             monkeypatch.setattr(Stage, "scene_scored", write)
-            assert call(monkeypatch, "test", f"weights={pipeline.weights}", *given(pipeline, folder / "test")) == 0
+            assert call(monkeypatch, "test", f"weights={pipeline.weights}", *toy_data(pipeline, folder / "test")) == 0
 
     return built_once("own_splats", fill)
 
 
-def given(pipeline, out: Path) -> list[str]:
+def toy_data(pipeline, out: Path) -> list[str]:
     data = ["data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32", "data.evaluation_targets=2"]
     return [*data, f"evaluation.scoring.samples={SAMPLES}", "trainer.accelerator=cpu", f"out={out}"]
 
 
-def test_our_own_samples_in_files_score_as_the_model_does(command, pipeline, own, tmp_path):
-    finished = command("test", f"scenes={own / 'splats'}", "method=Mine", *given(pipeline, tmp_path / "out"))
+def test_samples_score_the_same_from_files_as_from_the_model(command, pipeline, model_test, tmp_path):
+    finished = command("test", f"scenes={model_test / 'splats'}", "method=Mine", *toy_data(pipeline, tmp_path / "out"))
     assert finished.status == 0, finished.err
-    ours, files = (strict_json(folder / "metrics.json") for folder in (own / "test", tmp_path / "out"))
+    ours, files = (strict_json(folder / "metrics.json") for folder in (model_test / "test", tmp_path / "out"))
     _, described = ours.pop("protocol"), files.pop("protocol")
     assert ours["model"]["seconds"].pop("inference") > 0
     assert files["model"]["seconds"].keys() == {"rendering"}
@@ -65,7 +65,7 @@ def test_our_own_samples_in_files_score_as_the_model_does(command, pipeline, own
                 assert actual[name] == pytest.approx(expected[name], abs=1e-3), (row, name)
     named = {"method": "Mine (read from files)", "frame": "opencv", "align": "none", "sampler": None}
     assert {key: described[key] for key in named} == named
-    assert described["checkpoint"]["path"] == str(own / "splats")
+    assert described["checkpoint"]["path"] == str(model_test / "splats")
     assert len(described["checkpoint"]["sha256"]) == 64
     text = "\n".join(map(as_markdown, tables(find(tmp_path))))
     assert "| Mine (read from files), single sample [1] |" in text
@@ -74,7 +74,7 @@ def test_our_own_samples_in_files_score_as_the_model_does(command, pipeline, own
 
 
 def written(folder: Path, samples: Sequence[Gaussians], scene: str = "scene 0 0") -> Path:
-    """Write samples of one scene, and return the folder of all scenes."""
+    """Write samples of one scene and return `folder`."""
     (folder / scene).mkdir(parents=True)
     for index, sample in enumerate(samples):
         write_ply(folder / f"{scene}/sample_{index:02}.ply", sample)
@@ -94,31 +94,34 @@ def drawn(folder: Path, scenes: SceneBatch, samples: int, frame: str = "opencv",
     return stage.draw(scenes, [0], samples)
 
 
-def test_files_with_opengls_axes_are_turned_about_x(tmp_path):
+def test_files_with_opengl_axes_are_rotated_about_x(tmp_path):
     samples, flip = [in_front(40), in_front(25, seed=1)], torch.diag(torch.tensor([1.0, -1.0, -1.0]))
-    turned = [replace(one, means=one.means @ flip, quaternions=one.quaternions[:, [1, 0, 3, 2]]) for one in samples]
-    turned = [replace(one, quaternions=one.quaternions * torch.tensor([-1.0, 1, -1, 1])) for one in turned]
-    for one, other in zip(samples, turned, strict=True):  # i q = (-x, w, -z, y)
-        assert torch.allclose(other.covariances(), flip @ one.covariances() @ flip, atol=1e-6)
+    turned = [
+        replace(sample, means=sample.means @ flip, quaternions=sample.quaternions[:, [1, 0, 3, 2]])
+        for sample in samples
+    ]
+    turned = [replace(sample, quaternions=sample.quaternions * torch.tensor([-1.0, 1, -1, 1])) for sample in turned]
+    for sample, other in zip(samples, turned, strict=True):  # i q = (-x, w, -z, y)
+        assert torch.allclose(other.covariances(), flip @ sample.covariances() @ flip, atol=1e-6)
     result = drawn(written(tmp_path, turned), scene_batch(batch=1), 2, frame="opengl")
     assert result.opacities.shape == (2, 40)
     assert not result.opacities[1, 25:].any()
-    for one, placed in zip(samples, result, strict=False):
-        placed = placed[: one.count]
-        assert torch.allclose(placed.means, one.means, atol=1e-5)
-        assert torch.allclose(placed.covariances(), one.covariances(), atol=1e-5)
+    for sample, placed in zip(samples, result, strict=False):
+        placed = placed[: sample.count]
+        assert torch.allclose(placed.means, sample.means, atol=1e-5)
+        assert torch.allclose(placed.covariances(), sample.covariances(), atol=1e-5)
 
 
-def test_one_factor_for_all_samples_of_a_scene_is_found_by_depth(tmp_path):
+def test_align_scale_fits_one_factor_for_each_scene_to_true_depth(tmp_path):
     samples, scenes = [in_front(), in_front(seed=1)], scene_batch(batch=1)
     camera = scenes.reference.cameras[0]
     view = ReferenceRasterizer()(samples[0][None], camera[None][None])[0, 0]
     depths = torch.where(view.alpha > 0.6, view.expected_depth(), torch.zeros(()))[None]
     known = replace(scenes, reference=replace(scenes.reference, depths=depths))
-    smaller = [replace(one, means=one.means / 3, scales=one.scales / 3) for one in samples]
+    smaller = [replace(sample, means=sample.means / 3, scales=sample.scales / 3) for sample in samples]
     result = drawn(written(tmp_path / "a", smaller), known, 2, align="scale")
     for name in ("means", "scales"):
-        expected = torch.stack([getattr(one, name) for one in samples])
+        expected = torch.stack([getattr(sample, name) for sample in samples])
         assert torch.allclose(getattr(result, name), expected, rtol=1e-3, atol=1e-4)
     for unknown in (scenes, replace(known, reference=replace(known.reference, depths=torch.zeros_like(depths)))):
         with pytest.raises(CompleteSplatError, match=r"align=scale: scene 0 0: no true depth .* align=none"):
@@ -141,11 +144,11 @@ def empty(folder: Path) -> None:
 
 
 REFUSED = [
-    (remove, [], r"{scene}: no such folder, 3 files are wanted \(1 of 1 scenes have too few\); write them"),
+    (remove, [], r"{scene}: no such folder, 3 files are needed \(1 of 1 scenes have too few\); write them"),
     (
         lambda folder: (folder / "sample_00.ply").unlink(),
         [],
-        r"{scene}: 2 files sample_\*.ply, 3 files are wanted .*; .*fewer",
+        r"{scene}: 2 files sample_\*.ply, 3 files are needed .*; .*fewer",
     ),
     (behind, [], r"{scene}/sample_00.ply: nearly all .* behind the camera; try frame=opengl"),
     (empty, [], r"{scene}/sample_01.ply: holds 0 Gaussians; write it again"),
@@ -155,45 +158,45 @@ REFUSED = [
 
 @pytest.mark.parametrize(("damage", "settings", "message"), REFUSED, ids=range(len(REFUSED)))
 def test_scenes_that_cannot_be_scored_are_named_in_one_line(
-    command, pipeline, own, tmp_path, damage, settings, message
+    command, pipeline, model_test, tmp_path, damage, settings, message
 ):
-    (scene,) = shutil.copytree(own / "splats", tmp_path / "splats").iterdir()
+    (scene,) = shutil.copytree(model_test / "splats", tmp_path / "splats").iterdir()
     damage(scene)
-    finished = command("test", f"scenes={tmp_path / 'splats'}", *settings, *given(pipeline, tmp_path / "out"))
+    finished = command("test", f"scenes={tmp_path / 'splats'}", *settings, *toy_data(pipeline, tmp_path / "out"))
     (line,) = [line for line in finished.err.splitlines() if line.startswith("error: ")]
     assert finished.status == 2
     assert re.search(message.format(scene=scene), line), line
     assert not (tmp_path / "out/metrics.json").exists()
 
 
-def test_settings_that_do_not_fit_are_refused(tmp_path):
-    one = "give one: ckpt=FILE, or weights=DIR or scenes=DIR with data=NAME data.root=DIR"
-    assert refused("test", "scenes=a", "ckpt=b") == one
-    assert refused("test", "scenes=a", "weights=b", "data=toy_objects") == one
-    assert refused("test", "scenes=a") == "weights and scenes know no data: give data=NAME data.root=DIR"
+def test_contradictory_settings_are_refused(tmp_path):
+    message = "give one of ckpt=FILE, weights=DIR and scenes=DIR; all but ckpt need data=NAME"
+    assert refused("test", "scenes=a", "ckpt=b") == message
+    assert refused("test", "scenes=a", "weights=b", "data=toy_objects") == message
+    assert refused("test", "scenes=a") == "weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR"
     nowhere = ["data=toy_objects", f"data.root={tmp_path}", f"scenes={tmp_path / 'gone'}"]
     assert refused("test", *nowhere).startswith(f"scenes={tmp_path / 'gone'}: no such folder; give one with SCENE/")
     assert refused("test", "scenes=a", "frame=colmap") == "frame=colmap: choose one of opencv, opengl"
     assert refused("test", "scenes=a", "align=all") == "align=all: choose one of none, scale"
 
 
-def test_hidden_modes_of_files(command, pipeline, own, tmp_path):
+def test_hidden_modes_are_scored_from_files(command, pipeline, model_test, tmp_path):
     settings = ["evaluation=hidden_modes", "evaluation.samples=3", "align=scale", *FEW]
-    data = [setting for setting in given(pipeline, tmp_path / "out") if "scoring" not in setting]
-    finished = command("test", f"scenes={own / 'splats'}", *settings, *data)
+    data = [setting for setting in toy_data(pipeline, tmp_path / "out") if "scoring" not in setting]
+    finished = command("test", f"scenes={model_test / 'splats'}", *settings, *data)
     assert finished.status == 0, finished.err
     results = strict_json(tmp_path / "out/hidden_modes.json")
     assert results.keys() == {"model", "true_sampler", "mean_predictor"}
     assert strict_json(tmp_path / "out/protocol.json")["method"] == "splats (read from files)"
-    finished = command("test", f"scenes={own / 'splats'}", *settings, "evaluation.samples=4", *data)
-    assert "3 files sample_*.ply, 4 files are wanted" in finished.err
+    finished = command("test", f"scenes={model_test / 'splats'}", *settings, "evaluation.samples=4", *data)
+    assert "3 files sample_*.ply, 4 files are needed" in finished.err
 
 
 @pytest.mark.slow
-def test_the_lines_of_the_readme_run_as_they_stand(command, tmp_path):
+def test_the_lines_of_the_readme_run_as_written(command, tmp_path):
     document = ROOT / "completesplat/metrics/README.md"
     (lines,) = re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL)
-    making, *commands = [arguments_of(one) for one in block_commands(document) if re.search("HELDOUT|SPLATS", one)]
+    making, *commands = [arguments_of(text) for text in block_commands(document) if re.search("HELDOUT|SPLATS", text)]
     assert command(*making, "scenes=20", "frames=8").status == 0
     exec(lines, {})
     for arguments in commands:

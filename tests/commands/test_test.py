@@ -158,9 +158,9 @@ def test_weights_score_as_the_run_they_were_saved_with(scored, pipeline):
 
 def test_either_a_checkpoint_or_weights_are_scored():
     for given, message in (
-        ({"ckpt": None}, "give one: ckpt=FILE, or weights=DIR"),
-        ({"ckpt": "a", "weights": "b"}, "give one: ckpt=FILE, or weights=DIR"),
-        ({"ckpt": None, "weights": "b"}, "weights and scenes know no data"),
+        ({"ckpt": None}, "give one of ckpt=FILE, weights=DIR"),
+        ({"ckpt": "a", "weights": "b"}, "give one of ckpt=FILE, weights=DIR"),
+        ({"ckpt": None, "weights": "b"}, "weights=DIR and scenes=DIR need data"),
         ({"ckpt": "a", "data": {"root": "DIR"}}, "a checkpoint's data are its run's"),
     ):
         with pytest.raises(CompleteSplatError, match=message):

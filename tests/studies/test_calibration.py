@@ -21,7 +21,7 @@ def drawn(*shape: int, seed: int) -> torch.Tensor:
 
 
 def scene(seed: int) -> SceneBatch:
-    """Values from one normal distribution. Every view is a wall at depth 2; the last target looks away from it."""
+    """A wall at depth 2 with normally distributed values in all views; the last target looks the other way."""
     poses = torch.eye(4).repeat(1, 4, 1, 1)
     poses[:, 3] *= torch.tensor([-1.0, 1, -1, 1])[:, None]
     cameras = Cameras(poses, pinhole(60, SIZE).repeat(1, 4, 1, 1), (SIZE, SIZE))
@@ -55,12 +55,12 @@ def test_samples_of_the_true_distribution_are_calibrated(samples):
         assert row["spread_over_error"] == pytest.approx(1, abs=0.04)
         assert row["spread"] == pytest.approx(math.sqrt(1 + 1 / samples), abs=0.04)
         assert len(row["bins"]) == 10
-        # All values have one variance, so that bins by the samples' own would differ by chance.
+        # All values have the same variance. Bins chosen by the variance of the same samples would differ by chance.
         for spread, error in row["bins"] if samples > 3 else ():
             assert spread == pytest.approx(error, rel=0.1)
 
 
-def test_samples_of_half_the_spread_are_too_sure():
+def test_samples_of_half_the_spread_are_overconfident():
     for row in measured(0.5):
         assert row["spread_over_error"] == pytest.approx(math.sqrt(0.25 * (SAMPLES + 1) / (SAMPLES + 0.25)), abs=0.02)
         lowest, *inner, highest = row["ranks"]
@@ -71,7 +71,7 @@ def test_samples_of_half_the_spread_are_too_sure():
     assert max(wide["below_all"], wide["above_all"]) < 0.05
 
 
-def test_the_energy_score_is_that_of_groups_and_flat():
+def test_the_energy_score_does_not_depend_on_the_number_of_samples():
     truth, samples = drawn(3000, seed=0), drawn(6, 3000, seed=1)
     scores = energies(samples, truth)
     assert list(scores) == ["energy_2", "energy_4", "energy_6"]
@@ -80,7 +80,7 @@ def test_the_energy_score_is_that_of_groups_and_flat():
     assert energies(samples[:4], truth)["energy_4"] == scores["energy_4"] == energy_score(samples[:4], truth)
 
 
-def test_samples_without_spread_or_error_have_a_figure(tmp_path):
+def test_samples_without_spread_have_a_figure(tmp_path):
     results = rows(Normal(None, None, 0.5, 2, 0, 0.0), [scene(0)], lambda _: None)
     assert [row["spread"] for row in results] == [0, 0]
     plot_calibration(results, tmp_path / "calibration.png", "title")

@@ -14,7 +14,7 @@ SIZE = 16
 
 
 def scene() -> SceneBatch:
-    """Seen from the front; targets are the left and the back. The object is the middle column."""
+    """A reference view from the front and targets from the left and from behind; the object is the middle column."""
     eyes, center = torch.tensor([[0.0, 0, 0], [-3, 0, 3], [0, 0, 6]]), torch.tensor([0.0, 0, 3])
     poses, masks = look_at(eyes, center, torch.tensor([0.0, -1, 0])), torch.zeros(3, 1, SIZE, SIZE)
     masks[..., SIZE // 2] = 1
@@ -35,7 +35,7 @@ def test_difference_is_the_mean_over_pairs_inside_the_mask():
     assert difference(images[:1], mask) == 0
 
 
-def test_figures_are_of_the_reference_and_the_farthest_view_and_of_the_object():
+def test_figures_of_two_views_for_all_pixels_and_for_the_object():
     batch = scene()
     images = batch.all_views().images.repeat(2, 1, 1, 1, 1)
     images[1, 0, ..., SIZE // 2] += 0.1

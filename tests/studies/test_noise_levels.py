@@ -1,4 +1,4 @@
-"""Modes in noisy latents, for denoisers whose shares are known."""
+"""Shares of the true mode for denoisers with known answers."""
 
 import pytest
 import torch
@@ -19,13 +19,13 @@ LATENTS = DISTANCE / 2**0.5 * torch.eye(MODES, 32).view(MODES, *SHAPE)  # all at
 
 
 def exact(noisy: Tensor, time: float) -> Tensor:
-    """The mean of the clean latents that may have become these noisy ones."""
+    """Return the expected clean latents given the noisy ones."""
     distances = (noisy[:, None] - (1 - time) * LATENTS).square().flatten(2).sum(-1)
     return (-distances / (2 * time**2)).softmax(1) @ LATENTS.flatten(1)
 
 
 def table(monkeypatch: pytest.MonkeyPatch, estimate) -> list[dict[str, float]]:
-    """Rows for a denoiser that estimates the clean latent by `estimate`, given noisy latents and time."""
+    """Return the rows of a denoiser whose clean latents are `estimate(noisy, time)`."""
 
     class Denoiser(nn.Module):
         def forward(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
@@ -41,7 +41,7 @@ def table(monkeypatch: pytest.MonkeyPatch, estimate) -> list[dict[str, float]]:
     return rows(model, [scene_batch(), scene_batch()], draws=50, seed=0)
 
 
-def test_an_exact_denoiser_has_the_share_that_is_best(monkeypatch):
+def test_an_exact_denoiser_has_the_best_share(monkeypatch):
     result = table(monkeypatch, exact)
     assert [row["denoiser_share"] for row in result] == pytest.approx([row["best_share"] for row in result], abs=1e-3)
     assert result[0]["best_share"] == pytest.approx(1, abs=1e-4)
@@ -62,7 +62,7 @@ def test_timesteps_of_training_and_sampler_are_counted_once_each(monkeypatch):
 
 
 class Scenes:
-    """The second of four scenes shows its hidden part."""
+    """Four scenes, of which the second shows its hidden part."""
 
     def __len__(self) -> int:
         return 4

@@ -213,7 +213,7 @@ class EvaluationScenes(Dataset[Loaded]):
 
 
 def with_true_depths(scene: SceneBatch, sequence: PosedSequence, reference: int, targets: list[int]) -> SceneBatch:
-    """Return the scene of these views with their true depth, if the data set has it."""
+    """Return a scene with the true depth of its views, if the data set has it."""
     read = sequence.read_depth
     return scene if read is None else _with_depths(scene, torch.stack([read(view) for view in (reference, *targets)]))
 

@@ -117,7 +117,7 @@ class ToyHiddenModes:
         return stack([replace(scene, targets=replace(scene.targets, images=images)) for images in truths])
 
     def _read(self, name: str) -> tuple[ToyScene, PosedSequence, int]:
-        """Return a scene, drawn again and as it is on the disk, and its reference view."""
+        """Return a scene (drawn again), its sequence on the disk, and the index of its reference view."""
         toy, sequence = self._drawn_again(name), self.store.source.read(name)
         reference, _ = self.choose(sequence)
         if self._differs(self._truths(toy, sequence.frames[reference]), LEAK).any():

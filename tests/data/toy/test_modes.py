@@ -54,7 +54,7 @@ def test_modes_differ_in_the_patch_and_nowhere_else_and_the_reference_does_not_s
     assert scene.unseen[list(scene.views)][scene.region].float().mean() > 0.95
 
 
-def test_a_scene_in_every_mode_has_one_reference_and_the_stored_images_in_its_true_mode(toy_root, scene):
+def test_versions_share_the_reference_and_show_the_stored_images_in_the_true_mode(toy_root, scene):
     versions = scenes_of(toy_root)[0].versions(0)
     assert versions.names == scene.scene.names * len(PATCH_COLORS)
     assert (versions.reference.images == scene.scene.reference.images).all()
