@@ -117,15 +117,16 @@ def test_align_scale_fits_one_factor_for_each_scene_to_true_depth(tmp_path):
     camera = scenes.reference.cameras[0]
     view = ReferenceRasterizer()(samples[0][None], camera[None][None])[0, 0]
     depths = torch.where(view.alpha > 0.6, view.expected_depth(), torch.zeros(()))[None]
-    known = replace(scenes, reference=replace(scenes.reference, depths=depths))
+    with_depth = replace(scenes, reference=replace(scenes.reference, depths=depths))
     smaller = [replace(sample, means=sample.means / 3, scales=sample.scales / 3) for sample in samples]
-    result = drawn(written(tmp_path / "a", smaller), known, 2, align="scale")
+    result = drawn(written(tmp_path / "a", smaller), with_depth, 2, align="scale")
     for name in ("means", "scales"):
         expected = torch.stack([getattr(sample, name) for sample in samples])
         assert torch.allclose(getattr(result, name), expected, rtol=1e-3, atol=1e-4)
-    for unknown in (scenes, replace(known, reference=replace(known.reference, depths=torch.zeros_like(depths)))):
+    zeros = replace(scenes, reference=replace(scenes.reference, depths=torch.zeros_like(depths)))
+    for without_depth in (scenes, zeros):
         with pytest.raises(CompleteSplatError, match=r"align=scale: scene 0 0: no true depth .* align=none"):
-            drawn(tmp_path / "a", unknown, 2, align="scale")
+            drawn(tmp_path / "a", without_depth, 2, align="scale")
 
 
 def remove(folder: Path) -> None:

@@ -99,6 +99,9 @@ def test_scenes_of_no_use_are_counted():
                 raise DataError("broken", sequence="bad")
             return super().__getitem__(index)
 
+        def versions(self, index):
+            raise AssertionError("only single modes are wanted")
+
     scenes = Broken([SCENES[0], None, SCENES[1]])
     assert usable(scenes, None) == (SCENES, ["bad: broken"])
     assert usable(scenes, 1) == (SCENES[:1], [])
