@@ -165,5 +165,5 @@ def diffusion_of(stage: "Stage") -> CompleteSplat:
     """Return the model of latent diffusion; raise CompleteSplatError if the stage is another one."""
     model = getattr(stage, "completesplat", None)
     if not isinstance(model, CompleteSplat):
-        raise CompleteSplatError("this checkpoint is of a model that draws no samples; a diffusion model is needed")
+        raise CompleteSplatError("this model has no sampler: a diffusion model is needed, which stage 2 trains")
     return model
