@@ -88,7 +88,7 @@ class _StandIn(ModuleType):
     __path__: MutableSequence[str] = []  # noqa: RUF012
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") and name != "__pyx_capi__":  # `inspect` looks for these; numba reads the last
+        if name.startswith("__") and name != "__pyx_capi__":  # `inspect` looks for these, Cython for the last
             raise AttributeError(name)
         return getattr(_real(self.__name__), name)
 
