@@ -25,7 +25,7 @@ from completesplat.opening import locate, read_saved
 from completesplat.opening.parts import PartConfig, build, check_architecture, untrained
 from completesplat.scene import Views
 from completesplat.scene_model import SceneModel, camera_tensors
-from completesplat.settings.schema import Positive, Seed
+from completesplat.settings.schema import Natural, Positive, Seed
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import concatenate
 from completesplat.weights import first_line
@@ -119,12 +119,11 @@ class CompleteSplat(SceneModel):
         steps: int | None = None,
         seed: Seed | Sequence[Seed] = 0,
         visible: Float[Tensor, "batch 1 height width"] | None = None,
+        color_fits: Natural = 0,
         batch: Positive | None = None,
         on_step: Callable[[int, int, Gaussians], None] | None = None,
     ) -> Gaussians:
-        """Draw `samples` scenes for each image.
-
-        All noise is drawn first, so `batch` changes nothing but the rounding of float32.
+        """Draw Gaussians [batch * samples]: the scenes of one image next to each other, in the frame of its camera.
 
         Args:
             skip_weight: default 1, the most faithful (supplement, "Diverse Sampling"), or 0 if something is hidden.
@@ -132,11 +131,10 @@ class CompleteSplat(SceneModel):
             steps: denoising steps; by default the sampler's number.
             seed: seed of all noise, or one for each image, whose samples then do not depend on the other images.
             visible: 0 where an image is hidden; hidden pixels have no influence.
-            batch: the largest number of latents at a time; all by default, or fewer if a GPU's memory does not suffice.
+            color_fits: rounds in which colours are fitted to the image (`fit_colors`); 0 in the paper.
+            batch: the largest number of latents at a time, which changes only the rounding of float32; all by default,
+                or fewer if a GPU's memory does not suffice.
             on_step: called after each denoiser call of each batch with its number, the timestep, the estimated scenes.
-
-        Returns:
-            Gaussians [batch * samples], the samples of one image next to each other, in the frame of its camera.
 
         Raises:
             CompleteSplatError: a weight lies outside of [0, 1], skips meet hidden pixels, or the steps are impossible.
@@ -157,7 +155,8 @@ class CompleteSplat(SceneModel):
 
         # Sample first, then decode: if a GPU's memory does not suffice to decode a part, its latents are not lost.
         latents = torch.cat(in_parts(draw, len(noise), batch))
-        return concatenate(in_parts(lambda part: decode(latents[part], part), len(noise), batch))
+        scenes = concatenate(in_parts(lambda part: decode(latents[part], part), len(noise), batch))
+        return self.fitted(scenes, images, cameras, visible, color_fits)
 
     def _decode(
         self,

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,15 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import atomic_path, make_folder, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
+from completesplat.rasterizers.color_fitting import fit_colors
+from completesplat.rasterizers.selection import auto
 from completesplat.scene import Views
-from completesplat.settings.schema import check_settings
+from completesplat.settings.schema import Natural, check_settings
 from completesplat.splatter_image import Parameterization
+from completesplat.tensors import concatenate
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
+
+_rasterizer = cache(auto)
 
 
 class SceneModel(nn.Module):
@@ -66,12 +72,14 @@ class SceneModel(nn.Module):
         *,
         samples: int = 1,
         visible: Float[Tensor, "batch 1 height width"] | None = None,
+        color_fits: Natural = 0,
         **settings: object,
     ) -> Gaussians:
         """Reconstruct the scene of each image, in its camera's frame.
 
         Args:
             visible: 0 where an image is hidden; hidden pixels have no influence.
+            color_fits: rounds in which colours are fitted to the image (`fit_colors`); 0 in the paper.
             **settings: sampling options of `CompleteSplat.generate`; they have no effect.
 
         Raises:
@@ -84,7 +92,27 @@ class SceneModel(nn.Module):
         reconstruction: Reconstruction = self.eval().reconstruction_model(images)
         scenes = reconstruction.splatter_image.gaussians(cameras, depth_range)
         # Gaussians without what a subclass adds, such as colours that depend on the direction.
-        return Gaussians(scenes.means, scenes.quaternions, scenes.scales, scenes.opacities, scenes.colors)
+        plain = Gaussians(scenes.means, scenes.quaternions, scenes.scales, scenes.opacities, scenes.colors)
+        return self.fitted(plain, images, cameras, visible, color_fits)
+
+    def fitted(
+        self,
+        scenes: Gaussians,
+        images: Float[Tensor, "batch 3 height width"],
+        cameras: Cameras,
+        visible: Float[Tensor, "batch 1 height width"] | None,
+        color_fits: int,
+    ) -> Gaussians:
+        """Return scenes [batch * samples] with colours fitted to what is visible of their images."""
+        if not color_fits:
+            return scenes
+        background, parts = 0.5 if self.background is None else self.background, []
+        for i in range(len(scenes.means)):  # one after the other, for the memory
+            own = slice(j := i * len(images) // len(scenes.means), j + 1)
+            shown = None if visible is None else visible[own]
+            image = cameras[own], images[own]
+            parts.append(fit_colors(scenes[i : i + 1], *image, _rasterizer(), color_fits, background, shown))
+        return concatenate(parts)
 
     @property
     def parameterization(self) -> Parameterization:
@@ -107,7 +135,7 @@ class SceneModel(nn.Module):
         Args:
             image: a file, a PIL image, an array or a tensor (see `read`), or what `read` returned.
             visible: 0 where the image is hidden; see `completesplat.data.images.photograph`.
-            **settings: `samples`, `skip_weight`, `guidance_weight`, `steps`, `seed`, ...: see `generate`.
+            **settings: `samples`, `skip_weight`, `color_fits`, `steps`, `seed`, ...: see `generate`.
 
         Raises:
             CompleteSplatError: the image is not readable, or `generate` refuses an option.

@@ -202,7 +202,7 @@ def _predict(
     visible = visible_part(config, image, model.image_size)
     if warnings := remarks(photograph, model, whole=visible is None):
         log.warning("%s: %s", printable(image.name), "; ".join(warnings))
-    settings = {name: config[name] for name in ("samples", "seed")}
+    settings = {name: config[name] for name in ("samples", "seed", "color_fits")}
     sampler = {}
     if isinstance(model, CompleteSplat):
         settings["guidance_weight"] = config.guidance_weight

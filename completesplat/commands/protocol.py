@@ -100,13 +100,14 @@ def provenance(data: "SceneDataModule", out: Path) -> dict[str, object]:
 def drawing(module: Any) -> dict[str, object]:
     """Return the settings of the sampler; nulls for deterministic models and for scenes from files."""
     if not hasattr(module, "completesplat"):
-        return dict.fromkeys(("sampler", "steps", "skip_weight", "guidance_weight"))
+        return dict.fromkeys(("sampler", "steps", "skip_weight", "guidance_weight", "color_fits"))
     sampler = module.completesplat.sampler
     return {
         "sampler": type(sampler.scheduler).__name__,
         "steps": sampler.steps,
         "skip_weight": module.skip_weight,
         "guidance_weight": module.guidance_weight,
+        "color_fits": module.color_fits,
     }
 
 

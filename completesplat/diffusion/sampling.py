@@ -2,8 +2,7 @@
 
 import copy
 import logging
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -33,18 +32,11 @@ class Sampler:
     Args:
         scheduler: e.g. `diffusers.DDIMScheduler`; its options also define the forward process in training.
         steps: denoising steps unless a call overrides them (50 in the paper).
-        ancestral: renew noise in each step (`renewed`), which forgets earlier errors; for flow matching only.
-
-    Raises:
-        CompleteSplatError: `ancestral` is set for diffusion.
     """
 
-    def __init__(self, scheduler: Any, steps: Annotated[int, Range(1, 10_000)] = 50, ancestral: bool = False) -> None:
-        if ancestral and not is_flow(scheduler):
-            raise CompleteSplatError("sampler.ancestral: for flow matching (sampler=flow25, flow50_ancestral) only")
+    def __init__(self, scheduler: Any, steps: Annotated[int, Range(1, 10_000)] = 50) -> None:
         self.scheduler = scheduler
         self.steps = steps
-        self.ancestral = ancestral
 
     @torch.no_grad()
     def __call__(
@@ -65,7 +57,7 @@ class Sampler:
             CompleteSplatError: the guidance weight lies outside of [0, 1], or the scheduler cannot make these steps.
         """
         scheduler = self.set_up(steps, noise.device)
-        flow, fresh = is_flow(scheduler), fresh_noise(noise)
+        flow = is_flow(scheduler)
         latent: Tensor = noise if flow else noise * scheduler.init_noise_sigma
         for index, timestep in enumerate(scheduler.timesteps):
             level = timestep.round().long()
@@ -73,11 +65,7 @@ class Sampler:
             predicted = guided_noise(denoise, inputs, level.expand(len(noise)), conditioning, guidance_weight)
             if on_step is not None:
                 on_step(index, int(level), clean_estimate(scheduler, inputs, predicted, level))
-            if self.ancestral:
-                time, following = scheduler.sigmas[index : index + 2].tolist()
-                latent = renewed(latent, predicted, next(fresh), time, following)
-            else:
-                latent = scheduler.step(predicted, timestep, latent).prev_sample
+            latent = scheduler.step(predicted, timestep, latent).prev_sample
         return latent
 
     def set_up(self, steps: int | None = None, device: torch.device | None = None) -> Any:
@@ -119,28 +107,6 @@ class Sampler:
         """Return T, the number of noise levels of the forward process."""
         steps: int = self.scheduler.config.num_train_timesteps
         return steps
-
-
-def renewed(latent: Latents, velocity: Latents, fresh: Latents, time: float, following: float) -> Latents:
-    """Return a flow matching step from time t to s that renews the share 1 - r^2 of the noise's variance.
-
-    With h_t = (1 - t) h + t eps, n(t) = t / (1 - t) and r = n(s) / n(t), the forward process makes h_t from h_s by
-    adding noise that is independent of h_s. Given h, the reverse is h_s = (1 - s) h + s (r eps + sqrt(1 - r^2) z) with
-    new noise z. This is the ancestral step of diffusion (Ho et al. 2020, Eq. 7; k-diffusion's
-    `sample_euler_ancestral_RF`), with the denoiser's estimates in the place of h and eps.
-    """
-    clean, noise = latent - time * velocity, latent + (1 - time) * velocity
-    ratio = following * (1 - time) / (time * (1 - following))
-    return (1 - following) * clean + following * (ratio * noise + math.sqrt(1 - ratio**2) * fresh)
-
-
-def fresh_noise(noise: Latents) -> Iterator[Latents]:
-    """Yield new noise for each step; a latent's new noise depends on that latent's first noise alone."""
-    seeds = noise.float().contiguous().view(torch.int32).flatten(1).sum(1).tolist()
-    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
-    while True:
-        drawn = [torch.randn(noise.shape[1:], generator=generator) for generator in generators]
-        yield torch.stack(drawn).to(noise)
 
 
 def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:

@@ -35,7 +35,8 @@ CAPTIONS = {
 }
 MOST_CHARACTERS = 20_000  # characters of a config that are shown
 NAMED = {"image": "photograph", "mask": "mask", "box": "box", "fov_degrees": "degrees of view", "seed": "seed"}
-NAMED |= {"skip_weight": "skip weight", "guidance_weight": "guidance", "sampler": "sampler", "steps": "steps"}
+NAMED |= {"skip_weight": "skip weight", "guidance_weight": "guidance", "color_fits": "colour fits"}
+NAMED |= {"sampler": "sampler", "steps": "steps"}
 """Settings of a prediction, and their names on the page."""
 UNFOLDED = 3  # up to this number, all runs are unfolded; beyond it, only runs with a report's figure
 

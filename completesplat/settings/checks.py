@@ -69,6 +69,7 @@ class SceneSettings(TypedDict):
     weights: str
     skip_weight: Share | None
     guidance_weight: Share
+    color_fits: Annotated[int, Range(0, 100)]
     steps: Annotated[int, Range(1, 1000)] | None
     fov: float | None
     frames: Annotated[int, Range(1, 1000)]

@@ -22,12 +22,14 @@ def rows(
 ) -> tuple[list[dict[str, Any]], list[list[SheetCell | None]]]:
     """Return a row for each rung with means of `figures` over the scenes, and a sheet of the first scene.
 
-    The rungs are those of `mode_benchmark.rungs`, then the model's samples at skip weights 1 and 0. The other scene is
-    the previous one; with one scene there is no rung `other_scene`. The sheet shows two samples of each rung and
-    `AMPLIFIED` times their difference, in the reference view and then in the farthest view.
+    The rungs are those of `mode_benchmark.rungs`, then the model's samples at skip weight 1, the same after two
+    rounds of `fit_colors`, and at skip weight 0. The other scene is the previous one; with one scene there is no rung
+    `other_scene`. The sheet shows two samples of each rung and `AMPLIFIED` times their difference, in the reference
+    view and then in the farthest view.
     """
     methods = rungs(renderer.model.autoreconstructor, renderer.samples, renderer.samples)
     methods["samples"] = lambda scene, other, seed: renderer.generate(scene, seed=seed, skip_weight=1.0)
+    methods["samples_fitted"] = lambda scene, other, seed: renderer.generate(scene, seed=seed, color_fits=2)
     methods["samples_without_skips"] = lambda scene, other, seed: renderer.generate(scene, seed=seed, skip_weight=0.0)
 
     def render(name: str, index: int) -> Renders:

@@ -16,7 +16,7 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.scene import CachedScene, SceneBatch
-from completesplat.settings.schema import Positive, Share
+from completesplat.settings.schema import Natural, Positive, Share
 from completesplat.training.encoding import check_cache
 from completesplat.training.stage import Stage, prepare_network
 from completesplat.weights.checkpoint_reading import load_part
@@ -37,7 +37,7 @@ class LatentDiffusion(Stage):
             ones if it has them, and all measured values.
         unconditional_probability: probability of zeroing phi_ref, for guidance (0.2 in the paper).
         noise_draws: timesteps and noises that are drawn for each scene of a batch, whose image is encoded once.
-        skip_weight, guidance_weight: settings of the samples drawn in validation and test.
+        skip_weight, guidance_weight, color_fits: settings of the samples drawn in validation and test.
         scale_batches: training batches on which the latents' mean and standard deviation are measured.
         channels_last, compile: of the denoiser, see `prepare_network`.
         **rendering_and_optimization: see `Stage`.
@@ -57,6 +57,7 @@ class LatentDiffusion(Stage):
         noise_draws: Positive = 1,
         skip_weight: Share = 1.0,
         guidance_weight: Share = 0.0,
+        color_fits: Natural = 0,
         scale_batches: Positive = 50,
         channels_last: bool = False,
         compile: bool = False,
@@ -70,6 +71,7 @@ class LatentDiffusion(Stage):
         self.noise_draws = noise_draws
         self.skip_weight = skip_weight
         self.guidance_weight = guidance_weight
+        self.color_fits = color_fits
         self.scale_batches = scale_batches
         if autoreconstructor_checkpoint is not None and checkpoint is not None:
             raise WeightsError("model.checkpoint holds stage 1 as well: set model.autoreconstructor_checkpoint=null")
@@ -210,6 +212,7 @@ class LatentDiffusion(Stage):
             scenes.depth_range,
             skip_weight=self.skip_weight,
             guidance_weight=self.guidance_weight,
+            color_fits=self.color_fits,
             visible=scenes.visible,
             seed=seed,
             **settings,

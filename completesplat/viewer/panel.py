@@ -19,7 +19,7 @@ from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
 
 MOST_SAMPLES, MOST_STEPS, MOST_SEED = 8, 100, 99
-SLIDERS = ("samples", "skip_weight", "guidance_weight", "steps", "seed")  # settings of `CompleteSplat`
+SLIDERS = ("samples", "skip_weight", "guidance_weight", "color_fits", "steps", "seed")  # settings of `CompleteSplat`
 SIDE_BY_SIDE = "all, side by side"
 CUT_OUT = "of the next images: only the object, before what the weights know (needs completesplat[background])"
 KEYS = 9  # keys 1 to 9 choose a sample; 0 shows all
@@ -56,6 +56,7 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
             samples=slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
             skip_weight=slider("Skip weight", 0.0, 1.0, 0.05, start["skip_weight"], hint=free),
             guidance_weight=slider("Guidance", 0.0, 1.0, 0.05, start["guidance_weight"], hint=diverse),
+            color_fits=slider("Colour fits", 0, 10, 1, start["color_fits"], hint="rounds of fitting to the image"),
             steps=slider("Steps", 1, most_steps, 1, first_steps, hint="denoising steps"),
             seed=slider("Seed", 0, max(MOST_SEED, start["seed"]), 1, start["seed"]),
             live=gui.add_checkbox("Draw when a slider moves", True, visible=draws),

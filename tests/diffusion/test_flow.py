@@ -1,13 +1,11 @@
 """Flow matching: `sampler=flow25` and its training."""
 
-from itertools import islice
-
 import pytest
 import torch
-from diffusers import DDIMScheduler, FlowMatchEulerDiscreteScheduler
+from diffusers import FlowMatchEulerDiscreteScheduler
 
 from completesplat.diffusion.objective import clean_estimate, target
-from completesplat.diffusion.sampling import Sampler, fresh_noise, with_forward_process
+from completesplat.diffusion.sampling import Sampler, with_forward_process
 from completesplat.errors import CompleteSplatError
 
 CLEAN = torch.randn(2, 4, 3, 3, generator=torch.Generator().manual_seed(1))
@@ -27,10 +25,8 @@ def test_the_target_is_the_velocity_and_gives_the_latent_back(sampler):
     torch.testing.assert_close(clean_estimate(sampler.scheduler, noisy, velocity, time[0]), CLEAN)
 
 
-@pytest.mark.parametrize("ancestral", [False, True])
 @pytest.mark.parametrize("steps", [1, 5, 30])
-def test_a_perfect_denoiser_takes_noise_to_the_latent_in_any_number_of_steps(sampler, steps, ancestral):
-    sampler.ancestral = ancestral
+def test_a_perfect_denoiser_takes_noise_to_the_latent_in_any_number_of_steps(sampler, steps):
     calls = []
 
     def velocity(noisy, time, conditioning):
@@ -41,8 +37,7 @@ def test_a_perfect_denoiser_takes_noise_to_the_latent_in_any_number_of_steps(sam
     assert calls == [round(1000 * (1 - i / steps)) for i in range(steps)]
 
 
-@pytest.mark.parametrize("ancestral", [False, True])
-def test_an_exact_denoiser_gives_the_data_distribution(ancestral):
+def test_an_exact_denoiser_gives_the_data_distribution():
     """Data with two modes, of which one is three times as probable: shares, means and deviations of both."""
     modes, shares, std = torch.tensor([-2.0, 1.0]), torch.tensor([0.25, 0.75]), 0.1
 
@@ -54,7 +49,7 @@ def test_an_exact_denoiser_gives_the_data_distribution(ancestral):
         clean = (weight * (modes + (1 - t) * std**2 / spread * distance)).sum(-1)
         return ((noisy - clean) / t).float()
 
-    sampler = Sampler(FlowMatchEulerDiscreteScheduler(), steps=200, ancestral=ancestral)
+    sampler = Sampler(FlowMatchEulerDiscreteScheduler(), steps=200)
     noise = torch.randn(2, 1, 100, 100, generator=torch.Generator().manual_seed(0))
     drawn = sampler(velocity, noise, noise).flatten()
     left = drawn < -0.5
@@ -62,20 +57,6 @@ def test_an_exact_denoiser_gives_the_data_distribution(ancestral):
     for mode, result in zip(modes, (drawn[left], drawn[~left]), strict=True):
         assert result.mean().item() == pytest.approx(mode.item(), abs=0.01)
         assert result.std().item() == pytest.approx(std, abs=0.01)
-
-
-def test_renewed_noise_depends_on_the_first_alone():
-    sampler = Sampler(FlowMatchEulerDiscreteScheduler(), steps=5, ancestral=True)
-    velocity = lambda noisy, time, conditioning: noisy  # noqa: E731
-    both = sampler(velocity, NOISE, NOISE)
-    torch.testing.assert_close(sampler(velocity, NOISE[1:], NOISE[1:]), both[1:])
-    torch.testing.assert_close(sampler(velocity, NOISE, NOISE), both, atol=0, rtol=0)
-    # Each step has its own, and it is white.
-    first, second = islice(fresh_noise(torch.randn(1, 4, 32, 32)), 2)
-    assert (first * second).mean().abs() < 0.06
-    assert first.std().item() == pytest.approx(1, abs=0.05)
-    with pytest.raises(CompleteSplatError, match="for flow matching"):
-        Sampler(DDIMScheduler(), ancestral=True)
 
 
 def test_training_favours_the_middle_of_the_way(sampler):

@@ -29,7 +29,15 @@ pytestmark = [
 ]
 SWIFTSHADER = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 WINDOW = {"width": 700, "height": 360}
-START = {"samples": 1, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0, "remove_background": False}
+START = {
+    "samples": 1,
+    "skip_weight": 1.0,
+    "guidance_weight": 0.0,
+    "color_fits": 0,
+    "steps": 2,
+    "seed": 0,
+    "remove_background": False,
+}
 GREY = 128
 
 

@@ -29,7 +29,7 @@ from completesplat.viewer.page import Page, Saver  # noqa: E402
 from completesplat.viewer.panel import SIDE_BY_SIDE, preview_of, thumbnail_row  # noqa: E402
 from completesplat.viewer.splat_view import SplatView  # noqa: E402
 
-SETTINGS = {"samples": 2, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0}
+SETTINGS = {"samples": 2, "skip_weight": 1.0, "guidance_weight": 0.0, "color_fits": 0, "steps": 2, "seed": 0}
 START = SETTINGS | {"remove_background": False}
 
 

@@ -1,0 +1,93 @@
+"""Colours that are fitted to an image: what it shows follows it, what it hides does not."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.rasterizers.color_fitting import fit_colors
+from completesplat.rasterizers.reference import ReferenceRasterizer
+
+SIDE = 8
+CAMERA = Cameras(torch.eye(4)[None], pinhole(60.0, SIDE)[None], (SIDE, SIDE))
+VIEW = CAMERA.map(lambda tensor: tensor[:, None])
+
+
+def wall(depth: float, grey: float) -> Gaussians:
+    """A nearly opaque wall of Gaussians, one for each pixel and somewhat wider than it."""
+    place = (torch.arange(SIDE) + 0.5) / SIDE * 2 - 1
+    reach = depth * torch.tan(torch.deg2rad(torch.tensor(30.0)))
+    y, x = torch.meshgrid(place * reach, place * reach, indexing="ij")
+    means = torch.stack([x, y, torch.full_like(x, depth)], -1).view(1, -1, 3)
+    shape = means.shape[:2]
+    return Gaussians(
+        means,
+        torch.tensor([1.0, 0, 0, 0]).expand(*shape, 4),
+        torch.full((*shape, 3), float(reach / SIDE)),
+        torch.full(shape, 0.99),
+        torch.full((*shape, 3), grey),
+    )
+
+
+def joined(*walls: Gaussians) -> Gaussians:
+    return Gaussians(*(torch.cat(parts, 1) for parts in zip(*(vars(x).values() for x in walls), strict=True)))
+
+
+def render(gaussians: Gaussians) -> torch.Tensor:
+    return ReferenceRasterizer()(gaussians, VIEW).over(0.5)[:, 0]
+
+
+@pytest.fixture(scope="module")
+def image():
+    painted = replace(wall(2, 0.5), colors=torch.rand(1, SIDE**2, 3, generator=torch.Generator().manual_seed(0)))
+    return render(painted)
+
+
+def fitted(gaussians: Gaussians, image: torch.Tensor, rounds: int, visible: torch.Tensor | None = None) -> Gaussians:
+    return fit_colors(gaussians, CAMERA, image, ReferenceRasterizer(), rounds, 0.5, visible)
+
+
+def test_each_round_brings_the_render_nearer_to_the_image(image):
+    scene = joined(wall(2, 0.2), wall(3, 0.8))
+    errors = [(render(fitted(scene, image, rounds)) - image).square().mean().item() for rounds in (0, 1, 2, 4, 8)]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[2] < errors[0] / 4
+
+
+def test_what_the_front_hides_keeps_its_colours_and_nothing_else_changes(image):
+    scene = joined(wall(2, 0.2), wall(2.1, 0.8), wall(3, 0.8))
+    result = fitted(scene, image, 2)
+    moved = (result.colors - scene.colors).abs().amax(-1).view(3, SIDE, SIDE)[:, 1:-1, 1:-1]
+    assert moved[0].mean() > 0.2
+    assert moved[2].max() < 1e-3
+    for name in set(vars(scene)) - {"colors"}:
+        assert getattr(result, name) is getattr(scene, name)
+    assert not result.colors.requires_grad
+
+
+def test_hidden_pixels_have_no_influence(image):
+    visible = torch.ones(1, 1, SIDE, SIDE)
+    visible[..., : SIDE // 2] = 0
+    other = image.where(visible > 0, 1 - image)
+    first, second = (fitted(wall(2, 0.2), x, 2, visible) for x in (image, other))
+    assert torch.equal(first.colors, second.colors)
+    changed = (first.colors - 0.2).abs().amax(-1).view(SIDE, SIDE)
+    assert changed[:, -2:].mean() > 10 * changed[:, :2].mean()
+
+
+def test_one_gaussian_takes_the_mean_of_the_pixels_that_it_covers():
+    one = wall(2, 0.0)[:, 27:28]
+    image = torch.rand(1, 3, SIDE, SIDE)
+    rendering = ReferenceRasterizer()(replace(one, colors=torch.ones(1, 1, 3)), VIEW)
+    weights, open_share = rendering.color[0, 0], 1 - rendering.alpha[0, 0]
+    assert weights.sum((1, 2)).min() > 1
+    expected = ((image[0] - 0.5 * open_share) * weights).sum((1, 2)) / weights.sum((1, 2))
+    torch.testing.assert_close(fitted(one, image, 1).colors[0, 0], expected.clamp(min=0))
+
+
+def test_it_works_where_autograd_is_off(image):
+    expected = fitted(wall(2, 0.2), image, 2).colors
+    with torch.inference_mode():
+        assert torch.equal(fitted(wall(2, 0.2).map(torch.clone), image.clone(), 2).colors, expected)
