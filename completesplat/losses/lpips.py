@@ -1,5 +1,6 @@
 """Learned perceptual similarity (LPIPS) on VGG16's features, with torchvision's weights."""
 
+from collections.abc import Collection, Iterable
 from importlib.resources import as_file, files
 
 import torch
@@ -19,37 +20,42 @@ ADVICE = f"fetch VGG16 with `curl -LO {URL}` and give the file as loss.terms.lpi
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 SMALLEST_NORM = 1e-10
+RGB = tuple[float, float, float]
 
 
-class VGG16Features(nn.Module):
-    """Convolutions of VGG16 (Simonyan and Zisserman 2015, configuration D).
+class Activations(nn.Module):
+    """Sequence of layers that returns its activations after certain numbers of layers, the `ends`."""
 
-    The layers are numbered as in torchvision's `vgg16`, so its state dict's keys fit: `features.0.weight` and so on.
-    """
-
-    def __init__(self) -> None:
+    def __init__(self, layers: Iterable[nn.Module], ends: Collection[int]) -> None:
         super().__init__()
-        layers: list[nn.Module] = []
-        last = 3
-        for block in BLOCKS:
-            if layers:
-                layers.append(nn.MaxPool2d(2))
-            for channels in block:
-                layers += [nn.Conv2d(last, channels, 3, padding=1), nn.ReLU()]
-                last = channels
-        self.features = nn.Sequential(*layers)
+        self.features, self.ends = nn.Sequential(*layers), ends
 
     def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _ _ _"]]:
-        """Return each block's output before pooling: relu1_2, relu2_2, relu3_3, relu4_3, relu5_3."""
         outputs = []
-        for layer in self.features:
-            if isinstance(layer, nn.MaxPool2d):
-                outputs.append(images)
+        for number, layer in enumerate(self.features, 1):
             images = layer(images)
-        return [*outputs, images]
+            outputs += [images] if number in self.ends else []
+        return outputs
 
 
-def load_vgg16(weights: str, sha256: str | None = None) -> VGG16Features:
+def vgg16() -> Activations:
+    """Build the convolutions of VGG16 (Simonyan and Zisserman 2015, configuration D).
+
+    The layers are numbered as in torchvision's `vgg16`, so its state dict's keys fit: `features.0.weight` and so on.
+    The outputs are those of each block before pooling: relu1_2, relu2_2, relu3_3, relu4_3, relu5_3.
+    """
+    layers: list[nn.Module] = []
+    ends, last = [], 3
+    for block in BLOCKS:
+        for channels in block:
+            layers += [nn.Conv2d(last, channels, 3, padding=1), nn.ReLU()]
+            last = channels
+        ends.append(len(layers))
+        layers.append(nn.MaxPool2d(2))
+    return Activations(layers[:-1], ends)
+
+
+def load_vgg16(weights: str, sha256: str | None = None) -> Activations:
     """Load VGG16's features from a state dict of torchvision's `vgg16`, without its classifier.
 
     Args:
@@ -62,13 +68,12 @@ def load_vgg16(weights: str, sha256: str | None = None) -> VGG16Features:
     path = weights_file(weights, sha256, ADVICE, "loss.terms.lpips.term.vgg_sha256")
     try:
         contents = torch.load(path, map_location="cpu", weights_only=True)
-        tensors = {key: value for key, value in contents.items() if isinstance(value, Tensor)}
-        part = {key: value for key, value in tensors.items() if key.startswith("features.")}
+        part = {key: x for key, x in contents.items() if isinstance(x, Tensor) and key.startswith("features.")}
     except Exception as error:
         raise WeightsError(f"{path}: not a readable state dict ({type(error).__name__}); {ADVICE}") from error
     # On "meta", the network draws no random numbers, so this loss does not change those of the rest of the run.
     with torch.device("meta"):
-        network = VGG16Features()
+        network = vgg16()
     if reason := mismatch(network.state_dict(), part):
         raise WeightsError(f"{path}: not the weights of torchvision's vgg16 ({reason}); {ADVICE}")
     network.load_state_dict(part, assign=True)
@@ -76,22 +81,27 @@ def load_vgg16(weights: str, sha256: str | None = None) -> VGG16Features:
 
 
 class PerceptualDistance(nn.Module):
-    """LPIPS, version 0.1, VGG (Zhang et al. 2018, Eq. 1; their repository `PerceptualSimilarity`), frozen.
+    """Weighted squared distance of a frozen network's unit-length features (Zhang et al. 2018, Eq. 1).
+
+    With VGG16 and `load_heads`, it is LPIPS, version 0.1 (their repository `PerceptualSimilarity`).
 
     Args:
         features: network whose activations are compared.
         heads: non-negative weight of each channel of each activation.
+        shift, scale: the network takes (2 x - 1 - shift) / scale for sRGB colours x in [0, 1].
     """
 
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, features: VGG16Features, heads: list[Float[Tensor, "1 _ 1 1"]]) -> None:
+    def __init__(
+        self, features: Activations, heads: list[Float[Tensor, "1 _ 1 1"]], shift: RGB = SHIFT, scale: RGB = SCALE
+    ) -> None:
         super().__init__()
         self.features = features
         self.heads = nn.ParameterList(heads)
-        self.register_buffer("shift", torch.tensor(SHIFT).view(3, 1, 1))
-        self.register_buffer("scale", torch.tensor(SCALE).view(3, 1, 1))
+        self.register_buffer("shift", torch.tensor(shift).view(3, 1, 1))
+        self.register_buffer("scale", torch.tensor(scale).view(3, 1, 1))
         self.requires_grad_(False)
 
     def forward(
@@ -122,10 +132,22 @@ def load_heads() -> list[Float[Tensor, "1 _ 1 1"]]:
     return [weights[f"lin{layer}.model.1.weight"] for layer in range(5)]
 
 
-class LearnedPerceptualSimilarity:
-    """LPIPS with VGG16, averaged over the views (paper, Eq. 1, third term); always in float32.
+class PerceptualTerm:
+    """Loss term: a `PerceptualDistance`, averaged over the views; always in float32.
 
     The network is not part of the trained module, so no checkpoint holds it.
+    """
+
+    distance: PerceptualDistance
+
+    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        with torch.autocast(prediction.images.device.type, enabled=False):
+            pair = (images.flatten(0, 1).float() for images in (prediction.images, truth.images))
+            return torch.mean(self.distance(*pair))
+
+
+class LearnedPerceptualSimilarity(PerceptualTerm):
+    """LPIPS with VGG16 (paper, Eq. 1, third term).
 
     Args:
         vgg_weights, vgg_sha256: see `load_vgg16`; `vgg_sha256=None` accepts any file of the right layout.
@@ -134,15 +156,9 @@ class LearnedPerceptualSimilarity:
     def __init__(self, vgg_weights: str, vgg_sha256: str | None = None) -> None:
         self.distance = PerceptualDistance(load_vgg16(vgg_weights, vgg_sha256), load_heads())
 
-    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
-        with torch.autocast(prediction.images.device.type, enabled=False):
-            pair = (images.flatten(0, 1).float() for images in (prediction.images, truth.images))
-            distances: Tensor = self.distance(*pair)
-            return distances.mean()
 
-
-class UntrainedPerceptualSimilarity(LearnedPerceptualSimilarity):
+class UntrainedPerceptualSimilarity(PerceptualTerm):
     """The same network with random weights, to count the work of a step (`completesplat plan`)."""
 
     def __init__(self) -> None:
-        self.distance = PerceptualDistance(VGG16Features(), load_heads())
+        self.distance = PerceptualDistance(vgg16(), load_heads())

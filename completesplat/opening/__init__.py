@@ -53,6 +53,7 @@ ONLY_FOR_TRAINING = (
     "model.completesplat.autoreconstructor.pretrained",
     "model.completesplat.conditioning.pretrained",
     "model.loss.terms.lpips",
+    "model.loss.terms.efficientnet",
 )
 """Settings of weights that only training reads, for its start or its loss. Checkpoints hold the trained weights."""
 GROUPS = {"ablation", "autoreconstructor", "conditioning", "data", "denoiser", "experiment", "loss", "model"}

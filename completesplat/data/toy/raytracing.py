@@ -17,6 +17,7 @@ WALLS = (0, 1, 4, 5)
 GROUND, DOME = 6, 7
 
 SELF_INTERSECTION = 1e-6
+WHITE = (1.0, 1.0, 1.0)
 
 F = TypeVar("F", bound=Callable[..., object])
 
@@ -25,6 +26,7 @@ class Light(NamedTuple):
     """Ambient light, and direct light from the direction `place`, or from the point `place` if `is_point`.
 
     `sky` is the share of the ambient light from above, and `shadow` is the share of direct light that shadows keep.
+    `color` has factors of red, green and blue for both; the dome is not lit.
     """
 
     place: Array
@@ -32,6 +34,7 @@ class Light(NamedTuple):
     ambient: float
     sky: float
     shadow: float
+    color: Array = np.array(WHITE)
 
 
 class Dome(NamedTuple):
@@ -360,7 +363,7 @@ def _shade(shapes, light, dome, patch, room, ox, oy, oz, dx, dy, dz):
     if shape < 0 and face == DOME:
         return red, green, blue, t, shape
     level = _brightness(shapes, light, x, y, z, nx, ny, nz)
-    return red * level, green * level, blue * level, t, shape
+    return red * level * light.color[0], green * level * light.color[1], blue * level * light.color[2], t, shape
 
 
 @compiled

@@ -79,11 +79,9 @@ def lamp(rng: np.random.Generator) -> Piece:
     """Draw a foot, a pole and an ellipsoid on top."""
     top, shade = rng.uniform(1.0, 1.4), (rng.uniform(0.15, 0.25), rng.uniform(0.12, 0.2), rng.uniform(0.15, 0.25))
     look = _look(rng)
-    foot = [
-        part(BOX, (0, 0.03, 0), (0.15, 0.03, 0.15), look),
-        part(BOX, (0, top / 2, 0), (0.02, top / 2, 0.02), look),
-    ]
-    return [*foot, part(ELLIPSOID, (0, top + shade[1], 0), shade, _look(rng))]
+    foot = part(BOX, (0, 0.03, 0), (0.15, 0.03, 0.15), look)
+    pole = part(BOX, (0, top / 2, 0), (0.02, top / 2, 0.02), look)
+    return [foot, pole, part(ELLIPSOID, (0, top + shade[1], 0), shade, _look(rng))]
 
 
 PIECES = (cabinet, table, sofa, pouf, lamp)
@@ -92,14 +90,13 @@ PIECES = (cabinet, table, sofa, pouf, lamp)
 def furnish(rng: np.random.Generator, size: Array) -> list[Piece]:
     """Draw 3 to 6 pieces (fewer if there is no space) that do not overlap, most of them along the walls."""
     count = int(rng.integers(3, 7))
-    taken: list[tuple[Array, Array]] = []
     pieces: list[Piece] = []
     for _ in range(ATTEMPTS):
         piece = _placed(rng, PIECES[rng.integers(len(PIECES))](rng), size)
         low, high = _ground_extent(piece)
         inside = (np.abs(np.stack([low, high])) <= size[[0, 2]] / 2 - GAP + 1e-9).all()
-        if inside and not any((low < other[1] + GAP).all() and (other[0] < high + GAP).all() for other in taken):
-            taken.append((low, high))
+        others = map(_ground_extent, pieces)
+        if inside and not any((low < end + GAP).all() and (start < high + GAP).all() for start, end in others):
             pieces.append(piece)
         if len(pieces) == count:
             break

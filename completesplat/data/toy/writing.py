@@ -2,9 +2,10 @@
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,12 +16,13 @@ from rich.progress import track
 from completesplat.data.co3d.annotations import sequence_annotation, viewpoint, write_annotations, write_points
 from completesplat.data.images.files import save_image
 from completesplat.data.toy.object_scene import ToyScene, draw_mini, draw_scene, render_frame
+from completesplat.data.toy.raytracing import WHITE
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
 from completesplat.data.toy.shapes import Array
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder
-from completesplat.settings.schema import Natural, Positive, Range, Side
+from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
 
 FORMAT_VERSION = 2
 MOST_FRAMES = 1000
@@ -36,50 +38,11 @@ DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
 }
 """Functions that draw a scene, by category: (random generator, number of frames) -> scene."""
 
-Result = TypeVar("Result")
+KINDS = [*(category.removeprefix("toy_") for category in DRAW), "rooms"]
+Factors = Annotated[Sequence[Annotated[float, Range(0)]], Entries(3, 3)]
 Annotation = dict[str, Any]
 Written = tuple[str, list[Annotation], Annotation]
 """Split of a sequence, and annotations of its frames and of itself."""
-
-
-def _write_set(
-    folder: Path,
-    write: Callable[[Path, tuple[int, str]], Result],
-    splits: Sequence[str],
-    finish: Callable[[Path, list[Result]], None],
-    fewest: int,
-    workers: int | None,
-    progress: bool,
-    **numbers: int,
-) -> Path:
-    """Make `folder`, call `write` with it and (index, split) of every scene, then `finish`, and write `toy.json`.
-
-    The files depend only on the `numbers`: `scenes` (at least `fewest`), `frames`, `size` and `seed`. `workers` are
-    processes (None: one for each core). A folder that was made with the same numbers remains unchanged.
-
-    Raises:
-        DataError: a number is out of its range, or the folder holds something else.
-        DiskError: the disk is full.
-    """
-    for name, rule in {"scenes": Range(fewest), "frames": Range(2, MOST_FRAMES), "size": Range(8)}.items():
-        if (reason := rule.refusal(numbers[name])) is not None:
-            raise DataError(f"{folder.name}: {name}={numbers[name]}: {reason}")
-    parameters = {"format": FORMAT_VERSION, **numbers}
-    if folder.exists():
-        try:
-            existing = json.loads((folder / "toy.json").read_text())
-        except (OSError, ValueError):
-            existing = None
-        if existing != parameters:
-            raise DataError(f"{folder} already holds something else: remove it or choose another folder")
-        if progress:
-            Console().print(f"{folder} already holds these scenes")
-        return folder
-    with atomic_folder(folder) as unfinished:
-        written = map_in_processes(partial(write, unfinished), list(enumerate(splits)), workers)
-        finish(unfinished, list(track(written, f"Rendering {folder.name}", len(splits), disable=not progress)))
-        (unfinished / "toy.json").write_text(json.dumps(parameters, indent=1) + "\n")
-    return folder
 
 
 def to_bytes(values: Array) -> UInt8[np.ndarray, "..."]:
@@ -127,38 +90,27 @@ def _write_frame(
     }
 
 
-def write_objects(
-    out: Path,
-    scenes: int,
-    frames: int,
-    size: int,
-    seed: int,
-    workers: int | None = None,
-    progress: bool = True,
-    category: str = "toy_objects",
-) -> Path:
-    """Write `scenes` sequences of `frames` square images with masks, depth, point clouds and annotations.
-
-    The subset `fewview_train` splits the sequences: about 85 % train, 5 % val, 10 % test. `<seq>/toy.json` reveals the
-    family and the colour of the patch on the back. See `_write_set` for the numbers and `workers`. Return the folder of
-    the category (a key of `DRAW`).
-    """
-    numbers = {"scenes": scenes, "frames": frames, "size": size, "seed": seed}
-    write = partial(_write_scene, category=category, frames=frames, size=size, seed=seed)
-    return _write_set(out / category, write, _splits(scenes), _write_lists, 1, workers, progress, **numbers)
-
-
-def _splits(scenes: int) -> list[str]:
-    """Return the split of every sequence in order; with at least three scenes, each split has one or more."""
+def _splits(scenes: int, rooms: bool) -> list[str]:
+    """Return the split of every scene in order; three or more objects have all splits, rooms have no `val`."""
+    if rooms:
+        return ["test" if index % 10 == 0 else "train" for index in range(scenes)]
     test = max(1, round(0.1 * scenes)) if scenes > 1 else 0
     val = max(1, round(0.05 * scenes)) if scenes > 2 else 0
     return ["train"] * (scenes - val - test) + ["val"] * val + ["test"] * test
 
 
-def _write_scene(root: Path, place: tuple[int, str], category: str, frames: int, size: int, seed: int) -> Written:
-    """Write one sequence, drawn from a separate random generator, and return its split and annotations."""
-    index, split = place
+def draw(category: str, seed: int, index: int, frames: int, light: Array) -> ToyScene:
+    """Draw a scene of a category (a key of `DRAW`) from a separate random generator; `light` is `Light.color`."""
     scene = DRAW[category](np.random.default_rng([seed, index]), frames)
+    return replace(scene, light=scene.light._replace(color=light), point_colors=scene.point_colors * light)
+
+
+def _write_scene(
+    root: Path, place: tuple[int, str], category: str, frames: int, size: int, seed: int, light: Array
+) -> Written:
+    """Write one sequence and return its split and annotations; its `toy.json` reveals the colour of the patch."""
+    index, split = place
+    scene = draw(category, seed, index, frames, light)
     name = f"{index:05d}_{scene.family}"
     for folder in ("images", "masks", "depths", "depth_masks"):
         (root / name / folder).mkdir(parents=True)
@@ -178,22 +130,8 @@ def _write_lists(category: Path, written: list[Written]) -> None:
     write_annotations(category, annotations, [sequence for _, _, sequence in written], SUBSET, lists)
 
 
-def write_rooms(
-    out: Path, scenes: int, frames: int, size: int, seed: int, workers: int | None = None, progress: bool = True
-) -> Path:
-    """Write `scenes` clips of `frames` images, `size` high and 16 / 9 as wide, with poses and intrinsics.
-
-    `text`/<split>/ has <key>.txt and <key>/<timestamp>.jpg. The first and every tenth clip after it are in the split
-    `test`, the others in `train`. See `_write_set` for the numbers and `workers`. Return the folder, `out`/toy_rooms.
-    """
-    splits = ["test" if index % 10 == 0 else "train" for index in range(scenes)]
-    numbers = {"scenes": scenes, "frames": frames, "size": size, "seed": seed}
-    write = partial(_write_clip, frames=frames, size=size, seed=seed)
-    return _write_set(out / ROOMS, write, splits, lambda folder, clips: None, 2, workers, progress, **numbers)
-
-
-def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed: int) -> None:
-    """Write one clip, drawn from a separate random generator.
+def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed: int, light: Array) -> None:
+    """Write one clip, drawn from a separate random generator: `text`/<split>/<key>.txt and <key>/<timestamp>.jpg.
 
     The text has the address of the video, then a line for each frame: timestamp, fx fy cx cy as fractions of width or
     height, two zeros, and `world_to_camera` by rows.
@@ -201,6 +139,7 @@ def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed
     index, split = place
     rng = np.random.default_rng([seed, index])
     scene = draw_room_scene(rng, frames)
+    scene = replace(scene, light=scene.light._replace(color=light))
     width, start = image_width(size), int(rng.integers(LATEST_START))
     intrinsics, poses = scene.move.intrinsics(size, width), scene.move.world_to_camera().reshape(frames, 12)
     rows = np.concatenate([np.broadcast_to(intrinsics, (frames, 4)), np.zeros((frames, 2)), poses], axis=1)
@@ -216,20 +155,61 @@ def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed
     images.with_suffix(".txt").write_text("\n".join(lines) + "\n")
 
 
-KINDS: dict[str, Callable[..., Path]] = {
-    **{category.removeprefix("toy_"): partial(write_objects, category=category) for category in DRAW},
-    "rooms": write_rooms,
-}
-
-
 def write(
-    kind: str, out: Path, scenes: int, frames: int, size: Side, seed: Natural, workers: Positive | None = None
+    kind: str,
+    out: Path,
+    scenes: int,
+    frames: int,
+    size: Side,
+    seed: Natural,
+    workers: Positive | None = None,
+    light: Factors = WHITE,
+    progress: bool = True,
 ) -> Path:
-    """Write scenes of a kind (a key of `KINDS`) and return their folder.
+    """Write scenes of a kind (one of `KINDS`) and return their folder, `out`/toy_<kind>, with a `toy.json`.
+
+    The files depend only on the number of scenes (at least 1, for rooms 2), the number of frames of each, the height
+    `size` of the images in pixels, the seed, and the light's colour. `workers` are processes (None: one for each core).
+    A folder that was made with the same settings remains unchanged.
 
     Raises:
-        DataError: the kind is unknown, or the folder holds something else.
+        DataError: the kind is unknown, a number is out of its range, or the folder holds something else.
+        DiskError: the disk is full.
     """
     if kind not in KINDS:
         raise DataError(f"no toy data of kind {kind!r}; there are: {', '.join(KINDS)}")
-    return KINDS[kind](out, scenes, frames, size, seed, workers)
+    folder, rooms = out / f"toy_{kind}", kind == "rooms"
+    numbers = {"scenes": scenes, "frames": frames, "size": size, "seed": seed}
+    for name, rule in {"scenes": Range(1 + rooms), "frames": Range(2, MOST_FRAMES), "size": Range(8)}.items():
+        if (reason := rule.refusal(numbers[name])) is not None:
+            raise DataError(f"{folder.name}: {name}={numbers[name]}: {reason}")
+    parameters = {"format": FORMAT_VERSION, **numbers} | ({} if tuple(light) == WHITE else {"light": list(light)})
+    if _is_written(folder, parameters):
+        if progress:
+            Console().print(f"{folder} already holds these scenes")
+        return folder
+    with atomic_folder(folder) as unfinished:
+        write_one: Callable[..., Any] = _write_clip if rooms else partial(_write_scene, category=folder.name)
+        write_one = partial(write_one, unfinished, frames=frames, size=size, seed=seed, light=np.array(light, float))
+        written = map_in_processes(write_one, list(enumerate(_splits(scenes, rooms))), workers)
+        results = list(track(written, f"Rendering {folder.name}", scenes, disable=not progress))
+        if not rooms:
+            _write_lists(unfinished, results)
+        (unfinished / "toy.json").write_text(json.dumps(parameters, indent=1) + "\n")
+    return folder
+
+
+def _is_written(folder: Path, parameters: dict[str, Any]) -> bool:
+    """Return whether the scenes are in the folder; raise DataError if it holds something else."""
+    if not folder.exists():
+        return False
+    try:
+        existing = json.loads((folder / "toy.json").read_text())
+    except (OSError, ValueError):
+        existing = None
+    if existing != parameters:
+        raise DataError(f"{folder} already holds something else: remove it or choose another folder")
+    return True
+
+
+write_objects, write_rooms = partial(write, "objects"), partial(write, "rooms")

