@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, gumbel_softmax, one_hot
-from torch.special import entr
 
 from completesplat.diffusion.guidance import Features, Latents
 
@@ -31,19 +30,17 @@ class SceneCode(nn.Module):
         self.prior = _classifier(conditioning_channels, length * values)
         self.embedding = nn.Parameter(torch.randn(length, values, conditioning_channels) / 4)
 
-    def forward(self, latent: Latents, conditioning: Features) -> tuple[Features, Float[Tensor, ""], Float[Tensor, ""]]:
-        """Encode latents in training; return phi_ref with their codes, and two terms of the loss (nats of a value).
+    def forward(self, latent: Latents, conditioning: Features) -> tuple[Features, Float[Tensor, ""]]:
+        """Encode latents in training; return phi_ref with their codes, and the prior's cross-entropy (nats a value).
 
-        They are the prior's cross-entropy, and the entropy of the values in the batch, of which more is better: else
-        few values are used. Values are drawn by the Gumbel trick with straight-through gradients (Jang et al. 2017).
-        phi_ref gets gradients from the denoiser alone.
+        Values are drawn by the Gumbel trick with straight-through gradients (Jang et al. 2017). phi_ref gets gradients
+        from the denoiser alone.
         """
         seen = conditioning.detach()
         logits = self.encoder(torch.cat([latent, seen], 1)).float().unflatten(1, self.shape)
         predicted = self.prior(seen).float().unflatten(1, self.shape)
         surprise = cross_entropy(predicted.mT, logits.detach().softmax(2).mT)
-        used = entr(logits.softmax(2).mean(0)).sum(1).mean()
-        return self._added(conditioning, gumbel_softmax(logits, hard=True, dim=2)), surprise, used
+        return self._added(conditioning, gumbel_softmax(logits, hard=True, dim=2)), surprise
 
     def encoded(self, latent: Latents, conditioning: Features) -> Features:
         """Return phi_ref with the most probable codes of latents."""

@@ -43,8 +43,9 @@ def rows(model: CompleteSplat, scenes: Sequence[SceneBatch], draws: int, seed: i
     `best_share` is the true mode's probability given the noisy latent, for a classifier that knows the latents of all
     modes: with four modes, 0.25 in pure noise and 1 without noise. The denoiser's clean estimate is projected onto
     combinations of the modes' latents with weights of sum 1; `denoiser_share` is the true mode's weight. Where it is
-    lower than `best_share`, the denoiser blends the modes; it is told the true mode's code, if it has one. `training_share` is the share of training's timesteps
-    between the previous level and this one, `steps` the number of the sampler's timesteps there.
+    lower than `best_share`, the denoiser blends the modes. A denoiser with a code gets that of the true mode.
+    `training_share` is the share of training's timesteps between the previous level and this one, `steps` the number of
+    the sampler's timesteps there.
     """
     total = model.sampler.training_timesteps
     timesteps = [round(level * total) for level in LEVELS]

@@ -21,7 +21,6 @@ from completesplat.training.encoding import check_cache
 from completesplat.training.stage import Stage, prepare_network
 from completesplat.weights.checkpoint_reading import load_part
 
-MORE_VALUES = 0.1  # weight of the entropy of a code's values
 LOSS_BUCKETS = 4
 """Equal ranges of timesteps, for each of which the loss is logged."""
 
@@ -176,11 +175,10 @@ class LatentDiffusion(Stage):
     def training_step(self, batch: SceneBatch | CachedScene, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat
         latent, conditioning = (x.repeat_interleave(self.noise_draws, 0) for x in self.inputs(batch))
-        code_loss = latent.new_zeros(())
+        surprise = latent.new_zeros(())
         if parts.denoiser.code is not None:
-            conditioning, surprise, used = parts.denoiser.code(latent, conditioning)
-            code_loss = surprise - MORE_VALUES * used
-            self.log_step({"train/code_surprise": surprise, "train/code_entropy": used}, batch_size=len(latent))
+            conditioning, surprise = parts.denoiser.code(latent, conditioning)
+            self.log_step({"train/code_surprise": surprise}, batch_size=len(latent))
         conditioned = torch.rand(len(latent), device=self.device) >= self.unconditional_probability
         conditioning = conditioning * conditioned[:, None, None, None]
         noise = torch.randn(latent.shape, device=self.device)  # `randn_like` would depend on the memory layout
@@ -193,7 +191,7 @@ class LatentDiffusion(Stage):
         )
         errors: Tensor = (predicted - target(parts.sampler.scheduler, latent, noise, timestep)).square().mean((1, 2, 3))
         self.log_loss(errors.detach(), timestep)
-        return errors.mean() + code_loss
+        return errors.mean() + surprise
 
     def log_loss(self, errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"]) -> None:
         """Log the mean of the samples' losses, and that of each quarter of the timesteps that is among them."""
