@@ -187,7 +187,6 @@ class LatentCache:
         if sha256_of(checksums) != self.manifest.checksums:
             raise ChangedFile("its checksum is another: encode the images again", str(checksums))
         self.sequences = {sequence.name: sequence for sequence in self.manifest.sequences}
-        self.latent_shape = self.manifest.arrays["mean"].shape[1:]  # channels, height and width
         self.holds_images = self.origin.conditioning is None  # rather than features
 
     def scene(self, name: str, frame: int) -> CachedScene:

@@ -35,6 +35,7 @@ class Loaded(NamedTuple):
     refused_depths: tuple[DataError, ...] = ()
 
 
+@dataclass(eq=False)
 class SceneStore:
     """Scenes from the sequences of a source, in the order of its names.
 
@@ -44,18 +45,14 @@ class SceneStore:
         background: grey value (0 to 1) that replaces the background of images with a mask; None keeps it.
     """
 
-    def __init__(
-        self,
-        source: SequenceSource,
-        mask_threshold: float | None = None,
-        cache: bool = False,
-        background: float | None = None,
-    ) -> None:
-        self.source = source
-        self.names = source.names
-        self.mask_threshold = mask_threshold
-        self.background = background
-        self._cache: dict[tuple[str, int], MaskedImage] | None = {} if cache else None
+    source: SequenceSource
+    mask_threshold: float | None = None
+    cache: bool = False
+    background: float | None = None
+
+    def __post_init__(self) -> None:
+        self.names = self.source.names
+        self._cache: dict[tuple[str, int], MaskedImage] | None = {} if self.cache else None
 
     def scene(self, sequence: PosedSequence, reference: int, targets: Sequence[int]) -> SceneBatch:
         """Return the scene of the views with these indices, in the reference camera's coordinates."""
