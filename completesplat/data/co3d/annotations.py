@@ -52,6 +52,10 @@ class CO3DFrame:
     camera: Cameras
 
 
+Frames = dict[str, dict[int, CO3DFrame]]
+"""Frames by sequence and number."""
+
+
 @dataclass(frozen=True)
 class CO3DVideo:
     """Annotation of a whole sequence; a quality is None if it is missing or NaN."""
@@ -90,11 +94,9 @@ def _optional_number(entry: Entry, key: str) -> float | None:
     return float(finite_array(value, (), key))
 
 
-def read_frames(
-    root: Path, path: Path, wanted: Callable[[str, int], bool], refuse: Refuse
-) -> dict[str, dict[int, CO3DFrame]]:
+def read_frames(root: Path, path: Path, wanted: Callable[[str, int], bool], refuse: Refuse) -> Frames:
     """Read those frames in `frame_annotations.jgz` that are `wanted`, by sequence and number; see `read_videos`."""
-    frames: dict[str, dict[int, CO3DFrame]] = {}
+    frames: Frames = {}
     for name, entry in _entries(path, refuse):
         with refused_to(refuse), at(path, name):
             number = field(entry, "frame_number", int)

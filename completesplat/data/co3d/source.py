@@ -88,8 +88,7 @@ def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
 
 def _foreground(frame: CO3DFrame) -> np.ndarray:
     """Return the world points [n 3] of a depth map's foreground; the map may be smaller than the image."""
-    if frame.depth is None:
-        return np.zeros((0, 3))
+    assert frame.depth is not None
     depth = read_depth(frame.depth.path, frame.depth.scale_adjustment)[0]
     mask = decode(frame.mask, str(frame.mask), "L", frame.camera.image_size)
     height, width = depth.shape
