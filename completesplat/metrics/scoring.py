@@ -162,7 +162,8 @@ class Evaluation:
                 self.scores[predictor] |= scenes
             self.views |= views
             self.drawn |= drawn
-            self.sets.merge(sets)
+            for key, described in sets.items():
+                self.sets.described[key] |= described
             self.skipped |= skipped
 
     def results(self) -> dict[str, Any]:
