@@ -168,7 +168,6 @@ def count_step(
 
     Args:
         build: makes the module, whose rasterizer should be `StoreOnly`, without reading weights.
-        image_size: side of the images in pixels.
         batch, targets: number of scenes of a batch of this process, and of target views of each.
         precision: precision in Lightning's notation.
         accumulated: number of batches of a step.
