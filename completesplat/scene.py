@@ -73,3 +73,6 @@ class CachedScene(TensorDataclass):
     def __getitem__(self, index: int | slice) -> "CachedScene":
         """Select one scene of a batch, or several."""
         return replace(super().__getitem__(index), names=self.names[index])
+
+
+Batch = SceneBatch | CachedScene

@@ -46,17 +46,15 @@ GROUPS = {
 }
 CHANNELS = sum(group.channels for group in GROUPS.values())
 
+LayerMaps = Float[Tensor, "*batch layer height width"]
 
-def independent_depths(
-    raw: Float[Tensor, "*batch layer height width"], near: Tensor, far: Tensor
-) -> Float[Tensor, "*batch layer height width"]:
+
+def independent_depths(raw: LayerMaps, near: Tensor, far: Tensor) -> LayerMaps:
     """Return z = near + (far - near) * sigmoid(raw) for every layer, the plain reading of the paper."""
     return near + (far - near) * raw.sigmoid()
 
 
-def incremental_depths(
-    raw: Float[Tensor, "*batch layer height width"], near: Tensor, far: Tensor
-) -> Float[Tensor, "*batch layer height width"]:
+def incremental_depths(raw: LayerMaps, near: Tensor, far: Tensor) -> LayerMaps:
     """Return the first layer as `independent_depths` does; each further one lies exp(raw) behind the last (Flash3D).
 
     `initialize_head` makes that distance `Parameterization.layer_step` at first.
@@ -70,7 +68,6 @@ LAYER_DEPTHS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
     "independent": independent_depths,
     "incremental": incremental_depths,
 }
-
 
 Length = Annotated[float, Range(1e-9, 1e9)]
 

@@ -12,6 +12,9 @@ from torch.utils.checkpoint import checkpoint
 from completesplat.autoreconstructor.posterior import LOG_VARIANCE_RANGE, Posterior, from_moments
 from completesplat.settings.schema import Few, Range, Width, Widths
 
+Images = Float[Tensor, "batch 3 height width"]
+Features = list[Float[Tensor, "batch _ _ _"]]
+
 
 def recompute(block: nn.Module, *inputs: Tensor | None) -> Tensor:
     """Apply a block; in training, do not store its activations but recompute them in the backward pass."""
@@ -75,9 +78,7 @@ class Encoder(nn.Module):
             self.quant_conv.bias[latent_channels:] += first_log_variance  # type: ignore[index]
         self.gradient_checkpointing = False
 
-    def forward(
-        self, images: Float[Tensor, "batch 3 height width"]
-    ) -> tuple[Posterior, list[Float[Tensor, "batch _ _ _"]]]:
+    def forward(self, images: Images) -> tuple[Posterior, Features]:
         """Encode sRGB images in [0, 1].
 
         Returns:
@@ -85,9 +86,7 @@ class Encoder(nn.Module):
         """
         return self.encode(images * 2 - 1)
 
-    def encode(
-        self, values: Float[Tensor, "batch channel height width"]
-    ) -> tuple[Posterior, list[Float[Tensor, "batch _ _ _"]]]:
+    def encode(self, values: Float[Tensor, "batch channel height width"]) -> tuple[Posterior, Features]:
         """Encode values around zero without rescaling them; `forward` describes the result."""
         network: Any = self.network
         features = self.features(values, len(network.down_blocks))
@@ -95,9 +94,7 @@ class Encoder(nn.Module):
         hidden = network.conv_act(network.conv_norm_out(hidden))
         return from_moments(self.quant_conv(network.conv_out(hidden))), features
 
-    def features(
-        self, values: Float[Tensor, "batch channel height width"], levels: int
-    ) -> list[Float[Tensor, "batch _ _ _"]]:
+    def features(self, values: Float[Tensor, "batch channel height width"], levels: int) -> Features:
         """Return the features of the first levels as `encode` does, without computing anything after them."""
         network: Any = self.network
         hidden, features = network.conv_in(values), list[Tensor]()

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from completesplat.autoreconstructor.encoder import Encoder
+from completesplat.autoreconstructor.encoder import Encoder, Features, Images
 from completesplat.autoreconstructor.posterior import Posterior, from_moments
 from completesplat.autoreconstructor.pretrained import load_pretrained
 from completesplat.autoreconstructor.reconstructor import Reconstructor
@@ -14,6 +14,8 @@ from completesplat.scene import Views
 from completesplat.settings.schema import Share
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import TensorDataclass
+
+DepthRange = Float[Tensor, "batch 2"]
 
 
 @dataclass(frozen=True)
@@ -77,11 +79,8 @@ class VariationalAutoReconstructor(ReconstructionModel):
             load_pretrained(pretrained, encoder, reconstructor)
 
     def posterior(
-        self,
-        images: Float[Tensor, "batch 3 height width"],
-        views: Views | None = None,
-        depth_range: Float[Tensor, "batch 2"] | None = None,
-    ) -> tuple[Posterior, list[Float[Tensor, "batch _ _ _"]]]:
+        self, images: Images, views: Views | None = None, depth_range: DepthRange | None = None
+    ) -> tuple[Posterior, Features]:
         """Return the posterior of latents, and the reference's features for the skips.
 
         Args:
@@ -97,10 +96,7 @@ class VariationalAutoReconstructor(ReconstructionModel):
         return from_moments(torch.cat([base.mean + mean, base.log_variance + log_variance], 1)), features
 
     def forward(
-        self,
-        images: Float[Tensor, "batch 3 height width"],
-        views: Views | None = None,
-        depth_range: Float[Tensor, "batch 2"] | None = None,
+        self, images: Images, views: Views | None = None, depth_range: DepthRange | None = None
     ) -> Reconstruction:
         """Reconstruct from sRGB images in [0, 1], and from `views` if the posterior sees them."""
         posterior, features = self.posterior(images, views, depth_range)

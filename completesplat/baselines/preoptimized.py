@@ -14,7 +14,7 @@ from torch import Tensor
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_rays, project
 from completesplat.rasterizers import RenderingConstants
-from completesplat.splatter_image import LAYER_DEPTHS, SH_C0, Parameterization, SplatterImage
+from completesplat.splatter_image import LAYER_DEPTHS, SH_C0, LayerMaps, Parameterization, SplatterImage
 
 EMPTY_LOGIT = -30.0
 """Raw opacity of a place without a Gaussian: its opacity is 1e-13."""
@@ -92,9 +92,7 @@ def _places(
     return source[selected], place[selected]
 
 
-def _raw_depths(
-    depths: Float[Tensor, "batch layer height width"], near: Tensor, far: Tensor, layer_depths: str
-) -> Float[Tensor, "batch layer height width"]:
+def _raw_depths(depths: LayerMaps, near: Tensor, far: Tensor, layer_depths: str) -> LayerMaps:
     """Return raw values that activate close to these depths; the offset represents the rest."""
     shares = ((depths - near) / (far - near)).logit(CERTAINTY)
     if layer_depths == "independent":

@@ -47,11 +47,7 @@ def run(
 ) -> None:  # fmt: skip
     """Write scenes, read them in all their forms, write `data.json`, and print a table.
 
-    Args:
-        objects: makers of scenes and of their data modules.
-        workers: numbers of loading processes; everything is measured once with each number.
-        repeats: number of timed epochs of each form.
-        codecs: codecs of the packed stores.
+    `conf/bench_task/data.yaml` explains the settings.
     """
     with TemporaryDirectory(prefix="bench_data_", dir=out) as folder:
         forms = forms_of(objects, codecs, Path(folder))

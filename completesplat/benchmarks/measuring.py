@@ -21,21 +21,18 @@ def milliseconds(work: Work) -> float:
     return (now() - start) * 1e3
 
 
-def report(
-    path: Path, results: Mapping[str, object], tables: Mapping[str, Sequence[Row]], device: object = "cpu"
-) -> None:
+def report(path: Path, results: Mapping[str, Any], tables: Mapping[str, Sequence[Row]], device: object = "cpu") -> None:
     """Write results to a JSON file; print the machine, the tables, and the reasons for what was not measured.
 
     Args:
-        results: content of the file; `not_measured` has reasons by name, and `machine` is by default this one.
+        results: content of the file; `not_measured` has reasons by name.
         tables: rows by title.
         device: "cuda", or anything else for the processor.
     """
-    here: dict[str, Any] = {"machine": machine(), "not_measured": {}, **results}
-    hardware = here["machine"]
-    write_json(path, {"machine": hardware, **results})
-    name = hardware["gpu"] if device == "cuda" else f"{hardware['processor']}, {hardware['threads']} threads"
-    print(f"{name}, torch {hardware['torch']}, {hardware['date']}")
+    here = machine()
+    write_json(path, {"machine": here, **results})
+    name = here["gpu"] if device == "cuda" else f"{here['processor']}, {here['threads']} threads"
+    print(f"{name}, torch {here['torch']}, {here['date']}")
     show(*(records_table(title, rows) for title, rows in tables.items()), width=140)
-    for part, reason in here["not_measured"].items():
+    for part, reason in results.get("not_measured", {}).items():
         print(f"{part}: not measured, because {reason}")

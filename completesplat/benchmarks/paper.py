@@ -77,14 +77,7 @@ def run(
 ) -> None:  # fmt: skip
     """Measure with random weights, write `paper.json`, and print a table.
 
-    Args:
-        data, stage1, stage2: configs of the data module and of both stages' modules.
-        steps: number of steps of the sampler.
-        repeats: number of timed calls of each kind of work.
-        samples: number of samples that are drawn for one image at once.
-        compile: whether to measure with `torch.compile` and with CUDA graphs as well.
-        training: whether to measure optimizer steps of both stages as well.
-        channels: channels of the `encoder` and the `denoiser`, to compare them with the paper's.
+    `conf/bench_task/paper.yaml` explains the settings; `channels` are compared with the paper's.
 
     Raises:
         CompleteSplatError: there is no GPU.

@@ -3,12 +3,11 @@
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from rich.console import Console
 
 from completesplat.benchmarks.measuring import Row, report
@@ -43,23 +42,16 @@ def run(
 ) -> None:  # fmt: skip
     """Time the rasterizers, write `rasterizers.json`, and print tables.
 
-    Args:
-        backends: keys of `CLASSES`; those that do not work on this machine are skipped, with the reason.
-        sizes, views: sides of the images in pixels and numbers of views; every combination is timed.
-        repeats: number of timed calls of each backend.
-        constants: config of the `RenderingConstants` that all backends share.
+    `conf/bench_task/rasterizers.yaml` explains the settings. Every combination of sizes and numbers of views is timed.
 
     Raises:
         CompleteSplatError: a backend does not exist.
     """
     with Console(stderr=True).status("compiling") as status:
-
-        def tick(text: str) -> None:
-            status.update(f"timing {text}")
-
         shared = instantiate(constants)
         working, absent = working_backends(backends, shared)
         quieten()
+        tick = lambda text: status.update(f"timing {text}")  # noqa: E731
         rows = speed_rows(working, sizes, views, repeats, shared, tick)
     report(out / "rasterizers.json", {"not_measured": absent, "rows": rows}, {"Speed": rows})
 
@@ -75,9 +67,8 @@ def working_backends(names: Sequence[str], constants: RenderingConstants) -> tup
             raise CompleteSplatError(f"backends: {name!r} does not exist; choose from {', '.join(CLASSES)}")
     backends, absent = [], {}
     for name in names:
-        module, _, class_name = CLASSES[name].rpartition(".")
         try:
-            backend = Backend(name, getattr(import_module(module), class_name)(constants))
+            backend = Backend(name, get_class(CLASSES[name])(constants))
             gaussians, cameras = splatter_scene(8, 1, "trained")
             rendering_milliseconds(backend.rasterizer, gaussians.to(backend.device), cameras.to(backend.device))
         except Exception as error:  # a broken installation may raise anything

@@ -45,9 +45,7 @@ class Seconds(NamedTuple):
 def run(weights: str, repeats: Positive, out: Path) -> None:
     """Time whole processes in turn, write `startup.json`, and print a table.
 
-    Args:
-        weights: draw one sample, without a video.
-        repeats: number of timed processes of each kind, after an untimed one; the median counts.
+    `conf/bench_task/startup.yaml` explains the settings. An untimed process of each kind comes first.
 
     Raises:
         CompleteSplatError: a process fails.

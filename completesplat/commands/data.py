@@ -1,14 +1,13 @@
 """`completesplat data`: make, check, look at, prepare and encode data sets."""
 
-import json
 import logging
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from completesplat.commands.protocol import write_json
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.files import write_text
 from completesplat.settings.schema import Entries, Positive, Range
 
 logger = logging.getLogger(__name__)
@@ -41,7 +40,7 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
     sources = _sources(data, splits)
     tracked_names = {split: track(source.names, f"reading cameras of {split}") for split, source in sources.items()}
     results = statistics({split: _readable(sources[split], names) for split, names in tracked_names.items()})
-    write_text(out / "stats.json", json.dumps(results, indent=2, allow_nan=False) + "\n")
+    write_json(out / "stats.json", results)
     plot_statistics(results, out / "stats.png", str(data.root))
     show_statistics(results)
 

@@ -26,8 +26,10 @@ from completesplat.training.loggers import wandb_runs
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
 
+Config = Mapping[str, Any]
 
-def scored_data(run_config: DictConfig, evaluation: Mapping[str, Any]) -> SceneDataModule:
+
+def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
     """Return the data of a run's config, with the protocol's changes.
 
     If the protocol scores at a larger size than the model's, the model still sees images of its size.
@@ -63,7 +65,7 @@ def scored_data(run_config: DictConfig, evaluation: Mapping[str, Any]) -> SceneD
     return larger
 
 
-def set_scoring(module: Stage, evaluation: Mapping[str, Any]) -> None:
+def set_scoring(module: Stage, evaluation: Config) -> None:
     """Give a model the protocol's metrics; raise CompleteSplatError if it cannot draw several samples."""
     module.evaluation = instantiate(evaluation["scoring"], _convert_="all")
     if module.evaluation.samples > 1 and not module.draws_samples:
@@ -71,13 +73,7 @@ def set_scoring(module: Stage, evaluation: Mapping[str, Any]) -> None:
 
 
 @stopped_together()
-def run(
-    trained: Mapping[str, Any],
-    evaluation: Mapping[str, Any],
-    trainer: Mapping[str, Any],
-    logger: Mapping[str, Any] | None,
-    out: Path,
-) -> None:
+def run(trained: Config, evaluation: Config, trainer: Config, logger: Config | None, out: Path) -> None:
     """Write `metrics.json` and print the table.
 
     Args:
@@ -126,11 +122,7 @@ COLUMNS: list[Column] = [(name.replace("_", " "), name, form) for name, form in 
 
 
 def run_hidden_modes(
-    trained: Mapping[str, Any],
-    evaluation: HiddenModesEvaluation,
-    trainer: Mapping[str, Any],
-    logger: Mapping[str, Any] | None,
-    out: Path,
+    trained: Config, evaluation: HiddenModesEvaluation, trainer: Config, logger: Config | None, out: Path
 ) -> None:
     """Write JSON files of hidden modes, shares and protocol, draw `hidden_modes.png`, and print the table.
 
@@ -154,15 +146,9 @@ def run_hidden_modes(
     if tested.scenes is not None:
         tested.files.find([scene.scene.names[0] for scene in scenes], samples)
     progress = partial(track, description="Hidden modes", console=Console(stderr=True))
-    measured = measure(
-        predictors(module, samples, evaluation["batch"]),
-        [scene.to(device) for scene in scenes],
-        samples,
-        evaluation["seed"],
-        evaluation["shown_scenes"],
-        evaluation["shown_samples"],
-        progress,
-    )
+    methods, on_device = predictors(module, samples, evaluation["batch"]), [scene.to(device) for scene in scenes]
+    shown = evaluation["shown_scenes"], evaluation["shown_samples"]
+    measured = measure(methods, on_device, samples, evaluation["seed"], *shown, progress)
     results = measured.results(samples)
     write_json(out / "hidden_modes.json", results)
     write_json(out / "shares.json", measured.shares())

@@ -23,7 +23,7 @@ from completesplat.commands.protocol import write_json
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Table, records_table, show
-from completesplat.scene import CachedScene, SceneBatch
+from completesplat.scene import Batch, SceneBatch
 from completesplat.settings.checks import check_image_size, check_optimizer
 from completesplat.settings.options import did_you_mean
 from completesplat.training.latent_diffusion import LatentDiffusion
@@ -243,7 +243,7 @@ def timed(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, fl
     copied = untrained(config)
     copied.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
     module: Stage = build(copied.model, _convert_="all").to(device)
-    inputs: SceneBatch | CachedScene = synthetic_batch(config.data.image_size, scenes, config.data.targets).to(device)
+    inputs: Batch = synthetic_batch(config.data.image_size, scenes, config.data.targets).to(device)
     if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch) and config.data.latent_cache is not None:
         inputs = encode(module, inputs)
     training, seconds = Training(module, precision(config)), []

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from completesplat import __version__
@@ -95,13 +95,14 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> int:
     stored = cleaned(gaussians, path).detach()
     records = np.zeros(stored.count, RECORD)
     records["means"], records["scales"] = stored.means.cpu(), stored.scales.cpu()
-    records["colors"] = _bytes(torch.cat([stored.colors, stored.opacities[:, None]], dim=-1) * 255)
-    records["quaternions"] = _bytes(normalize_quaternion(stored.quaternions) * 128 + 128)
+    records["colors"] = rounded(torch.cat([stored.colors, stored.opacities[:, None]], dim=-1) * 255)
+    records["quaternions"] = rounded(normalize_quaternion(stored.quaternions) * 128 + 128)
     write_bytes(path, records.tobytes())
     return stored.count
 
 
-def _bytes(values: Tensor) -> UInt8[np.ndarray, "*shape"]:
+def rounded(values: Tensor) -> UInt8[np.ndarray, "*shape"]:
+    """Round values to bytes, those outside of 0 to 255 to the nearer end."""
     return values.round().clamp(0, 255).to(torch.uint8).cpu().numpy()
 
 
@@ -130,8 +131,10 @@ def write_glb(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
 
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     """Return arrays [gaussian, component] by attribute name of the glTF primitive."""
-    opacities = gaussians.opacities.clamp(0, 1)[:, None]
-    points = torch.cat([_linear(gaussians.colors.clamp(0, 1)), opacities], dim=-1)
+    opacities, colors = gaussians.opacities.clamp(0, 1)[:, None], gaussians.colors.clamp(0, 1)
+    # From sRGB to linear light (IEC 61966-2-1), in which glTF stores the colours of points.
+    linear = torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    points = torch.cat([linear, opacities], dim=-1)
     splats = {
         "ROTATION": normalize_quaternion(gaussians.quaternions).roll(-1, dims=-1),  # x, y, z, w
         "SCALE": gaussians.scales,
@@ -141,11 +144,6 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     arrays = {"POSITION": gaussians.means} | {f"{EXTENSION}:{name}": values for name, values in splats.items()}
     as_floats = {name: values.numpy().astype("<f4") for name, values in arrays.items()}
     return as_floats | {"COLOR_0": points.mul(65535).round().numpy().astype("<u2")}
-
-
-def _linear(colors: Float[Tensor, "gaussian 3"]) -> Float[Tensor, "gaussian 3"]:
-    """Convert sRGB to linear light (IEC 61966-2-1), in which glTF stores colours."""
-    return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
 
 
 def _description(arrays: dict[str, np.ndarray], size: int, comments: Sequence[str]) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """Images for people from tensors: bytes, grids, sheets with labels, and colours for depth and normals."""
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from completesplat.data.images.files import image_bytes
 from completesplat.files import write_bytes
 from completesplat.rasterizers import Rendering
 
@@ -44,9 +44,7 @@ def to_bytes(images: Float[Tensor, "*batch 3 height width"]) -> UInt8[np.ndarray
 
 def write_png(path: Path, image: Image.Image) -> None:
     """Write an image as PNG with `write_bytes`."""
-    content = io.BytesIO()
-    image.save(content, format="PNG")
-    write_bytes(path, content.getvalue())
+    write_bytes(path, image_bytes(image, "PNG"))
 
 
 def enlarge(

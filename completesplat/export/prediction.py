@@ -25,7 +25,7 @@ from completesplat.export.images import (
 )
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform
-from completesplat.export.video import orbit_views, render_views, write_video
+from completesplat.export.video import Frames, orbit_views, render_views, write_video
 from completesplat.files import make_folder, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
@@ -116,13 +116,7 @@ def write_prediction(
 
 
 def write_fitted_scene(
-    folder: Path,
-    name: str,
-    scene: Gaussians,
-    cameras: Cameras,
-    images: Float[Tensor, "view 3 height width"],
-    truth: Float[Tensor, "view 3 height width"],
-    seed: int,
+    folder: Path, name: str, scene: Gaussians, cameras: Cameras, images: Frames, truth: Frames, seed: int
 ) -> None:
     """Write `scene.ply`, `sheet.png` (true and rendered images of at most 8 views) and `scene.json`.
 
@@ -154,7 +148,7 @@ def _write_sample(
     up: Float[Tensor, "3"],
     wanted: Wanted,
     comments: Sequence[str],
-) -> tuple[Float[Tensor, "view 3 height width"], Float[Tensor, "1 height width"], dict[str, str]]:
+) -> tuple[Frames, Float[Tensor, "1 height width"], dict[str, str]]:
     """Write a sample's splats and videos; return views around it, the first view's depth, and file names by purpose."""
     pivot = seen_center(rasterizer, scene, reference)
     view = PageView(reference, pivot, up, wanted.background)

@@ -88,14 +88,11 @@ def _run(command: Sequence[str]) -> str:
             raise CompleteSplatError(f"{name} has not finished within {LIMIT_SECONDS} seconds") from error
         raise
     if process.returncode != 0:
-        raise CompleteSplatError(f"{name} failed with status {process.returncode}: {_reason(complaint)}")
+        # Without npm's hints and Node's stack trace.
+        lines = [line for line in complaint.splitlines() if not line.startswith(("npm warn", "    at "))]
+        reason = " ".join(" ".join(lines).split())[:500] or "it does not say why"
+        raise CompleteSplatError(f"{name} failed with status {process.returncode}: {reason}")
     return output
-
-
-def _reason(complaint: str) -> str:
-    """Return a program's error output without npm's hints and Node's stack trace."""
-    lines = [line for line in complaint.splitlines() if not line.startswith(("npm warn", "    at "))]
-    return " ".join(" ".join(lines).split())[:500] or "it does not say why"
 
 
 @dataclass(frozen=True)

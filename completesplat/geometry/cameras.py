@@ -13,6 +13,10 @@ from torch import Tensor
 
 from completesplat.tensors import TensorDataclass
 
+Vectors = Float[Tensor, "*#batch 3"]
+Points = Float[Tensor, "*#batch n 3"]
+Pixels = Float[Tensor, "*#batch n 2"]
+
 PARALLEL = 1e-5
 """Mean squared sine between axes and their mean direction, below which they count as parallel (0.2 degrees)."""
 
@@ -58,33 +62,25 @@ def _rigid(rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*b
     return matrix
 
 
-def transform_points(
-    matrix: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch n 3"]
-) -> Float[Tensor, "*batch n 3"]:
+def transform_points(matrix: Float[Tensor, "*#batch 4 4"], points: Points) -> Float[Tensor, "*batch n 3"]:
     """Apply an affine 4 x 4 matrix to points."""
     return points @ matrix[..., :3, :3].mT + matrix[..., None, :3, 3]
 
 
-def project(
-    cameras: Cameras, points: Float[Tensor, "*#batch n 3"]
-) -> tuple[Float[Tensor, "*batch n 2"], Float[Tensor, "*batch n"]]:
+def project(cameras: Cameras, points: Points) -> tuple[Float[Tensor, "*batch n 2"], Float[Tensor, "*batch n"]]:
     """Project world points to pixel coordinates (u, v) and depth along the optical axis."""
     camera_points = transform_points(cameras.world_to_camera, points)
     homogeneous = camera_points @ cameras.intrinsics.mT
     return homogeneous[..., :2] / homogeneous[..., 2:], camera_points[..., 2]
 
 
-def unproject(
-    cameras: Cameras, pixels: Float[Tensor, "*#batch n 2"], depth: Float[Tensor, "*#batch n"]
-) -> Float[Tensor, "*batch n 3"]:
+def unproject(cameras: Cameras, pixels: Pixels, depth: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*batch n 3"]:
     """Convert pixel coordinates with depth along the optical axis to world points; the inverse of `project`."""
     camera_points = rays_through(cameras.intrinsics, pixels) * depth[..., None]
     return transform_points(cameras.camera_to_world, camera_points)
 
 
-def rays_through(
-    intrinsics: Float[Tensor, "*#batch 3 3"], pixels: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*batch n 3"]:
+def rays_through(intrinsics: Float[Tensor, "*#batch 3 3"], pixels: Pixels) -> Float[Tensor, "*batch n 3"]:
     """Return camera-frame rays ((u - cx) / fx, (v - cy) / fy, 1), not normalised, so that ray * depth is a point."""
     focal = torch.diagonal(intrinsics, dim1=-2, dim2=-1)[..., None, :2]
     xy = (pixels - intrinsics[..., None, :2, 2]) / focal
@@ -145,9 +141,7 @@ def mirror(cameras: Cameras) -> Cameras:
     return Cameras(cameras.world_to_camera * signs[:, None] * signs, intrinsics, cameras.image_size)
 
 
-def look_at(
-    eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "*#batch 3"]
-) -> Float[Tensor, "*batch 4 4"]:
+def look_at(eye: Vectors, target: Vectors, up: Vectors) -> Float[Tensor, "*batch 4 4"]:
     """Return `world_to_camera` of a camera at `eye` with `target` in the image's centre and `up` pointing up."""
     eye, target, up = torch.broadcast_tensors(eye, target, up)  # type: ignore[no-untyped-call]
     forward = torch.nn.functional.normalize(target - eye, dim=-1)

@@ -35,14 +35,12 @@ def _difference(
     points: Float[Tensor, "*batch 3 height width"], known: Bool[Tensor, "*batch 1 height width"], axis: int
 ) -> Float[Tensor, "*batch 3 height width"]:
     """Subtract the point before from the next one; the point itself replaces a missing one."""
-    size = points.shape[axis]
-    following = torch.arange(1, size + 1, device=points.device).clamp(max=size - 1)
-    before = torch.arange(-1, size - 1, device=points.device).clamp(min=0)
-    ends = (
+    indices = torch.arange(points.shape[axis], device=points.device)
+    before, following = (
         torch.where(known.index_select(axis, index), points.index_select(axis, index), points)
-        for index in (following, before)
+        for index in ((indices - 1).clamp(min=0), (indices + 1).clamp(max=len(indices) - 1))
     )
-    return next(ends) - next(ends)
+    return following - before
 
 
 TOLERANCE = 0.03

@@ -61,16 +61,9 @@ class ImageSets:
         for index, metric in enumerate(self.metrics):
             predicted, true = self.described[owner, region, index], self.described[self.TRUE, region, index]
             if predicted:
-                names = sorted(predicted)
-                figures |= metric.distances(
-                    *(torch.cat([scenes[name] for name in names]) for scenes in (true, predicted))
-                )
+                sets = (torch.cat([scenes[name] for name in sorted(predicted)]) for scenes in (true, predicted))
+                figures |= metric.distances(*sets)
         return figures
-
-    def merge(self, described: dict[tuple[str, str, int], dict[str, Descriptors]]) -> None:
-        """Add the descriptors of another process."""
-        for key, scenes in described.items():
-            self.described[key] |= scenes
 
 
 class Inception:

@@ -22,6 +22,7 @@ from completesplat.scene import SceneBatch, Views
 ImageMetric = Callable[[Tensor, Tensor], Tensor]
 Scores = dict[tuple[str, str, str], float]
 Depths = Float[Tensor, "image 1 height width"]
+Samples = Float[Tensor, "sample view 3 height width"]
 REGIONS = ("full", "object")
 PROPER_REGIONS = ("full", "hidden")
 MODEL, BEST, BEST_BY_METRIC, MEAN = "model", "best_of_k", "best_of_k_by_metric", "mean_of_k"
@@ -92,7 +93,7 @@ class Evaluation:
             self._add(predictor, name, self.score(clipped, truth[b]), dict.fromkeys(REGIONS, clipped), truth[b])
 
     @torch.no_grad()
-    def update_samples(self, name: str, images: Float[Tensor, "sample view 3 height width"], truth: Views) -> None:
+    def update_samples(self, name: str, images: Samples, truth: Views) -> None:
         """Add the scores of one scene's samples: of the first, of the best ones (`BEST_RULES`), and their mean."""
         images = images.clamp(0, 1)
         each = [self.score(sample, truth) for sample in images]
@@ -161,7 +162,8 @@ class Evaluation:
                 self.scores[predictor] |= scenes
             self.views |= views
             self.drawn |= drawn
-            self.sets.merge(sets)
+            for key, described in sets.items():
+                self.sets.described[key] |= described
             self.skipped |= skipped
 
     def results(self) -> dict[str, Any]:
@@ -192,9 +194,7 @@ def _means(rows: Sequence[Sequence[float]]) -> list[float]:
     return [sum(values) / len(rows) for values in zip(*rows, strict=True)]
 
 
-def noisy_mean(
-    images: Float[Tensor, "sample view 3 height width"], seed: int
-) -> Float[Tensor, "sample view 3 height width"]:
+def noisy_mean(images: Samples, seed: int) -> Samples:
     """Return as many images: the samples' mean plus white noise of the same variance as the samples.
 
     Best of k gains from this noise too, so a gain of that size does not speak for the samples.
@@ -203,9 +203,7 @@ def noisy_mean(
     return (images.mean(0) + images.var(0).mean().sqrt() * noise).clamp(0, 1)
 
 
-def proper_scores(
-    images: Float[Tensor, "sample view 3 height width"], truth: Views
-) -> tuple[Scores, dict[str, list[float]]]:
+def proper_scores(images: Samples, truth: Views) -> tuple[Scores, dict[str, list[float]]]:
     """Return `energy`, `crps` and rank histograms of the novel views, for each region of `novel_values`."""
     scores: Scores = {}
     ranks = {}
@@ -217,7 +215,7 @@ def proper_scores(
 
 
 def novel_values(
-    images: Float[Tensor, "sample view 3 height width"], truth: Views
+    images: Samples, truth: Views
 ) -> dict[str, tuple[Float[Tensor, "sample value"], Float[Tensor, " value"]]]:
     """Return the values of the samples and the true values by region; the first view of `truth` is the reference.
 
@@ -280,7 +278,7 @@ def _worst_first(scores: Sequence[float], higher_is_better: bool) -> list[float]
     return sorted(scores, reverse=not higher_is_better)
 
 
-def diversity(images: Float[Tensor, "sample view 3 height width"]) -> float:
+def diversity(images: Samples) -> float:
     """Return the root mean square difference of two samples' renders, averaged over all pairs and views."""
     differences = [(a - b).square().mean((1, 2, 3)).sqrt() for a, b in combinations(images, 2)]
     return torch.stack(differences).mean().item()

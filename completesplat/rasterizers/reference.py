@@ -33,14 +33,7 @@ class ReferenceRasterizer:
         return stack(scenes)
 
     def _render(self, gaussians: Gaussians, camera: Cameras) -> Rendering:
-        pixels = pixel_centers(*camera.image_size, gaussians.means.device, gaussians.means.dtype).flatten(0, 1)
-        image = self.at_pixels(gaussians, camera, pixels).mT.reshape(5, *camera.image_size)
-        return Rendering(image[:3], image[3:4], image[4:])
-
-    def at_pixels(
-        self, gaussians: Gaussians, camera: Cameras, pixels: Float[Tensor, "pixel 2"]
-    ) -> Float[Tensor, "pixel 5"]:
-        """Return red, green, blue, depth and alpha of one scene seen by one camera, at these pixel coordinates.
+        """Render one scene from one camera.
 
         The backward pass computes intermediate results again. Memory thus does not grow with the number of pixels, and
         computing results twice in the cache is faster than reading them from memory once.
@@ -49,9 +42,12 @@ class ReferenceRasterizer:
         chosen = gaussians[visible][depth_order]
         centers, depths, covariances = project_gaussians(chosen, camera, self.constants)
         values = torch.cat([chosen.colors, depths[:, None], torch.ones_like(depths)[:, None]], dim=-1)
+        pixels = pixel_centers(*camera.image_size, gaussians.means.device, gaussians.means.dtype).flatten(0, 1)
         chunks = torch.split(pixels, max(1, PAIRS_AT_ONCE // max(1, chosen.count)))
         inputs = (centers, covariances, chosen.opacities, values)
-        return torch.cat([checkpoint(self._chunk, chunk, *inputs, use_reentrant=False) for chunk in chunks])
+        columns = torch.cat([checkpoint(self._chunk, chunk, *inputs, use_reentrant=False) for chunk in chunks])
+        image = columns.mT.reshape(5, *camera.image_size)
+        return Rendering(image[:3], image[3:4], image[4:])
 
     def _chunk(self, pixels: Tensor, centers: Tensor, covariances: Tensor, opacities: Tensor, values: Tensor) -> Tensor:
         alphas = alphas_at(pixels, centers, covariances, opacities, self.constants)

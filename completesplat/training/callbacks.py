@@ -20,7 +20,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.data.loading.distributed import gathered, mean_of_processes
 from completesplat.errors import DivergenceError
-from completesplat.scene import CachedScene, SceneBatch
+from completesplat.scene import Batch
 from completesplat.settings.schema import Positive, Share
 from completesplat.training.stage import Stage, now
 
@@ -228,12 +228,7 @@ class Throughput(Callback):
             self.paused += now() - self.pause
 
     def on_train_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: object,
-        batch: SceneBatch | CachedScene,
-        batch_idx: int,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
     ) -> None:
         self.scenes += len(batch.names)
         stepped, self.step = trainer.global_step != self.step, trainer.global_step

@@ -4,7 +4,6 @@ import hashlib
 import logging
 import os
 import shutil
-from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from copy import deepcopy
 from pathlib import Path
@@ -16,6 +15,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import DivergenceError, WeightsError
@@ -187,11 +187,7 @@ def _replaced(path: Path, size: int = 0) -> AbstractContextManager[Path]:
 
 def bytes_of(contents: object) -> int:
     """Return the bytes of all tensors in nested containers, the least size of a file that holds them."""
-    if isinstance(contents, Tensor):
-        return contents.nbytes
-    if isinstance(contents, Mapping):
-        return sum(map(bytes_of, contents.values()))
-    return sum(map(bytes_of, contents)) if isinstance(contents, list | tuple) else 0
+    return sum(leaf.nbytes for leaf in tree_leaves(contents) if isinstance(leaf, Tensor))
 
 
 def _add_checksum(path: Path) -> None:

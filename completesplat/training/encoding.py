@@ -43,6 +43,7 @@ from completesplat.weights import sha256_of
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 Rows = dict[str, Shaped[np.ndarray, "image _ _ _"]]
+Moments = Float[np.ndarray, "row channel _ _"]
 Sums = Float[np.ndarray, "3 channel"]
 Reference = tuple[PosedSequence, int]
 """A sequence, and the index of its frame to encode."""
@@ -105,16 +106,14 @@ def encoded(
     return {"condition": (images * 255).round().to(torch.uint8).cpu().numpy(), **rows}
 
 
-def moment_sums(
-    mean: Float[np.ndarray, "row channel _ _"], log_variance: Float[np.ndarray, "row channel _ _"]
-) -> Float[np.ndarray, "3 channel"]:
+def moment_sums(mean: Moments, log_variance: Moments) -> Sums:
     """Return each channel's number of elements and expected sums of h and h^2, in float64, without sampling h."""
     mean, variance = mean.astype(np.float64), np.exp(log_variance.astype(np.float64))
     total, squares = mean.sum((0, 2, 3)), (np.square(mean) + variance).sum((0, 2, 3))
     return np.stack([np.full_like(total, mean[:, 0].size), total, squares])
 
 
-def moments(sums: Float[np.ndarray, "3 channel"]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def moments(sums: Sums) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return mean and standard deviation of each channel; Var[h] = E[mean^2] + E[variance] - E[mean]^2."""
     count, total, squares = sums
     mean = total / count

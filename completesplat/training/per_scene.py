@@ -30,7 +30,7 @@ from completesplat.scene import SceneBatch, Views
 from completesplat.settings.schema import Range
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import stack
-from completesplat.training.stage import Stage
+from completesplat.training.stage import Renders, Stage
 
 logger = logging.getLogger(__name__)
 
@@ -58,14 +58,7 @@ class PerScene(Stage):
         self.fitting = fitting
         self.scenes_folder = None if scenes_folder is None else Path(scenes_folder)
 
-    def scene_scored(
-        self,
-        name: str,
-        gaussians: Gaussians,
-        cameras: Cameras,
-        images: Float[Tensor, "sample view 3 height width"],
-        truth: Views,
-    ) -> None:
+    def scene_scored(self, name: str, gaussians: Gaussians, cameras: Cameras, images: Renders, truth: Views) -> None:
         """Write the scene, or log a warning if it has nothing that can be written."""
         if self.scenes_folder is None:
             return

@@ -1,6 +1,7 @@
 """Stage 1: a reconstruction model trained from posed images alone (paper, Section 3.2)."""
 
 import logging
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,6 @@ from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.baselines.autodecoder import AutoDecoder, Codes, optimize_codes
 from completesplat.baselines.splatter_image.files import write_trained
 from completesplat.baselines.splatter_image.model import PublishedSplatterImage
-from completesplat.data.sequences import SequenceSource
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.generator import OneAnswer
@@ -209,8 +209,11 @@ class ReconstructorOnly(ReconstructionModule):
     def setup(self, stage: str) -> None:
         """Allocate a code for each training image, unless a checkpoint has codes."""
         if stage == "fit" and not len(self.model.codes):
-            source = self.data.source("train")
-            self.model.make_room(sum(_frames(source, name) for name in source.names))
+            source, frames = self.data.source("train"), 0
+            for name in source.names:
+                with suppress(DataError):
+                    frames += len(source.read(name).frames)
+            self.model.make_room(frames)
 
     def on_fit_start(self) -> None:
         """Raise CompleteSplatError for several processes, because each would assign the codes to other images."""
@@ -251,11 +254,3 @@ class ReconstructorOnly(ReconstructionModule):
         images = self.rasterizer(gaussians, views.cameras).over(self.background)
         total, _ = self.loss(Prediction(images, gaussians, None), views, self.global_step)
         return total
-
-
-def _frames(source: SequenceSource, name: str) -> int:
-    """Return the number of a sequence's frames; 0 if it cannot be read."""
-    try:
-        return len(source.read(name).frames)
-    except DataError:
-        return 0

@@ -227,15 +227,8 @@ class Stage(LightningModule):
         self.seconds[name].append((now() - start) / scenes)
         return result
 
-    def scene_scored(
-        self,
-        name: str,
-        gaussians: Gaussians,
-        cameras: Cameras,
-        images: Float[Tensor, "sample view 3 height width"],
-        truth: Views,
-    ) -> None:
-        """Write the result of a test for a scene: Gaussians [sample], and their images as they are scored.
+    def scene_scored(self, name: str, gaussians: Gaussians, cameras: Cameras, images: Renders, truth: Views) -> None:
+        """Write the result of a test for a scene: Gaussians [sample], and their images, as they are scored.
 
         The cameras are those of the renders, which may be smaller than the scored images.
         """

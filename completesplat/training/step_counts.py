@@ -24,7 +24,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses.ssim import blur_matrix
 from completesplat.rasterizers import Rendering
-from completesplat.scene import CachedScene, SceneBatch
+from completesplat.scene import Batch, CachedScene, SceneBatch
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stage import Stage
@@ -168,7 +168,6 @@ def count_step(
 
     Args:
         build: makes the module, whose rasterizer should be `StoreOnly`, without reading weights.
-        image_size: side of the images in pixels.
         batch, targets: number of scenes of a batch of this process, and of target views of each.
         precision: precision in Lightning's notation.
         accumulated: number of batches of a step.
@@ -185,7 +184,7 @@ def count_step(
         if isinstance(module, ReconstructionModule):
             module.draw_others = lambda targets: targets - 1  # type: ignore[method-assign]
         weights, latent_bytes = live.bytes, None
-        inputs: SceneBatch | CachedScene = synthetic_batch(image_size, batch, targets)
+        inputs: Batch = synthetic_batch(image_size, batch, targets)
         if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch):
             encoded = encode(module, inputs)  # rows of a cache are in float32 with a checksum, images in bytes
             part = 4 if module.completesplat.conditioning.frozen else 1
@@ -199,9 +198,7 @@ def count_step(
         return StepCounts(trained, frozen, flops, operations, memory, latent_bytes)
 
 
-def _count(
-    training: Training, inputs: SceneBatch | CachedScene, accumulated: int, live: LiveMemory
-) -> tuple[int, int, dict[str, int]]:
+def _count(training: Training, inputs: Batch, accumulated: int, live: LiveMemory) -> tuple[int, int, dict[str, int]]:
     """Return FLOPs, operations and memory of a step; the weights are part of the batch's."""
     counter = flop_counter.FlopCounterMode(display=False, custom_mapping=ATTENTION)
     before, first = live.bytes, live.operations

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
-from completesplat.scene import CachedScene, SceneBatch, Views
+from completesplat.scene import Batch, SceneBatch, Views
 from completesplat.training.stage import Stage
 
 DISTANCE = 2.2  # from the cameras to the object's centre, world units
@@ -38,14 +38,14 @@ class Training:
         """Return the optimizer, which takes memory from the first step on."""
         return self.module.optimizer([p for p in self.module.parameters() if p.requires_grad])
 
-    def step(self, batch: SceneBatch | CachedScene) -> None:
+    def step(self, batch: Batch) -> None:
         """Do one optimizer step on a batch of scenes or of their latents."""
         loss = self.loss(batch)
         self.optimizer.zero_grad()
         torch.autograd.backward([loss])
         self.update()
 
-    def loss(self, batch: SceneBatch | CachedScene) -> Tensor:
+    def loss(self, batch: Batch) -> Tensor:
         """Return the loss of a batch."""
         module = self.module.train()
         with autocast(module.device, self.precision):

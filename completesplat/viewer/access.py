@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, quote
 
@@ -29,24 +30,7 @@ from completesplat.files import printable
 
 # viser has no settings for these. The page stays as viser made it if another version of viser has other texts.
 TITLE = "completesplat"
-ICON = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><g fill-opacity=".8">
-<ellipse cx="11" cy="20" rx="9" ry="7" fill="#1971c2"/><ellipse cx="21" cy="20" rx="9" ry="7" fill="#f08c00"/>
-<ellipse cx="16" cy="11" rx="8" ry="8" fill="#2f9e44"/></g></svg>"""
-
-# viser's program stands compressed in the page, and is put into the document as a text. Of that text,
-# - the square on which splats are drawn gets corners of three numbers: of two, three.js measures a bounding sphere of
-#   radius NaN, and says so as an error; the square is no place of the scene, and must not be culled by that sphere;
-# - the panel of narrow windows is folded at first, since it would cover most of the scene.
-CORRECTIONS = r"""<script>
-document.head.appendChild = function (node) {
-  if (node.type === "module")
-    node.textContent = node.textContent
-      .replace("[-2,-2,2,-2,2,2,-2,2]),2)", "[-2,-2,0,2,-2,0,2,2,0,-2,2,0]),3)")
-      .replace(/(`mesh`,\{ref:\w+,geometry:\w+\.geometry,)(material:\w+\.material,renderOrder:)/, "$1frustumCulled:!1,$2")
-      .replace(/(\{toggle:\w+\}\]=\w+\()!0(\);return\(0,\w+\.jsx\)\(\w+\.Provider,\{value:\{wrapperRef:)/, "$1!1$2");
-  return Node.prototype.appendChild.call(this, node);
-};
-</script>"""  # noqa: E501
+ICON, CORRECTIONS = (Path(__file__).with_name(name) for name in ("icon.svg", "corrections.js"))
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost", "[::1]")
@@ -192,7 +176,7 @@ def tokens(request: Request, port: int) -> list[bytes]:
 
 def with_head(page: str) -> str:
     """Return viser's HTML with our title, icon and corrections."""
-    icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON)}" />'
+    icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON.read_text())}" />'
     page = re.sub(r'<link\s+rel="icon"\s+href="[^"]*"\s*/>', icon, page, count=1)
     page = re.sub(r"<title>[^<]*</title>", f"<title>{TITLE}</title>", page, count=1)
-    return page.replace("<head>", f"<head>{CORRECTIONS}", 1)
+    return page.replace("<head>", f"<head><script>{CORRECTIONS.read_text()}</script>", 1)

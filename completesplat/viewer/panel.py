@@ -1,7 +1,6 @@
 """Controls of the page: completing a photo, viewing its samples, and saving them."""
 
 import base64
-import io
 from collections.abc import Sequence
 from functools import partial
 from html import escape
@@ -14,6 +13,7 @@ from diffusers import DDIMScheduler
 from jaxtyping import UInt8
 from PIL import Image
 
+from completesplat.data.images.files import image_bytes
 from completesplat.diffusion.sampling import Sampler
 from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
@@ -117,9 +117,7 @@ def preview_of(image: Pixels, label: str) -> str:
 
 def _source(image: Pixels) -> str:
     """Return an image as a data URL, because viser's own images disappear when the panel is moved."""
-    content = io.BytesIO()
-    Image.fromarray(image).save(content, format="PNG")
-    return f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode()}"
+    return f"data:image/png;base64,{base64.b64encode(image_bytes(Image.fromarray(image), 'PNG')).decode()}"
 
 
 def possible_steps(sampler: Sampler) -> list[int]:

@@ -12,6 +12,7 @@ import viser
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from completesplat.export.formats import rounded
 from completesplat.export.images import color_depth
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -247,21 +248,17 @@ class ViserSplats(NamedTuple):
 
 def to_splats(gaussians: Gaussians) -> ViserSplats:
     """Convert one unbatched set; leave out Gaussians that are not finite, and clamp colours to [0, 1]."""
-    finite = gaussians.keep(gaussians.finite()).to("cpu")
+    finite = gaussians.keep(gaussians.finite()).detach().to("cpu")
     largest = finite.scales.max().item() if finite.count else 1.0
     scale = max(largest, 1e-12) / math.sqrt(LARGEST_COVARIANCE)
     unit = replace(finite, means=finite.means / scale, scales=finite.scales / scale)
     return ViserSplats(
         unit.means.float().numpy(),
         unit.covariances().float().numpy(),
-        _bytes(finite.colors),
-        _bytes(finite.opacities[:, None]),
+        rounded(finite.colors * 255),
+        rounded(finite.opacities[:, None] * 255),
         scale,
     )
-
-
-def _bytes(values: Float[Tensor, "gaussian channel"]) -> UInt8[np.ndarray, "gaussian channel"]:
-    return values.detach().clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
 
 
 def depth_colored(scenes: Sequence[Gaussians]) -> list[Gaussians]:

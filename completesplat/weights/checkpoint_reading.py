@@ -140,12 +140,7 @@ def _is_plain_call(function: str, arguments: tuple[_Op, ...]) -> bool:
             return text.name in TEXTS and codec == _Op(codec.name, "latin1")
         case "_rebuild_parameter", _:
             return True
-        case "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_tensor_v3", (
-            _Op("BINPERSID", length),
-            _,
-            sizes,
-            *_,
-        ):
+        case "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_tensor_v3", (_Op("BINPERSID", length), _, sizes, *_):
             if any(size.name not in NUMBERS for size in sizes.inputs):
                 return False
             if math.prod(size.argument for size in sizes.inputs) > max(length, MOST_REPEATED):

@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image, ImageCms, ImageFile
 
-from completesplat.data.images.crop import Square, read_square
+from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.exif import ORIENTATION
 from completesplat.data.images.files import decode, read_depth
 from completesplat.data.validation import BadImage, MissingFile
@@ -114,10 +114,10 @@ def ramp(tmp_path):
 
 
 def test_a_whole_pixel_crop_without_resizing_is_a_slice(ramp, tmp_path):
-    pixels = read_square(ramp, (20, 30), Square(7, 3, 10), 10, "L")
+    pixels = cut_square(decode(ramp, str(ramp), "L", (20, 30)), Square(7, 3, 10), 10)
     assert np.array_equal(pixels[0].numpy(), 4 * np.arange(7, 17) + 5 * np.arange(3, 13)[:, None])
     Image.fromarray(DEEP).save(tmp_path / "mask.png")
-    square = read_square(tmp_path / "mask.png", (6, 8), Square(1, 0, 6), 6, "L")
+    square = cut_square(decode(tmp_path / "mask.png", "mask.png", "L", (6, 8)), Square(1, 0, 6), 6)
     assert np.array_equal(square[0].numpy(), EIGHT[:, 1:7])
 
 
@@ -125,7 +125,7 @@ def test_a_whole_pixel_crop_without_resizing_is_a_slice(ramp, tmp_path):
 def test_a_subpixel_crop_of_a_linear_image_keeps_to_the_plane(ramp, mode):
     """Pixel centres of the crop lie at left + (i + 0.5) side / size of the file, whose centres lie at i + 0.5."""
     left, top, side, size = 6.3, 2.6, 15.0, 12
-    pixels = read_square(ramp, (20, 30), Square(left, top, side), size, mode).numpy()
+    pixels = cut_square(decode(ramp, str(ramp), mode, (20, 30)), Square(left, top, side), size).numpy()
     centers = (np.arange(size) + 0.5) * side / size - 0.5
     expected = 4 * (left + centers)[None, :] + 5 * (top + centers)[:, None]
     assert pixels.shape == (3 if mode == "RGB" else 1, size, size)

@@ -39,7 +39,7 @@ def scored(count: int, skipped: set[str]) -> dict[str, Any]:
     store.names = [f"scene {index}" for index in range(count)]
     evaluation = Evaluation(samples=2, sets={"mean": Means()})
     cameras = Cameras(torch.eye(4).expand(3, 4, 4), torch.eye(3).expand(3, 3, 3), (16, 16))
-    for name in EvaluationScenes(store, lambda _: (0, [1, 2])).share(BATCH).names:
+    for name in EvaluationScenes(store, lambda _: (0, [1, 2]), store.names).share(BATCH).names:
         generator = torch.Generator().manual_seed(int(name.split()[1]))
         true, masks = torch.rand(3, 3, 16, 16, generator=generator), torch.ones(3, 1, 16, 16)
         images = torch.rand(2, 3, 3, 16, 16, generator=generator)

@@ -108,15 +108,12 @@ def in_order(frames: Sequence[CapturedFrame]) -> tuple[CapturedFrame, ...]:
         first = seen.setdefault(frame.image.resolve(), frame.number)
         if first != frame.number:
             raise BadAnnotation(f"the same image as frame {first}: {frame.image}", frame=frame.number)
-    return tuple(
-        sorted(
-            frames,
-            key=lambda frame: [
-                (len(part), part) if part.isdecimal() else (-1, part)
-                for part in re.split(r"([0-9]+)", str(frame.image))
-            ],
-        )
-    )
+
+    def key(frame: CapturedFrame) -> list[tuple[int, str]]:
+        parts = re.split(r"([0-9]+)", str(frame.image))
+        return [(len(part), part) if part.isdecimal() else (-1, part) for part in parts]
+
+    return tuple(sorted(frames, key=key))
 
 
 def _read_upright(path: Path, image_size: tuple[int, int]) -> tuple[Image.Image, Image.Image | None]:

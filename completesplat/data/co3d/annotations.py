@@ -3,10 +3,10 @@
 import gzip
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -52,6 +52,10 @@ class CO3DFrame:
     camera: Cameras
 
 
+Frames = dict[str, dict[int, CO3DFrame]]
+"""Frames by sequence and number."""
+
+
 @dataclass(frozen=True)
 class CO3DVideo:
     """Annotation of a whole sequence; a quality is None if it is missing or NaN."""
@@ -68,19 +72,17 @@ def read_videos(root: Path, path: Path, refuse: Refuse) -> dict[str, CO3DVideo]:
         DataError: the file is missing, unreadable or not a list.
     """
     videos: dict[str, CO3DVideo] = {}
-    for index, entry in enumerate(_read_list(path)):
-        with refused_to(refuse), at(path):
-            name = _name(entry, index)
-            with at(sequence=name):
-                if name in videos:
-                    raise BadAnnotation("the sequence is annotated twice")
-                quality = _optional_number(entry, "viewpoint_quality_score")
-                if entry.get("point_cloud") is None:
-                    videos[name] = CO3DVideo(None, None, quality)
-                    continue
-                cloud = field(entry, "point_cloud", dict)
-                path_of_cloud = inside(root, field(cloud, "path", str))
-                videos[name] = CO3DVideo(path_of_cloud, _optional_number(cloud, "quality_score"), quality)
+    for name, entry in _entries(path, refuse):
+        with refused_to(refuse), at(path, name):
+            if name in videos:
+                raise BadAnnotation("the sequence is annotated twice")
+            quality = _optional_number(entry, "viewpoint_quality_score")
+            if entry.get("point_cloud") is None:
+                videos[name] = CO3DVideo(None, None, quality)
+                continue
+            cloud = field(entry, "point_cloud", dict)
+            path_of_cloud = inside(root, field(cloud, "path", str))
+            videos[name] = CO3DVideo(path_of_cloud, _optional_number(cloud, "quality_score"), quality)
     return videos
 
 
@@ -92,37 +94,33 @@ def _optional_number(entry: Entry, key: str) -> float | None:
     return float(finite_array(value, (), key))
 
 
-def read_frames(
-    root: Path, path: Path, wanted: Callable[[str, int], bool], refuse: Refuse
-) -> dict[str, dict[int, CO3DFrame]]:
+def read_frames(root: Path, path: Path, wanted: Callable[[str, int], bool], refuse: Refuse) -> Frames:
     """Read those frames in `frame_annotations.jgz` that are `wanted`, by sequence and number; see `read_videos`."""
-    frames: dict[str, dict[int, CO3DFrame]] = {}
-    for index, entry in enumerate(_read_list(path)):
-        with refused_to(refuse), at(path):
-            name = _name(entry, index)
-            with at(sequence=name):
-                number = field(entry, "frame_number", int)
+    frames: Frames = {}
+    for name, entry in _entries(path, refuse):
+        with refused_to(refuse), at(path, name):
+            number = field(entry, "frame_number", int)
             if wanted(name, number):
-                with at(sequence=name, frame=number):
+                with at(frame=number):
                     if number in frames.get(name, ()):
                         raise BadAnnotation("the frame is annotated twice")
                     frames.setdefault(name, {})[number] = _frame(root, number, entry)
     return frames
 
 
-def _name(entry: object, index: int) -> str:
-    try:
-        return field(entry, "sequence_name", str)
-    except BadAnnotation as error:
-        raise BadAnnotation(f"entry {index}: {error.reason}") from None
-
-
-def _read_list(path: Path) -> list[Any]:
+def _entries(path: Path, refuse: Refuse) -> Iterator[tuple[str, Entry]]:
+    """Yield the names of sequences and the entries of a file; pass the errors of entries without a name to `refuse`."""
     # CO3D was written by Python's `json`, which writes NaN; every number is checked before use.
     content = read_json(path, allow_nan=True)
     if type(content) is not list:
         raise BadAnnotation("must hold a list", str(path))
-    return content
+    for index, entry in enumerate(content):
+        try:
+            name = field(entry, "sequence_name", str)
+        except BadAnnotation as error:
+            refuse(BadAnnotation(f"entry {index}: {error.reason}", str(path)))
+            continue
+        yield name, entry
 
 
 def _frame(root: Path, number: int, entry: Entry) -> CO3DFrame:

@@ -70,9 +70,8 @@ class CO3DDataModule(ObjectDataModule):
         return f"of the set list; where it validates nothing, {val:g} of training validates, by seed {seed}"
 
     def packed_settings(self) -> dict[str, Scalar]:
-        names = ("category", "subset", "allow_shared_sequences")
-        seeded = dict(zip(("val_fraction", "test_fraction", "split_seed"), self.seeded, strict=True))
-        return {name: getattr(self, name) for name in names} | seeded | vars(self.filters) | vars(self.framing)
+        chosen = {name: getattr(self, name) for name in ("category", "subset", "allow_shared_sequences")}
+        return chosen | self.seeded._asdict() | vars(self.filters) | vars(self.framing)
 
     def open(self, split: str) -> Mapping[str, CO3DSource]:
         """Open all splits at once, because they share the annotations."""

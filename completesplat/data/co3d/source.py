@@ -13,7 +13,7 @@ from torch import Tensor
 
 from completesplat.data.co3d.annotations import CO3DFrame
 from completesplat.data.co3d.splits import SplitMembers
-from completesplat.data.images.crop import Square, read_square
+from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.files import decode, read_depth
 from completesplat.data.placement import (
     OBJECT_HALF_SIZE,
@@ -88,8 +88,7 @@ def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
 
 def _foreground(frame: CO3DFrame) -> np.ndarray:
     """Return the world points [n 3] of a depth map's foreground; the map may be smaller than the image."""
-    if frame.depth is None:
-        return np.zeros((0, 3))
+    assert frame.depth is not None
     depth = read_depth(frame.depth.path, frame.depth.scale_adjustment)[0]
     mask = decode(frame.mask, str(frame.mask), "L", frame.camera.image_size)
     height, width = depth.shape
@@ -143,8 +142,9 @@ def _read(name: str, frames: list[CO3DFrame], size: int, index: int) -> MaskedIm
     frame = frames[index]
     square, image_size = square_of(frame.camera), frame.camera.image_size
     with at(sequence=name, frame=frame.number):
-        image = read_square(frame.image, image_size, square, size, "RGB")
-        return MaskedImage(image, read_square(frame.mask, image_size, square, size, "L"))
+        image = decode(frame.image, str(frame.image), "RGB", image_size)
+        mask = decode(frame.mask, str(frame.mask), "L", image_size)
+        return MaskedImage(cut_square(image, square, size), cut_square(mask, square, size))
 
 
 def _read_depth(name: str, frames: list[CO3DFrame], size: int, factor: float, index: int) -> Float[Tensor, "1 _ _"]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from completesplat.data.co3d.annotations import CO3DFrame, CO3DVideo, read_frames, read_videos
+from completesplat.data.co3d.annotations import CO3DFrame, CO3DVideo, Frames, read_frames, read_videos
 from completesplat.data.sequences import SPLITS, overlaps, shared_names, split_by_hash
 from completesplat.data.validation import (
     BadAnnotation,
@@ -36,7 +36,7 @@ class SeededSplit(NamedTuple):
 
     val_fraction: float
     test_fraction: float
-    seed: int
+    split_seed: int
 
 
 def set_list_path(category: Path, subset: str | None) -> Path | None:
@@ -89,10 +89,10 @@ def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, l
     lost = names["train"] & names["val"]
     train, val = listed["train"], {frame for frame in listed["val"] if frame[0] not in lost}
     if not val and len(names["train"]) > 1:
-        held_out = set(split_by_hash(sorted(names["train"]), rule.val_fraction, rule.seed)[1])
+        held_out = set(split_by_hash(sorted(names["train"]), rule.val_fraction, rule.split_seed)[1])
         logger.warning(
             "%s lists nothing for validation alone: %d of %d training sequences validate, by seed %d",
-            *(path, len(held_out), len(names["train"]), rule.seed),
+            *(path, len(held_out), len(names["train"]), rule.split_seed),
         )
         val, lost = {frame for frame in train if frame[0] in held_out}, lost - held_out
         train = train - val
@@ -103,9 +103,9 @@ def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Lis
     """Split at least three sequences by seed, each as a whole."""
     if len(frames) < 3:
         raise DataError(f"{len(frames)} sequences cannot be split into train, val and test; write a set list")
-    rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.seed)
+    rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.split_seed)
     # The hashes of the remaining names lie above the test fraction; validation gets the next interval.
-    train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.seed)
+    train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.split_seed)
     names = {"train": train, "val": val, "test": test}
     return {split: {(name, number) for name in names[split] for number in frames[name]} for split in SPLITS}
 
@@ -192,11 +192,7 @@ def read_category(
 
 
 def _members(
-    split: str,
-    listed: Iterable[tuple[str, int]],
-    frames: dict[str, dict[int, CO3DFrame]],
-    videos: dict[str, CO3DVideo],
-    filters: Filters,
+    split: str, listed: Iterable[tuple[str, int]], frames: Frames, videos: dict[str, CO3DVideo], filters: Filters
 ) -> SplitMembers:
     members: dict[str, list[CO3DFrame]] = {}
     for name, number in sorted(listed):

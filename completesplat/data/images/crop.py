@@ -1,7 +1,6 @@
 """Crop around the principal point, and resizing."""
 
-from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -9,7 +8,6 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from completesplat.data.images.files import decode
 from completesplat.data.validation import BadCamera
 
 
@@ -31,13 +29,6 @@ def principal_square(center: tuple[float, float], image_size: tuple[int, int]) -
     if not half > 0:
         raise BadCamera(f"principal point ({x:g}, {y:g}) lies outside of the {width} x {height} image")
     return Square(x - half, y - half, 2 * half)
-
-
-def read_square(
-    path: Path, image_size: tuple[int, int], square: Square, size: int, mode: Literal["RGB", "L"]
-) -> UInt8[Tensor, "channel size size"]:
-    """Read a square part of an image file, resized to `size`; see `decode` and `cut_square`."""
-    return cut_square(decode(path, str(path), mode, image_size), square, size)
 
 
 def cut_square(image: Image.Image, square: Square, size: int) -> UInt8[Tensor, "channel size size"]:

@@ -174,14 +174,10 @@ def augment(
 
 def mirrored(scene: SceneBatch) -> SceneBatch:
     """Mirror images, masks, depths and cameras left to right; the reference camera's frame remains the world frame."""
-    parts = (scene.reference, scene.targets)
-    reference, targets = (
-        Views(
-            views.images.flip(-1),
-            mirror(views.cameras),
-            views.masks.flip(-1),
-            None if views.depths is None else views.depths.flip(-1),
-        )
-        for views in parts
-    )
+
+    def flipped(views: Views) -> Views:
+        depths = None if views.depths is None else views.depths.flip(-1)
+        return Views(views.images.flip(-1), mirror(views.cameras), views.masks.flip(-1), depths)
+
+    reference, targets = flipped(scene.reference), flipped(scene.targets)
     return replace(scene, reference=reference, targets=targets, visible=scene.visible.flip(-1))

@@ -239,11 +239,10 @@ class SceneDataModule(LightningDataModule):
         return self.training_views(frames, epoch, rng)
 
     def _training_scenes(self) -> TrainingScenes:
-        drawing = self.store("train"), self._drawn_views
-        counting = self.references_per_sequence, self.seed
+        settings = self.store("train"), self._drawn_views, self.augment, self.references_per_sequence, self.seed
         if self.latent_cache is not None:
-            return CachedTrainingScenes(self.cached_latents, *drawing, self.box_masks, *counting)
-        return TrainingScenes(*drawing, self.augment, *counting)
+            return CachedTrainingScenes(*settings, self.cached_latents, self.box_masks)
+        return TrainingScenes(*settings)
 
     def val_dataloader(self) -> SceneLoader:
         """Load fixed views of all validation sequences."""
@@ -256,9 +255,9 @@ class SceneDataModule(LightningDataModule):
     predict_dataloader = test_dataloader
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
-        seen = None if self.at_model_size is None else self.at_model_size.store(split)
+        store, seen = self.store(split), None if self.at_model_size is None else self.at_model_size.store(split)
         choose, depths = partial(self.evaluation_views, split=split), split == "test"
-        scenes = EvaluationScenes(self.store(split), choose, seen=seen, depths=depths)
+        scenes = EvaluationScenes(store, choose, store.names, seen, depths)
         batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
         local = scenes.share(batch_size) if split == "test" else scenes
         return SceneLoader(local, batch_size, None, self.workers, *self.policy)

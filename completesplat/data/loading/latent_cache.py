@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
 from hashlib import sha256
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Shaped
 
 from completesplat.data.loading.augmentation import BoxMasks
-from completesplat.data.loading.scenes import Choice, SceneStore, TrainingScenes
+from completesplat.data.loading.scenes import TrainingScenes
 from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, json_text, read_as
 from completesplat.data.sequences import SequenceSource
 from completesplat.data.validation import ChangedFile, MissingFile, UnreadableFile, at, inside, require_file
@@ -187,7 +187,6 @@ class LatentCache:
         if sha256_of(checksums) != self.manifest.checksums:
             raise ChangedFile("its checksum is another: encode the images again", str(checksums))
         self.sequences = {sequence.name: sequence for sequence in self.manifest.sequences}
-        self.latent_shape = self.manifest.arrays["mean"].shape[1:]  # channels, height and width
         self.holds_images = self.origin.conditioning is None  # rather than features
 
     def scene(self, name: str, frame: int) -> CachedScene:
@@ -221,32 +220,26 @@ class LatentCache:
         return LatentCache, (self.folder,)
 
 
+@dataclass(eq=False)
 class CachedTrainingScenes(TrainingScenes):
     """Items of `TrainingScenes` without targets, with the same sequence and reference frame for (seed, epoch, index).
 
     If only some frames of a sequence were encoded, the nearest one (the earlier of two) replaces the reference frame.
-    `store` determines the order of items; its images are not read. Box masks hide parts of images as in `augment`.
+    `store` determines the order of items; its images are neither read nor augmented. Box masks hide parts of images
+    as in `augment`.
 
     Raises:
         CompleteSplatError: there are box masks, but the store holds features instead of images.
     """
 
-    def __init__(
-        self,
-        cache: LatentCache,
-        store: SceneStore,
-        choose: Callable[[int, int, np.random.Generator], Choice],
-        box_masks: BoxMasks | None,
-        references: int,
-        seed: int,
-    ) -> None:
-        super().__init__(store, choose, lambda scene, rng: scene, references, seed)
-        if box_masks is not None and not cache.holds_images:
+    cache: LatentCache
+    box_masks: BoxMasks | None
+
+    def __post_init__(self) -> None:
+        if self.box_masks is not None and not self.cache.holds_images:
             raise CompleteSplatError(
                 "data.box_masks cannot hide parts of encoded features: use data.latent_cache=null, or encode images"
             )
-        self.cache = cache
-        self.box_masks = box_masks
 
     def draw(self, name: str, epoch: int, rng: np.random.Generator) -> CachedScene:
         """Draw a random reference frame of the sequence `name` and return its encoding."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +35,7 @@ class Loaded(NamedTuple):
     refused_depths: tuple[DataError, ...] = ()
 
 
+@dataclass(eq=False)
 class SceneStore:
     """Scenes from the sequences of a source, in the order of its names.
 
@@ -44,18 +45,14 @@ class SceneStore:
         background: grey value (0 to 1) that replaces the background of images with a mask; None keeps it.
     """
 
-    def __init__(
-        self,
-        source: SequenceSource,
-        mask_threshold: float | None = None,
-        cache: bool = False,
-        background: float | None = None,
-    ) -> None:
-        self.source = source
-        self.names = source.names
-        self.mask_threshold = mask_threshold
-        self.background = background
-        self._cache: dict[tuple[str, int], MaskedImage] | None = {} if cache else None
+    source: SequenceSource
+    mask_threshold: float | None = None
+    cache: bool = False
+    background: float | None = None
+
+    def __post_init__(self) -> None:
+        self.names = self.source.names
+        self._cache: dict[tuple[str, int], MaskedImage] | None = {} if self.cache else None
 
     def scene(self, sequence: PosedSequence, reference: int, targets: Sequence[int]) -> SceneBatch:
         """Return the scene of the views with these indices, in the reference camera's coordinates."""
@@ -97,6 +94,7 @@ def _as_floats(images: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, 
     return torch.from_numpy(np.divide([image.numpy() for image in images], 255, dtype=np.float32))
 
 
+@dataclass(eq=False)
 class TrainingScenes(Dataset[Loaded]):
     """Dataset of scenes with random views; a key is (epoch, index), see `EpochSampler`.
 
@@ -107,19 +105,11 @@ class TrainingScenes(Dataset[Loaded]):
         references: number of items of each sequence in one epoch.
     """
 
-    def __init__(
-        self,
-        store: SceneStore,
-        choose: Callable[[int, int, np.random.Generator], Choice],
-        augment: Callable[[SceneBatch, np.random.Generator], SceneBatch],
-        references: int,
-        seed: int,
-    ) -> None:
-        self.store = store
-        self.choose = choose
-        self.augment = augment
-        self.references = references
-        self.seed = seed
+    store: SceneStore
+    choose: Callable[[int, int, np.random.Generator], Choice]
+    augment: Callable[[SceneBatch, np.random.Generator], SceneBatch]
+    references: int
+    seed: int
 
     def __len__(self) -> int:
         return len(self.store.names) * self.references
@@ -151,29 +141,22 @@ class TrainingScenes(Dataset[Loaded]):
         return [[name * self.references + i for name in group for i in offsets] for group in groups]
 
 
+@dataclass(eq=False)
 class EvaluationScenes(Dataset[Loaded]):
     """Dataset of evaluation scenes, one for each sequence.
 
     Args:
         choose: sequence -> views; it raises a DataError if the sequence lacks one of them.
-        names: sequences to evaluate; None: all.
+        names: sequences to evaluate.
         seen: store of the smaller images that the model sees; None: it sees the images of `store`.
         depths: also read the true depth if the data set has it.
     """
 
-    def __init__(
-        self,
-        store: SceneStore,
-        choose: Callable[[PosedSequence], Choice],
-        names: Sequence[str] | None = None,
-        seen: SceneStore | None = None,
-        depths: bool = False,
-    ) -> None:
-        self.store = store
-        self.choose = choose
-        self.names = store.names if names is None else names
-        self.seen = seen
-        self.depths = depths
+    store: SceneStore
+    choose: Callable[[PosedSequence], Choice]
+    names: Sequence[str]
+    seen: SceneStore | None = None
+    depths: bool = False
 
     def __len__(self) -> int:
         return len(self.names)
@@ -186,7 +169,7 @@ class EvaluationScenes(Dataset[Loaded]):
         rank, count = processes()
         starts = range(rank * batch_size, len(self.names), count * batch_size)
         local = [name for start in starts for name in self.names[start : start + batch_size]]
-        return EvaluationScenes(self.store, self.choose, local or self.names[:1], self.seen, self.depths)
+        return replace(self, names=local or self.names[:1])
 
     def __getitem__(self, index: int) -> Loaded:
         name = self.names[index]

@@ -14,6 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from completesplat.data.images.crop import Square, cut_square
+from completesplat.data.images.files import image_bytes
 from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.data.validation import BadAnnotation, BadImage, ChangedFile, UnreadableFile, at
 from completesplat.geometry.cameras import Cameras, crop_resize
@@ -28,9 +29,8 @@ def encode(image: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
     """Return an image file with three channels (colour) or one (grey); PNG and BMP are lossless."""
     # NumPy reorders the channels, here and below, because starting PyTorch's threads costs more than the work itself.
     pixels = np.ascontiguousarray(image.numpy().transpose(1, 2, 0))
-    content = io.BytesIO()
-    Image.fromarray(pixels.squeeze(-1) if len(image) == 1 else pixels).save(content, codec.upper(), **CODECS[codec])
-    return content.getvalue()
+    grey_or_rgb = Image.fromarray(pixels.squeeze(-1) if len(image) == 1 else pixels)
+    return image_bytes(grey_or_rgb, codec.upper(), **CODECS[codec])
 
 
 def decode(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tensor, "channel wanted wanted"]:

@@ -46,6 +46,7 @@ MOST_BYTES = 2**26  # a frame needs about 300
 CHUNKS_IN_MEMORY = 2
 
 Chunk = dict[str, dict[str, object]]
+Images = Sequence[Path] | Sequence[UInt8[Tensor, " _"]]
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Clip:
     key: str
     source: Path
     cameras: Cameras
-    images: Sequence[Path] | Sequence[UInt8[Tensor, " _"]]
+    images: Images
 
     def read(self, frame: int, square: Square, size: int) -> UInt8[Tensor, "3 {size} {size}"]:
         """Return the square part of a frame's image, resized to `size`."""
@@ -71,11 +72,7 @@ class Clip:
 
 
 def make_clip(
-    key: str,
-    source: Path,
-    timestamps: Sequence[int],
-    rows: Float[Tensor, "view 18"],
-    images: Sequence[Path] | Sequence[UInt8[Tensor, " _"]],
+    key: str, source: Path, timestamps: Sequence[int], rows: Float[Tensor, "view 18"], images: Images
 ) -> Clip:
     """Convert stored rows and images to a clip; the first image determines the size.
 
