@@ -175,10 +175,10 @@ class LatentDiffusion(Stage):
     def training_step(self, batch: SceneBatch | CachedScene, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat
         latent, conditioning = (x.repeat_interleave(self.noise_draws, 0) for x in self.inputs(batch))
-        surprise = latent.new_zeros(())
+        code_loss = latent.new_zeros(())
         if parts.denoiser.code is not None:
-            conditioning, surprise = parts.denoiser.code(latent, conditioning)
-            self.log_step({"train/code_surprise": surprise}, batch_size=len(latent))
+            conditioning, code_loss, told = parts.denoiser.code(latent, conditioning)
+            self.log_step({"train/code_nats": told}, batch_size=len(latent))
         conditioned = torch.rand(len(latent), device=self.device) >= self.unconditional_probability
         conditioning = conditioning * conditioned[:, None, None, None]
         noise = torch.randn(latent.shape, device=self.device)  # `randn_like` would depend on the memory layout
@@ -191,7 +191,7 @@ class LatentDiffusion(Stage):
         )
         errors: Tensor = (predicted - target(parts.sampler.scheduler, latent, noise, timestep)).square().mean((1, 2, 3))
         self.log_loss(errors.detach(), timestep)
-        return errors.mean() + surprise
+        return errors.mean() + code_loss
 
     def log_loss(self, errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"]) -> None:
         """Log the mean of the samples' losses, and that of each quarter of the timesteps that is among them."""
