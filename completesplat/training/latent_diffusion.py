@@ -34,7 +34,7 @@ class LatentDiffusion(Stage):
         completesplat: the whole generator, its autoreconstructor still without weights.
         autoreconstructor_checkpoint: checkpoint of stage 1 to start from.
         checkpoint: checkpoint of this stage to start from instead (for masked diffusion): all weights, the averaged
-            ones if it has them, and all measured values.
+            ones if it has them, and all measured values. Its denoiser may lack the code.
         unconditional_probability: probability of zeroing phi_ref, for guidance (0.2 in the paper).
         noise_draws: timesteps and noises that are drawn for each scene of a batch, whose image is encoded once.
         skip_weight, guidance_weight, color_fits: settings of the samples drawn in validation and test.
@@ -78,7 +78,7 @@ class LatentDiffusion(Stage):
         if autoreconstructor_checkpoint is not None:
             load_part(completesplat.autoreconstructor, autoreconstructor_checkpoint, prefix="model.")
         if checkpoint is not None:
-            load_part(completesplat, checkpoint, prefix="completesplat.")
+            load_part(completesplat, checkpoint, prefix="completesplat.", new="denoiser.code.")
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         prepare_network(completesplat.denoiser, channels_last, compile)
 
