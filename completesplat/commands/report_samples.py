@@ -18,6 +18,7 @@ from completesplat.commands import quieten
 from completesplat.commands.protocol import write_json
 from completesplat.commands.trained import Trained, diffusion_of
 from completesplat.data.loading.data_module import SceneDataModule
+from completesplat.errors import CompleteSplatError
 from completesplat.export.images import image_sheet, write_png
 from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
@@ -113,10 +114,13 @@ def front(out: Path, **run: Unpack[Run]) -> None:
 def modes(spread_views: Positive, out: Path, **run: Unpack[Run]) -> None:
     """Write `modes.json` and `modes.png`, and print the table; `studies.noise_levels.rows` explains its columns."""
     stage, data = _opened_stage(run)
+    model = diffusion_of(stage)
+    if not model.autoreconstructor.sees_views:
+        raise CompleteSplatError("these latents are equal in all modes: report modes needs posterior=views")
     data.setup("test")
     progress = partial(track, description="Scenes in all modes", console=Console(stderr=True))
     scenes = noise_levels.scenes_in_all_modes(data.hidden_modes(1, spread_views), run["scenes"], progress)
-    rows = noise_levels.rows(diffusion_of(stage), [x.to(stage.device) for x in scenes], run["samples"], run["seed"])
+    rows = noise_levels.rows(model, [x.to(stage.device) for x in scenes], run["samples"], run["seed"])
     settings = {"scenes": len(scenes), "samples": run["samples"], "seed": run["seed"], "spread_views": spread_views}
     write_json(out / "modes.json", {"settings": settings, "rows": rows})
     noise_levels.plot(rows, out / "modes.png", f"Hidden modes of {len(scenes)} scenes in noisy latents")

@@ -32,10 +32,10 @@ def fit_colors(
         background: grey value of the images where Gaussians leave a pixel open.
         visible: 0 where an image is not to be fitted.
     """
-    shown = 1.0 if visible is None else visible[:, None]
     with torch.inference_mode(False), torch.enable_grad():
         # Autograd cannot use tensors that were made in inference mode, but it can use copies.
         fixed, views = gaussians.map(torch.clone).detach(), cameras.map(lambda x: x[:, None].clone())
+        shown = 1.0 if visible is None else visible[:, None].clone()
         colors, total = fixed.colors, torch.ones(())
         for number in range(rounds):
             colors = colors.detach().requires_grad_()

@@ -2,6 +2,7 @@
 
 import csv
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 from conftest import made
@@ -47,6 +48,18 @@ def test_hidden_modes_have_every_rung_of_the_ladder(runs, command, tmp_path):
     # Of what all modes share the mean is certain; of the patch it is nobody.
     assert results["mean_predictor"]["energy_visible"] == pytest.approx(0, abs=0.02)
     assert results["mean_predictor"]["energy_hidden"] > 0.02
+
+
+def test_modes_has_shares_by_noise_level_and_a_figure(runs, command, tmp_path):
+    given = [f"ckpt={runs / 'diffusion/checkpoints/last.ckpt'}", "scenes=1", "samples=2", "spread_views=2"]
+    finished = command("report", "modes", *given, f"out={tmp_path}")
+    assert finished.status == 0, finished.err
+    results = strict_json(tmp_path / "modes.json")
+    assert results["settings"] == {"scenes": 1, "samples": 2, "seed": 0, "spread_views": 2}
+    assert all(0 <= row["best_share"] <= 1 for row in results["rows"])
+    assert sum(row["training_share"] for row in results["rows"]) == pytest.approx(1)
+    assert imageio.imread(tmp_path / "modes.png").ndim == 3
+    assert "Share of the true mode" in finished.out
 
 
 def test_several_samples_have_proper_scores_of_the_hidden_part(runs, command, tmp_path):

@@ -88,6 +88,9 @@ def test_one_gaussian_takes_the_mean_of_the_pixels_that_it_covers():
 
 
 def test_it_works_where_autograd_is_off(image):
-    expected = fitted(wall(2, 0.2), image, 2).colors
+    visible = torch.ones(1, 1, SIDE, SIDE)
+    expected = fitted(wall(2, 0.2), image, 2, visible).colors
     with torch.inference_mode():
-        assert torch.equal(fitted(wall(2, 0.2).map(torch.clone), image.clone(), 2).colors, expected)
+        scene, camera = wall(2, 0.2).map(torch.clone), CAMERA.map(torch.clone)
+        result = fit_colors(scene, camera, image.clone(), ReferenceRasterizer(), 2, 0.5, visible.clone())
+    assert torch.equal(result.colors, expected)
