@@ -151,9 +151,7 @@ class CompleteSplat(SceneModel):
 
         def draw(part: slice) -> Tensor:
             watch = None if on_step is None else lambda step, level, latent: on_step(step, level, decode(latent, part))
-            known, code = conditioning[image_of[part]], self.denoiser.code
-            known = known if code is None else code.drawn(known, noise[part])
-            return self.sampler(self.denoiser, noise[part], known, guidance_weight, steps, watch)
+            return self.sampler(self.denoiser, noise[part], conditioning[image_of[part]], guidance_weight, steps, watch)
 
         # Sample first, then decode: if a GPU's memory does not suffice to decode a part, its latents are not lost.
         latents = torch.cat(in_parts(draw, len(noise), batch))

@@ -112,10 +112,10 @@ def write_capture(folder: Path, frames: int, names: Sequence[str] = ()) -> None:
     (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": listed}))
 
 
-def tiny_generator(*overrides: str) -> CompleteSplat:
+def tiny_generator() -> CompleteSplat:
     """An untrained generator from the configs, with skips that pass something on."""
     settings = ["model.autoreconstructor_checkpoint=null", "data.image_size=32", "sampler.steps=2"]
-    config = compose_config("fit", "model=latent_diffusion", *settings, *overrides)
+    config = compose_config("fit", "model=latent_diffusion", *settings)
     torch.manual_seed(0)
     model = instantiate(config.model.completesplat, _convert_="all")
     for skip in model.autoreconstructor.reconstructor.skips.values():

@@ -1,6 +1,6 @@
 """Denoisers eps_theta(h_t, phi_ref, t): Stable Diffusion's UNet on [conditioning, noisy latent]."""
 
-from typing import Annotated, Any, TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import torch
 from diffusers import UNet2DConditionModel, UNet2DModel
@@ -10,11 +10,7 @@ from jaxtyping import Int
 from torch import Tensor, nn
 
 from completesplat.diffusion.guidance import Features, Latents
-from completesplat.diffusion.scene_code import SceneCode
-from completesplat.settings.schema import Few, Levels, Range, Width, Widths
-
-CodeLength = Annotated[int, Range(0, 16)]
-CodeValues = Annotated[int, Range(2, 256)]
+from completesplat.settings.schema import Few, Levels, Width, Widths
 
 
 class Sizes(TypedDict, total=False):
@@ -27,8 +23,6 @@ class Sizes(TypedDict, total=False):
     layers_per_block: Few
     norm_groups: Width
     gradient_checkpointing: bool
-    code_length: CodeLength
-    code_values: CodeValues
 
 
 class ConditionalUNet(nn.Module):
@@ -51,8 +45,6 @@ class ConditionalUNet(nn.Module):
         layers_per_block: int = 2,
         norm_groups: int = 32,
         gradient_checkpointing: bool = False,
-        code_length: CodeLength = 0,
-        code_values: CodeValues = 16,
     ) -> None:
         super().__init__()
         self.latent_channels = latent_channels
@@ -69,8 +61,6 @@ class ConditionalUNet(nn.Module):
         )
         if gradient_checkpointing:
             self.network.enable_gradient_checkpointing()
-        sizes = latent_channels, conditioning_channels, code_length, code_values
-        self.code = SceneCode(*sizes) if code_length else None
 
     def forward(self, noisy_latent: Latents, timestep: Int[Tensor, " batch"], conditioning: Features) -> Latents:
         """Predict the noise in h_t (paper, Eq. 3), or another target of training (`objective.target`), in float32."""
@@ -117,7 +107,6 @@ class TextlessStableDiffusion(ConditionalUNet):
         norm_groups: groups of the group normalisation.
         gradient_checkpointing: in training, recompute the blocks' activations in the backward pass, which saves
             memory and costs one more forward pass.
-        code_length, code_values: of the scene's code (`SceneCode`); without one (length 0), as in the paper.
     """
 
     context: Tensor

@@ -43,7 +43,7 @@ def rows(model: CompleteSplat, scenes: Sequence[SceneBatch], draws: int, seed: i
     `best_share` is the true mode's probability given the noisy latent, for a classifier that knows the latents of all
     modes: with four modes, 0.25 in pure noise and 1 without noise. The denoiser's clean estimate is projected onto
     combinations of the modes' latents with weights of sum 1; `denoiser_share` is the true mode's weight. Where it is
-    lower than `best_share`, the denoiser blends the modes. A denoiser with a code gets that of the true mode.
+    lower than `best_share`, the denoiser blends the modes.
     `training_share` is the share of training's timesteps between the previous level and this one, `steps` the number of
     the sampler's timesteps there.
     """
@@ -54,8 +54,6 @@ def rows(model: CompleteSplat, scenes: Sequence[SceneBatch], draws: int, seed: i
     for versions in scenes:
         modes = standardised(model, versions)
         condition = model.conditioning(versions.reference.images[:1]).expand(draws * len(modes.mean), -1, -1, -1)
-        if model.denoiser.code is not None:
-            condition = model.denoiser.code.encoded(modes.mean.repeat_interleave(draws, 0), condition)
         for index, timestep in enumerate(timesteps):
             sums[index] += shares(model, modes, condition, timestep, draws, generator)
     training_times = model.sampler.draw_timesteps(TIMESTEPS_DRAWN, torch.device("cpu"))

@@ -34,7 +34,7 @@ class LatentDiffusion(Stage):
         completesplat: the whole generator, its autoreconstructor still without weights.
         autoreconstructor_checkpoint: checkpoint of stage 1 to start from.
         checkpoint: checkpoint of this stage to start from instead (for masked diffusion): all weights, the averaged
-            ones if it has them, and all measured values. Its denoiser may lack the code.
+            ones if it has them, and all measured values.
         unconditional_probability: probability of zeroing phi_ref, for guidance (0.2 in the paper).
         noise_draws: timesteps and noises that are drawn for each scene of a batch, whose image is encoded once.
         skip_weight, guidance_weight, color_fits: settings of the samples drawn in validation and test.
@@ -78,7 +78,7 @@ class LatentDiffusion(Stage):
         if autoreconstructor_checkpoint is not None:
             load_part(completesplat.autoreconstructor, autoreconstructor_checkpoint, prefix="model.")
         if checkpoint is not None:
-            load_part(completesplat, checkpoint, prefix="completesplat.", new="denoiser.code.")
+            load_part(completesplat, checkpoint, prefix="completesplat.")
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         prepare_network(completesplat.denoiser, channels_last, compile)
 
@@ -175,10 +175,6 @@ class LatentDiffusion(Stage):
     def training_step(self, batch: SceneBatch | CachedScene, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat
         latent, conditioning = (x.repeat_interleave(self.noise_draws, 0) for x in self.inputs(batch))
-        code_loss = latent.new_zeros(())
-        if parts.denoiser.code is not None:
-            conditioning, code_loss, told = parts.denoiser.code(latent, conditioning)
-            self.log_step({"train/code_nats": told}, batch_size=len(latent))
         conditioned = torch.rand(len(latent), device=self.device) >= self.unconditional_probability
         conditioning = conditioning * conditioned[:, None, None, None]
         noise = torch.randn(latent.shape, device=self.device)  # `randn_like` would depend on the memory layout
@@ -191,7 +187,7 @@ class LatentDiffusion(Stage):
         )
         errors: Tensor = (predicted - target(parts.sampler.scheduler, latent, noise, timestep)).square().mean((1, 2, 3))
         self.log_loss(errors.detach(), timestep)
-        return errors.mean() + code_loss
+        return errors.mean()
 
     def log_loss(self, errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"]) -> None:
         """Log the mean of the samples' losses, and that of each quarter of the timesteps that is among them."""

@@ -209,15 +209,10 @@ def mismatch(network: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> st
     return next(chain(different, missing, needless), None)
 
 
-def load_part(module: nn.Module, path: str | Path, prefix: str, new: str | None = None) -> None:
-    """Load a checkpoint's weights below `prefix` into a module; raise WeightsError unless all are present and fit.
-
-    Weights of the module whose names start with `new` stay as they are if the checkpoint has none of them.
-    """
+def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:
+    """Load a checkpoint's weights below `prefix` into a module; raise WeightsError unless all are present and fit."""
     weights = read_checkpoint(path)["state_dict"]
     part = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
-    if new is not None and not any(name.startswith(new) for name in part):
-        part |= {name: value for name, value in module.state_dict().items() if name.startswith(new)}
     try:
         module.load_state_dict(part)
     except RuntimeError as error:

@@ -62,7 +62,7 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
     assert settings["samples"] == 1
     model = CompleteSplat.from_pretrained(weights)
     assert isinstance(model, PublishedOneAnswer)
-    scene = model(image)[0]
+    scene = model(image, color_fits=2)[0]
     assert type(scene) is Gaussians  # which every rasterizer takes
     torch.testing.assert_close(read_ply(folder / "sample_00.ply").colors, scene.colors, atol=1e-5, rtol=0)
     for settings, message in (

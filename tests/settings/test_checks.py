@@ -77,7 +77,7 @@ def test_a_wrong_value_is_reported_under_the_setting_that_the_user_gave():
         ),
         ("fit experiment=toy_vr", r"no experiment 'toy_vr': there are co3d_small_diffusion, .*; did you mean toy_var"),
         ("fit ablation=no_skip", r"no ablation 'no_skip': there are full, .*; did you mean no_skips"),
-        ("fit -m loss=stge1,stage2", r"no loss 'stge1': there are stage1, stage2; did you mean stage1"),
+        ("fit -m loss=stge1,stage2", r"no loss 'stge1': there are perceptual, stage1, stage2; did you mean stage1"),
         ("fit data=null", r"data=null: choose one of capture, co3d_category, "),
         ("fit toy_var", r"toy_var: no setting, which are given as key=value; did you mean experiment=toy_var\?"),
         ("data chck", r"no task of completesplat data 'chck': there are check, .*; did you mean check\?"),

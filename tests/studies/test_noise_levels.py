@@ -28,8 +28,6 @@ def table(monkeypatch: pytest.MonkeyPatch, estimate) -> list[dict[str, float]]:
     """Return the rows of a denoiser whose clean latents are `estimate(noisy, time)`."""
 
     class Denoiser(nn.Module):
-        code = None
-
         def forward(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
             time = timestep[0].item() / 1000
             return (noisy - estimate(noisy, time).view_as(noisy)) / time

@@ -56,7 +56,6 @@ class Recorder(nn.Module):
     """A denoiser that predicts zeros and keeps what it is given."""
 
     latent_channels = 4
-    code = None
 
     def forward(self, noisy_latent, timestep, conditioning):
         self.noisy_latent, self.timestep, self.conditioning = noisy_latent, timestep, conditioning
@@ -96,25 +95,6 @@ def test_the_conditioning_alone_is_zeroed_at_the_stated_rate(monkeypatch):
     assert abs(dropped.sum() - 800) <= 5 * math.sqrt(4000 * 0.2 * 0.8)  # standard deviations of the binomial
     assert torch.equal(sometimes.noisy_latent, never.noisy_latent)
     assert torch.equal(sometimes.timestep, never.timestep)
-
-
-def test_a_code_is_learned_with_the_denoiser_and_can_be_added_to_a_trained_one(monkeypatch, tmp_path):
-    with_code = ("denoiser.code_length=1", "denoiser.code_values=4")
-    module, _ = module_of(monkeypatch, tiny_generator(*with_code))
-    logged: dict[str, torch.Tensor] = {}
-    monkeypatch.setattr(module, "log_step", lambda values, **_: logged.update(values))
-    module.training_step(scenes(), 0).backward()
-    assert logged["train/code_nats"] >= 0
-    names = {name.rpartition("code.")[2].partition(".")[0] for name in gradients(module) if ".code." in name}
-    assert names == {"embedding", "encoder", "prior"}
-    plain = module_of(monkeypatch)[0]
-    torch.save({"state_dict": plain.state_dict()}, tmp_path / "plain.ckpt")
-    fresh = tiny_generator(*with_code)
-    before = fresh.denoiser.code.embedding.clone()
-    torch.nn.init.zeros_(fresh.denoiser.network.conv_in.weight)
-    module_of(monkeypatch, fresh, checkpoint=str(tmp_path / "plain.ckpt"))
-    assert torch.equal(fresh.denoiser.code.embedding, before)
-    assert torch.equal(fresh.denoiser.network.conv_in.weight, plain.completesplat.denoiser.network.conv_in.weight)
 
 
 def test_a_scene_gets_several_noises_and_timesteps_and_is_encoded_once(monkeypatch):
