@@ -199,7 +199,8 @@ def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     assert page.view.samples[0].settings["image"] == "photo.png"
     assert client.camera.position == pytest.approx(np.zeros(3), abs=0.02)  # it comes back to the front
     assert client.camera.look_at[:2] == pytest.approx(np.zeros(2), abs=0.02)
-    seed = tab.locator(".mantine-NumberInput-input").nth(4)  # behind the fifth slider
+    number = "xpath=following::input[contains(@class, 'mantine-NumberInput-input')][1]"
+    seed = tab.get_by_text("Seed", exact=True).locator(number)
     seed.fill("9")
     seed.press("Enter")
     assert waited_for(lambda: page.view.samples[0].settings.get("seed") == 9), "no new sample"
