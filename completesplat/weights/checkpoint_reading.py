@@ -213,8 +213,6 @@ def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:
     """Load a checkpoint's weights below `prefix` into a module; raise WeightsError unless all are present and fit."""
     weights = read_checkpoint(path)["state_dict"]
     part = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
-    try:
-        module.load_state_dict(part)
-    except RuntimeError as error:
-        first = str(error).splitlines()[1].strip() if "\n" in str(error) else str(error)
-        raise WeightsError(f"{path}: weights of another architecture: {first}") from error
+    if (difference := mismatch(module.state_dict(), part)) is not None:
+        raise WeightsError(f"{path}: weights of another architecture: {difference}")
+    module.load_state_dict(part)

@@ -106,7 +106,7 @@ def test_masked_diffusion_starts_from_all_weights_of_the_main_stage(pipeline):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (["experiment=toy_diffusion_masked", "model.checkpoint={var}"], "another architecture"),
+        (["experiment=toy_diffusion_masked", "model.checkpoint={var}"], "is missing there"),
         ([*FROM_STAGE_1, "model.checkpoint={diffusion}"], "set model.autoreconstructor_checkpoint=null"),
         (
             [FROM_STAGE_1[0], "model.autoreconstructor_checkpoint=null"],
