@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from plyfile import PlyData, PlyElement
 
-from completesplat.data.co3d.annotations import write_points
+from completesplat.data.co3d.writing import write_points
 from completesplat.errors import PlyError
 from completesplat.ply_files import TYPES, read_vertices
 

@@ -18,6 +18,7 @@ from completesplat.data.sequences import shortened
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
+    TooFewFrames,
     at,
     field,
     finite_array,
@@ -28,7 +29,7 @@ from completesplat.data.validation import (
     require_rotation,
 )
 from completesplat.errors import CompleteSplatError
-from completesplat.geometry.cameras import crop_resize
+from completesplat.geometry.cameras import Cameras, crop_resize
 from completesplat.scene import Views
 from completesplat.tensors import stack
 
@@ -40,6 +41,8 @@ RADIAL = {"SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2")}
 USED = {"SIMPLE_PINHOLE": (), "PINHOLE": (), **RADIAL, "OPENCV": COEFFICIENTS}
 OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
 Entry = Mapping[str, object]
+FEWEST_CAMERAS = 2
+SAME_FOCAL = 1e-3
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # NeRF (synthetic) leaves the suffix out.
 
 
@@ -93,6 +96,39 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
         cameras.append(crop_resize(camera, (width - side) // 2, (height - side) // 2, side, size))
     placed = stack(cameras)
     return Views(torch.stack(squares), placed.relative_to(placed[0]), torch.ones(len(squares), 1, size, size))
+
+
+def read_cameras(path: Path, size: int) -> list[Cameras]:
+    """Read the cameras of a `transforms.json`, whose images need not exist, for images with a shorter side of `size`.
+
+    Without `w` and `h` the images are square.
+
+    Raises:
+        DataError: as in `read_transforms`; or the lens distorts, its focal lengths differ, or `fl_x` is without a size.
+    """
+    content, cameras = read_json(path), []
+    with at(path):
+        for number, entry in enumerate(field(content, "frames", list)):
+            with at(frame=number):
+                if type(entry) is not dict:
+                    raise BadAnnotation("must be an object with transform_matrix")
+                values = {**content, **entry}
+                if not {"w", "h"} <= values.keys():
+                    if "fl_x" in values:
+                        raise BadAnnotation("fl_x is in pixels, but w and h are missing")
+                    values |= {"w": size, "h": size}
+                lens, pose = _read_lens(values, path), torch.from_numpy(_read_pose(entry.get("transform_matrix")))
+                if any(lens.distortion) or not math.isclose(*lens.focal, rel_tol=SAME_FOCAL):
+                    raise BadCamera(f"only pinhole cameras are rendered, not {lens.focal}, {lens.distortion}")
+                (height, width), scale = lens.image_size, size / min(lens.image_size)
+                (focal, _), (x, y) = lens.focal, lens.center
+                intrinsics = scale * torch.tensor(
+                    [[focal, 0, x], [0, focal, y], [0, 0, 1 / scale]], dtype=torch.float64
+                )
+                cameras.append(Cameras(pose, intrinsics, (round(scale * height), round(scale * width))))
+        if len(cameras) < FEWEST_CAMERAS:
+            raise TooFewFrames(f"{len(cameras)} frames; at least {FEWEST_CAMERAS} are rendered")
+    return cameras
 
 
 def _read_frames(path: Path) -> tuple[list[CapturedFrame], Entry]:

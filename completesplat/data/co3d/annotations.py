@@ -1,7 +1,5 @@
-"""Annotations of CO3D v2, read and written without PyTorch3D (facebookresearch/co3d, `co3d/dataset/data_types.py`)."""
+"""Annotations of CO3D v2, read without PyTorch3D (facebookresearch/co3d, `co3d/dataset/data_types.py`)."""
 
-import gzip
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from completesplat.data.images.files import MOST_PIXELS
 from completesplat.data.validation import (
@@ -26,7 +24,6 @@ from completesplat.data.validation import (
     require_rotation,
 )
 from completesplat.geometry.cameras import Cameras
-from completesplat.ply_files import TYPES, header
 
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up), and back.
 FLIP = np.diag([-1.0, -1.0, 1.0])
@@ -181,33 +178,3 @@ def viewpoint(
         "principal_point": center,
         "intrinsics_format": "ndc_norm_image_bounds",
     }
-
-
-def sequence_annotation(category: str, name: str, points: int) -> dict[str, object]:
-    """Return the annotation of a sequence without a video; with points, its cloud is `name`/pointcloud.ply."""
-    cloud = {"path": f"{category}/{name}/pointcloud.ply", "quality_score": 1.0, "n_points": points}
-    sequence = {"sequence_name": name, "category": category, "video": None, "point_cloud": cloud if points else None}
-    return sequence | {"viewpoint_quality_score": 1.0}
-
-
-def write_points(path: Path, points: Float[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"]) -> None:
-    """Write a point cloud as a binary PLY file."""
-    properties = [(axis, "float") for axis in "xyz"] + [(channel, "uchar") for channel in ("red", "green", "blue")]
-    types = [(name, f"<{TYPES[kind]}") for name, kind in properties]
-    vertices = np.rec.fromarrays([*points.T, *colors.T], dtype=types)
-    path.write_bytes(header(len(vertices), properties) + vertices.tobytes())
-
-
-def write_annotations(
-    category: Path,
-    frames: Sequence[Entry],
-    sequences: Sequence[Entry],
-    subset: str,
-    lists: Mapping[str, Sequence[Sequence[object]]],
-) -> None:
-    """Write a category's annotations and set list `subset`; `lists` has [sequence, frame number, image] by split."""
-    for name, content in (("frame_annotations", frames), ("sequence_annotations", sequences)):
-        # A fixed time stamp and no file name in the gzip header, so that equal content gives equal bytes.
-        (category / f"{name}.jgz").write_bytes(gzip.compress(json.dumps(content).encode(), mtime=0))
-    (category / "set_lists").mkdir()
-    (category / "set_lists" / f"set_lists_{subset}.json").write_text(json.dumps(lists))

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image, ImageFile, UnidentifiedImageError
 from torch import Tensor
 
@@ -171,6 +171,16 @@ def image_bytes(image: Image.Image, kind: str, **options: int) -> bytes:
 def save_image(image: Image.Image, path: Path, **options: int) -> None:
     """Write an image in the format of its path's suffix; a full disk raises, while Pillow would truncate a JPEG."""
     path.write_bytes(image_bytes(image, Image.registered_extensions()[path.suffix], **options))
+
+
+def to_bytes(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
+    """Convert colours or shares in [0, 1] to bytes."""
+    return np.round(255 * values.clip(0, 1)).astype(np.uint8)
+
+
+def save_jpeg(image: Float[np.ndarray, "height width 3"], path: Path) -> None:
+    """Write colours in [0, 1] as a JPEG of high quality."""
+    save_image(Image.fromarray(to_bytes(image)), path, quality=95, subsampling=0)
 
 
 @contextmanager

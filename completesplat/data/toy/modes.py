@@ -12,12 +12,13 @@ from torch import Tensor
 
 from completesplat.data.hidden_modes import HiddenModes
 from completesplat.data.images.crop import cut_square, principal_square
+from completesplat.data.images.files import to_bytes
 from completesplat.data.loading.scenes import Choice, SceneStore, with_true_depths
 from completesplat.data.loading.view_selection import evaluation_views
 from completesplat.data.sequences import PosedSequence
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, render_frame
 from completesplat.data.toy.raytracing import WHITE, trace
-from completesplat.data.toy.writing import FORMAT_VERSION, draw, to_bytes
+from completesplat.data.toy.writing import FORMAT_VERSION, draw
 from completesplat.data.validation import at, field, finite_array, read_json
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject

@@ -8,13 +8,21 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import UInt8
-from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
-from completesplat.data.co3d.annotations import sequence_annotation, viewpoint, write_annotations, write_points
-from completesplat.data.images.files import save_image
+from completesplat.data.co3d.annotations import viewpoint
+from completesplat.data.co3d.writing import (
+    FOLDERS,
+    Annotation,
+    is_written,
+    sequence_annotation,
+    write_annotations,
+    write_frame,
+    write_points,
+    write_set_list,
+)
+from completesplat.data.images.files import save_jpeg, to_bytes
 from completesplat.data.toy.object_scene import ToyScene, draw_mini, draw_scene, render_frame
 from completesplat.data.toy.raytracing import WHITE
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
@@ -26,7 +34,7 @@ from completesplat.settings.schema import Entries, Natural, Positive, Range, Sid
 
 FORMAT_VERSION = 2
 MOST_FRAMES = 1000
-FRAMES_PER_SECOND, ROOM_FRAMES_PER_SECOND = 10.0, 30
+ROOM_FRAMES_PER_SECOND = 30
 MICROSECONDS = 1_000_000
 LATEST_START = 9000
 ROOMS = "toy_rooms"
@@ -40,54 +48,22 @@ DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
 
 KINDS = [*(category.removeprefix("toy_") for category in DRAW), "rooms"]
 Factors = Annotated[Sequence[Annotated[float, Range(0)]], Entries(3, 3)]
-Annotation = dict[str, Any]
 Written = tuple[str, list[Annotation], Annotation]
 """Split of a sequence, and annotations of its frames and of itself."""
-
-
-def to_bytes(values: Array) -> UInt8[np.ndarray, "..."]:
-    """Convert colours or shares in [0, 1] to bytes."""
-    return np.round(255 * values.clip(0, 1)).astype(np.uint8)
-
-
-def write_image(path: Path, image: Array) -> None:
-    """Write colours in [0, 1], [height width 3], as a JPEG."""
-    save_image(Image.fromarray(to_bytes(image)), path, quality=95, subsampling=0)
 
 
 def _write_frame(
     folder: Path, category: str, name: str, scene: ToyScene, frame: int, size: int, split: str
 ) -> Annotation:
-    stem = f"frame{frame + 1:06d}"
-    files = {
-        "image": f"{name}/images/{stem}.jpg",
-        "mask": f"{name}/masks/{stem}.png",
-        "depth": f"{name}/depths/{stem}.jpg.geometric.png",
-        "depth_mask": f"{name}/depth_masks/{stem}.png",
-    }
-    image, coverage, depth = render_frame(scene, frame, size)
-    mask = to_bytes(coverage)
-    write_image(folder / files["image"], image)
-    save_image(Image.fromarray(mask), folder / files["mask"])
-    # CO3D stores depth as a 16-bit image whose bits are float16, in units of `scale_adjustment`.
-    save_image(Image.fromarray(depth.astype(np.float16).view(np.uint16)), folder / files["depth"])
-    save_image(Image.fromarray(np.full_like(mask, 255)), folder / files["depth_mask"])
-    paths = {key: f"{category}/{path}" for key, path in files.items()}
     # The world has the scene's unit and origin.
     world_to_camera = np.linalg.inv(scene.camera_to_world[frame])
     rotation = world_to_camera[:3, :3]
     translation = scene.unit * world_to_camera[:3, 3] - rotation @ scene.origin
     focal = float(1 / np.tan(np.radians(scene.fov_degrees) / 2))
-    return {
-        "sequence_name": name,
-        "frame_number": frame,
-        "frame_timestamp": frame / FRAMES_PER_SECOND,
-        "image": {"path": paths["image"], "size": [size, size]},
-        "mask": {"path": paths["mask"], "mass": float(coverage.sum())},
-        "depth": {"path": paths["depth"], "scale_adjustment": scene.unit, "mask_path": paths["depth_mask"]},
-        "viewpoint": viewpoint(rotation, translation, [focal, focal], [0.0, 0.0]),
-        "meta": {"frame_type": f"{split}_known"},
-    }
+    seen_from = viewpoint(rotation, translation, [focal, focal], [0.0, 0.0])
+    place = category, name, frame
+    annotation = write_frame(folder / name, place, *render_frame(scene, frame, size), seen_from, scene.unit)
+    return annotation | {"meta": {"frame_type": f"{split}_known"}}
 
 
 def _splits(scenes: int, rooms: bool) -> list[str]:
@@ -112,7 +88,7 @@ def _write_scene(
     index, split = place
     scene = draw(category, seed, index, frames, light)
     name = f"{index:05d}_{scene.family}"
-    for folder in ("images", "masks", "depths", "depth_masks"):
+    for folder in FOLDERS:
         (root / name / folder).mkdir(parents=True)
     annotations = [_write_frame(root, category, name, scene, frame, size, split) for frame in range(frames)]
     points = scene.unit * scene.points + scene.origin
@@ -127,7 +103,8 @@ def _write_lists(category: Path, written: list[Written]) -> None:
     for split, frames, _ in written:
         lists[split] += [[f["sequence_name"], f["frame_number"], f["image"]["path"]] for f in frames]
     annotations = [frame for _, frames, _ in written for frame in frames]
-    write_annotations(category, annotations, [sequence for _, _, sequence in written], SUBSET, lists)
+    write_annotations(category, annotations, [sequence for _, _, sequence in written])
+    write_set_list(category, SUBSET, lists)
 
 
 def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed: int, light: Array) -> None:
@@ -151,7 +128,7 @@ def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed
         time = round((start + frame) * MICROSECONDS / ROOM_FRAMES_PER_SECOND)
         # Nine digits identify a float32 exactly.
         lines.append(" ".join([str(time), *(f"{number:.9g}" for number in row)]))
-        write_image(images / f"{time}.jpg", render_room_frame(scene, frame, size, width)[0])
+        save_jpeg(render_room_frame(scene, frame, size, width)[0], images / f"{time}.jpg")
     images.with_suffix(".txt").write_text("\n".join(lines) + "\n")
 
 
@@ -184,7 +161,7 @@ def write(
         if (reason := rule.refusal(numbers[name])) is not None:
             raise DataError(f"{folder.name}: {name}={numbers[name]}: {reason}")
     parameters = {"format": FORMAT_VERSION, **numbers} | ({} if tuple(light) == WHITE else {"light": list(light)})
-    if _is_written(folder, parameters):
+    if is_written(folder / "toy.json", parameters):
         if progress:
             Console().print(f"{folder} already holds these scenes")
         return folder
@@ -197,19 +174,6 @@ def write(
             _write_lists(unfinished, results)
         (unfinished / "toy.json").write_text(json.dumps(parameters, indent=1) + "\n")
     return folder
-
-
-def _is_written(folder: Path, parameters: dict[str, Any]) -> bool:
-    """Return whether the scenes are in the folder; raise DataError if it holds something else."""
-    if not folder.exists():
-        return False
-    try:
-        existing = json.loads((folder / "toy.json").read_text())
-    except (OSError, ValueError):
-        existing = None
-    if existing != parameters:
-        raise DataError(f"{folder} already holds something else: remove it or choose another folder")
-    return True
 
 
 write_objects, write_rooms = partial(write, "objects"), partial(write, "rooms")

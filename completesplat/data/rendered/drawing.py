@@ -1,0 +1,114 @@
+"""Random cameras, light, floor and wall of a rendered scene, described for `scene_script.py`."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from completesplat.data.captures.transforms_json import read_cameras
+from completesplat.data.validation import MissingFile, require_file
+from completesplat.errors import CompleteSplatError
+from completesplat.geometry.cameras import Cameras, look_at, pinhole
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+# Distance at which the ball around the object touches the image's border, times this.
+NEAREST, FARTHEST = 1.0, 1.35
+ROOM, SMALLEST_ROOM = 1.3, 3.0  # half size of a room: relative to the farthest camera, and at least
+TEXTURES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+ENVIRONMENTS = (".hdr", ".exr")
+GREY = 0.5
+
+Angles = Float[np.ndarray, " view"]
+
+
+def draw_cameras(rng: np.random.Generator, kind: str, views: int, fov: Sequence[float], size: int) -> list[Cameras]:
+    """Draw the cameras of an object whose farthest vertex has distance 1 from the origin; z points up.
+
+    Args:
+        kind: `turn`: around the object at varying heights, as people film for CO3D; `hemisphere`: from random
+            directions above the ground; or the path of a `transforms.json`, whose cameras are taken.
+        fov: smallest and largest field of view in degrees, drawn once for an object.
+    """
+    if kind not in ("turn", "hemisphere"):
+        return read_cameras(Path(kind), size)
+    azimuth, elevation = turn(rng, views) if kind == "turn" else hemisphere(rng, views)
+    degrees = rng.uniform(fov[0], fov[1])
+    distance = rng.uniform(NEAREST, FARTHEST) / math.sin(math.radians(degrees) / 2) * rng.normal(1, 0.03, views)
+    level = np.cos(elevation)
+    eyes = distance * np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    targets = torch.from_numpy(rng.normal(0, 0.05, (views, 3)))
+    matrices = look_at(torch.from_numpy(eyes.T.copy()), targets, UP)
+    return [Cameras(matrix, pinhole(degrees, size).double(), (size, size)) for matrix in matrices]
+
+
+def turn(rng: np.random.Generator, views: int) -> tuple[Angles, Angles]:
+    """Return azimuths that go once around, and elevations that rise and fall, in radians."""
+    start, phase = rng.uniform(0, 2 * np.pi, 2)
+    azimuth = start + 2 * np.pi * (np.arange(views) + rng.uniform(-0.25, 0.25, views)) / views
+    degrees = rng.uniform(8, 35) + rng.uniform(0, 10) * np.sin(azimuth + phase) + rng.normal(0, 1.5, views)
+    return azimuth, np.radians(degrees.clip(2, 70))
+
+
+def hemisphere(rng: np.random.Generator, views: int) -> tuple[Angles, Angles]:
+    """Return directions that are uniform on the upper hemisphere, without its pole and its rim, in radians."""
+    return rng.uniform(0, 2 * np.pi, views), np.arcsin(rng.uniform(0.03, 0.97, views))
+
+
+def room_size(cameras: Sequence[Cameras]) -> float:
+    """Return the half size of a room with all cameras in it."""
+    reach = max(camera.centers[:2].abs().max().item() for camera in cameras)
+    return max(ROOM * reach, SMALLEST_ROOM)
+
+
+def draw_light(rng: np.random.Generator, light: str) -> dict[str, Any]:
+    """Draw a sun and a sky (`random`), or the turn of an environment map's file."""
+    if light != "random":
+        return {"file": light, "turn": rng.uniform(0, 2 * np.pi)}
+    warm, brightness = rng.uniform(0, 1), rng.uniform(0.25, 0.9)
+    horizon, zenith = np.array([0.9, 0.95, 1.0]), np.array([0.3, 0.5, 1.0]) + rng.uniform(0, 0.6)
+    return {
+        "sky": [(brightness * color.clip(0, 1)).tolist() for color in (horizon, zenith)],
+        "strength": rng.uniform(1.0, 4.0),
+        "color": [1.0, 1 - 0.15 * warm, 1 - 0.4 * warm],
+        "angle": math.radians(rng.uniform(0.5, 10)),  # a larger sun has softer shadows
+        "elevation": math.radians(rng.uniform(20, 80)),
+        "azimuth": rng.uniform(0, 2 * np.pi),
+    }
+
+
+def draw_surface(rng: np.random.Generator, surface: str) -> dict[str, Any] | None:
+    """Draw a floor or wall: `none`, `plain` grey, a `random` pattern of two colours, or an image of a folder."""
+    if surface == "none":
+        return None
+    if surface == "plain":
+        return {"pattern": "checker", "colors": [[GREY] * 3] * 2, "repeats": 1.0, "file": ""}
+    repeats = float(np.exp(rng.uniform(np.log(0.3), np.log(3))))
+    if surface == "random":
+        base = rng.uniform(0.05, 0.7) * (1 - rng.uniform(0, 0.5) * rng.uniform(size=3))
+        colors = [base.tolist(), (base * rng.uniform(0.5, 1, 3)).tolist()]
+        return {"pattern": str(rng.choice(["checker", "noise"])), "colors": colors, "repeats": repeats, "file": ""}
+    file = str(rng.choice(textures_of(Path(surface))))
+    return {"pattern": "image", "colors": [], "repeats": repeats, "file": file}
+
+
+def textures_of(folder: Path) -> list[str]:
+    """Return the absolute paths of a folder's images, in order."""
+    paths = sorted(str(path.absolute()) for path in folder.glob("*") if path.suffix.lower() in TEXTURES)
+    if not paths:
+        raise MissingFile(f"no textures there ({', '.join(TEXTURES)})", str(folder))
+    return paths
+
+
+def check_surroundings(light: str, floor: str, wall: str) -> None:
+    """Refuse a light's file or a folder of textures that does not exist."""
+    if light != "random" and Path(light).suffix.lower() not in ENVIRONMENTS:
+        raise CompleteSplatError(f"light={light}: neither random nor a file ({', '.join(ENVIRONMENTS)})")
+    if light != "random":
+        require_file(Path(light))
+    for surface in (floor, wall):
+        if surface not in ("none", "plain", "random"):
+            textures_of(Path(surface))

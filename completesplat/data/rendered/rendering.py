@@ -1,0 +1,227 @@
+"""Renders of a folder of meshes: list of objects, jobs of worker processes, continuation, broken meshes."""
+
+import hashlib
+import json
+import logging
+import math
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
+from pathlib import Path
+from threading import Event
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+from PIL import Image
+from rich.progress import track
+
+from completesplat.data.co3d.annotations import viewpoint
+from completesplat.data.co3d.writing import (
+    FOLDERS,
+    Annotation,
+    is_written,
+    sequence_annotation,
+    write_annotations,
+    write_frame,
+    write_points,
+)
+from completesplat.data.images.files import to_bytes
+from completesplat.data.rendered.blender import Blender, find_blender, run_job
+from completesplat.data.rendered.drawing import check_surroundings, draw_cameras, draw_light, draw_surface, room_size
+from completesplat.data.sequences import shortened
+from completesplat.data.validation import MissingFile
+from completesplat.errors import DataError
+from completesplat.files import atomic_folder, folder_names, write_text
+from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
+from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
+
+logger = logging.getLogger(__name__)
+
+CATEGORY = "rendered"
+DESCRIPTION, OBJECT, BROKEN = "rendered.json", "object.json", "broken.json"
+FORMAT_VERSION = 1
+SUFFIXES = ("glb", "gltf", "obj", "ply", "stl", "fbx", "usd", "usda", "usdc")
+MOST_POINTS = 20_000
+SKY = 1e9  # Cycles has 1e10 where no surface is
+MEGABYTE = 1_000_000
+Fields = Annotated[Sequence[Annotated[float, Range(5, 120)]], Entries(2, 2)]
+
+
+class Mesh(NamedTuple):
+    """Mesh file with the name of its sequence, and its path in the folder of meshes."""
+
+    name: str
+    path: Path
+    relative: str
+
+
+class BrokenMesh(DataError, kind="broken mesh"):
+    """Mesh that Blender cannot render, or of which no image shows anything."""
+
+
+def find_meshes(folder: Path) -> list[Mesh]:
+    """List the mesh files below a folder by path; a sequence is named after its file's path.
+
+    Raises:
+        MissingFile: the folder does not exist or has no mesh.
+    """
+    if not folder.is_dir():
+        raise MissingFile("no such folder", str(folder))
+    paths = sorted(path for path in folder.rglob("*") if path.suffix[1:].lower() in SUFFIXES and path.is_file())
+    if not paths:
+        raise MissingFile(f"no meshes there ({', '.join(SUFFIXES)})", str(folder))
+    relative = [path.relative_to(folder).as_posix() for path in paths]
+    return [Mesh(*mesh) for mesh in zip(folder_names(relative), paths, relative, strict=True)]
+
+
+def render(
+    meshes: str,
+    out: Path,
+    views: Annotated[int, Range(2, 1000)] = 24,
+    size: Side = 128,
+    samples: Positive = 32,
+    cameras: str = "turn",
+    fov: Fields = (36.0, 55.0),
+    light: str = "random",
+    floor: str = "random",
+    wall: str = "none",
+    seed: Natural = 0,
+    max_megabytes: Positive = 500,
+    blender: str | None = None,
+    workers: Positive | None = None,
+    progress: bool = True,
+) -> Path:
+    """Render every mesh of a folder into `out`/rendered, and return this folder.
+
+    What an object's images show depends on the settings, the seed and its path alone. Objects that are rendered
+    already remain; meshes that cannot be rendered are left out and tried again the next time.
+
+    Args:
+        cameras, fov: see `draw_cameras`.
+        light: see `draw_light`; floor, wall: see `draw_surface`.
+        max_megabytes: largest size of a mesh's file.
+        blender: see `find_blender`.
+        workers: number of Blender's processes, each with one object and one thread (None: one for each core).
+
+    Raises:
+        CompleteSplatError: there is no Blender, or it is too old.
+        DataError: there are no meshes, a file of the settings is missing, the folder holds something else, or no mesh
+            can be rendered; `broken.json` has the reasons.
+        DiskError: the disk is full.
+    """
+    objects, program = find_meshes(Path(meshes)), find_blender(blender)
+    check_surroundings(light, floor, wall)
+    settings = {"views": views, "size": size, "cameras": cameras, "fov": list(fov)}
+    settings |= {"samples": samples, "light": light, "floor": floor, "wall": wall, "seed": seed}
+    draw_scene(objects[0], settings)  # refuses cameras that cannot be read
+    category = out / CATEGORY
+    parameters = {"format": FORMAT_VERSION, **settings}
+    if not is_written(category / DESCRIPTION, parameters):
+        with atomic_folder(category) as unfinished:
+            (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1) + "\n")
+    waiting = [mesh for mesh in objects if not (category / mesh.name).exists()]
+    write_one = partial(_write_object, category, program, settings, MEGABYTE * max_megabytes)
+    broken = dict(track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting), disable=not progress))
+    broken = {name: reason for name, reason in sorted(broken.items()) if reason}
+    write_text(category / BROKEN, json.dumps(broken, indent=1) + "\n")
+    for name, reason in broken.items():
+        logger.warning("left out: %s: %s", name, reason)
+    records = [json.loads(path.read_text()) for path in sorted(category.glob(f"[!.]*/{OBJECT}"))]
+    if not records:
+        raise DataError(f"none of {len(objects)} meshes can be rendered: {shortened([*broken.values()], 1)}", meshes)
+    frames = [frame for record in records for frame in record["frames"]]
+    write_annotations(category, frames, [record["sequence"] for record in records])
+    logger.info("%d objects in %s, %d meshes left out", len(records), category, len(broken))
+    return category
+
+
+def draw_scene(mesh: Mesh, settings: dict[str, Any]) -> tuple[dict[str, Any], list[Cameras]]:
+    """Draw a mesh's surroundings and cameras by the seed and the mesh's path, as a job of `scene_script.py`."""
+    digest = hashlib.sha256(mesh.relative.encode()).digest()
+    rng = np.random.default_rng([settings["seed"], int.from_bytes(digest[:8])])
+    cameras = draw_cameras(rng, *(settings[key] for key in ("cameras", "views", "fov", "size")))
+    job = {
+        "mesh": str(mesh.path.absolute()),
+        "samples": settings["samples"],
+        "views": [_view(camera) for camera in cameras],
+        "room": room_size(cameras),
+        "light": draw_light(rng, settings["light"]),
+        "floor": draw_surface(rng, settings["floor"]),
+        "wall": draw_surface(rng, settings["wall"]),
+    }
+    return job, cameras
+
+
+def _view(camera: Cameras) -> dict[str, Any]:
+    focal, center = camera.intrinsics[0, 0].item(), camera.intrinsics[:2, 2].tolist()
+    size = camera.image_size[::-1]
+    return {"world_to_camera": camera.world_to_camera.tolist(), "focal": focal, "center": center, "size": size}
+
+
+def _in_threads(
+    function: Callable[[Mesh, Event], tuple[str, str]], meshes: Sequence[Mesh], workers: int | None
+) -> Iterator[tuple[str, str]]:
+    """Yield the results as they come; at an exception, end those that run and start no others."""
+    stopped = Event()
+    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+        futures = [pool.submit(function, mesh, stopped) for mesh in meshes]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            stopped.set()
+            pool.shutdown(cancel_futures=True)
+
+
+def _write_object(
+    category: Path, program: Blender, settings: dict[str, Any], most_bytes: int, mesh: Mesh, stopped: Event
+) -> tuple[str, str]:
+    """Render a mesh into its folder, whole or not at all; return its name, and why it is left out or an empty text."""
+    if (size := mesh.path.stat().st_size) > most_bytes:
+        return mesh.name, f"{size // MEGABYTE:,} MB, more than max_megabytes={most_bytes // MEGABYTE}"
+    try:
+        with atomic_folder(category / mesh.name) as folder:
+            files = folder / "blender"
+            files.mkdir()
+            job, cameras = draw_scene(mesh, settings)
+            result = run_job(program, job | {"folder": str(files.absolute())}, files, stopped)
+            if "refused" in result:
+                raise BrokenMesh(result["refused"])
+            record = {"mesh": mesh.relative, **result, **_write_sequence(folder, mesh.name, files, cameras)}
+            (folder / OBJECT).write_text(json.dumps(record) + "\n")
+            shutil.rmtree(files)
+    except BrokenMesh as error:
+        return mesh.name, error.reason
+    return mesh.name, ""
+
+
+def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Cameras]) -> dict[str, Any]:
+    """Write images, masks, depths and points from the files of Blender; return the annotations."""
+    for kind in FOLDERS:
+        (folder / kind).mkdir()
+    frames, points, colors = list[Annotation](), [], []
+    for number, camera in enumerate(cameras):
+        image = np.asarray(Image.open(files / f"{number:04d}.png").convert("RGB")) / 255.0
+        depth, seen, coverage = np.moveaxis(np.load(files / f"{number:04d}.npy"), -1, 0)
+        depth[depth > SKY] = 0
+        place = CATEGORY, name, number
+        frames.append(write_frame(folder, place, image, coverage, depth, _viewpoint(camera)))
+        pixels = pixel_centers(*camera.image_size, dtype=torch.float64)[torch.from_numpy(seen == 1)]
+        points.append(unproject(camera, pixels, torch.from_numpy(depth[seen == 1]).double()).numpy())
+        colors.append(to_bytes(image[seen == 1]))
+    step = math.ceil(sum(map(len, points)) / MOST_POINTS)
+    if not step:
+        raise BrokenMesh("no image shows it")
+    cloud = np.concatenate(points)[::step]
+    write_points(folder / "pointcloud.ply", cloud, np.concatenate(colors)[::step])
+    return {"frames": frames, "sequence": sequence_annotation(CATEGORY, name, len(cloud))}
+
+
+def _viewpoint(camera: Cameras) -> dict[str, object]:
+    half = np.array(camera.image_size[::-1]) / 2
+    matrix, intrinsics = camera.world_to_camera.numpy(), camera.intrinsics.numpy()
+    focal, center = intrinsics.diagonal()[:2] / half, 1 - intrinsics[:2, 2] / half
+    return viewpoint(matrix[:3, :3], matrix[:3, 3], focal.tolist(), center.tolist())

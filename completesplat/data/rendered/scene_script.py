@@ -1,0 +1,316 @@
+"""Program for Blender's Python, or a Python with `bpy`: render one mesh as a job (a JSON file) describes.
+
+It imports nothing of this package, because Blender's Python does not have it. For every view it writes `NNNN.png`, the
+colours, and `NNNN.npy`, float32 [height width 3]: depth along the optical axis, 1 where the pixel's centre shows the
+object, and the object's coverage of the pixel. `result.json` has the object's place and scale, or why it is refused.
+"""
+
+import json
+import math
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+IMPORTERS = {
+    "glb": "import_scene.gltf",
+    "gltf": "import_scene.gltf",
+    "obj": "wm.obj_import",
+    "ply": "wm.ply_import",
+    "stl": "wm.stl_import",
+    "fbx": "import_scene.fbx",
+    **dict.fromkeys(("usd", "usda", "usdc"), "wm.usd_import"),
+}
+SENSOR = 36.0  # its width; the unit cancels out
+BOUNCES = 4
+OPEN_GROUND = 30.0  # half size of a floor without walls
+TINY_FILTER = 0.01  # Blender's narrowest: the ray of a pixel with one sample goes through its centre
+
+
+class RefusedMesh(Exception):
+    """Mesh that cannot be rendered."""
+
+
+def import_mesh(path: Path) -> None:
+    """Import a file into the empty scene; refuse one that Blender cannot read or whose textures are missing."""
+    module, name = IMPORTERS[path.suffix[1:].lower()].split(".")
+    if path.suffix.lower() == ".obj":
+        with path.open("rb") as file:
+            names = [line[6:].strip().decode(errors="replace") for line in file if line.startswith(b"mtllib")]
+        require_files([path.parent / name for name in names], "material file")
+    try:
+        getattr(getattr(bpy.ops, module), name)(filepath=str(path))
+    except RuntimeError as error:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip() and "Location:" not in line]
+        reason = lines[-1] if "Traceback" in lines[0] else lines[0]
+        raise RefusedMesh(f"Blender cannot import it: {reason.removeprefix('Error: ')}") from None
+    images = [image for image in bpy.data.images if image.source == "FILE" and image.packed_file is None]
+    require_files([Path(bpy.path.abspath(image.filepath)) for image in images], "texture")
+
+
+def require_files(paths: list[Path], what: str) -> None:
+    for path in paths:
+        if not path.is_file():
+            raise RefusedMesh(f"its {what} {path.name} is missing")
+
+
+def baked_objects() -> list[Any]:
+    """Replace everything in the scene by static meshes, one for each visible instance, and return these."""
+    graph = bpy.context.evaluated_depsgraph_get()
+    meshes = []
+    for instance in graph.object_instances:
+        if instance.object.type == "MESH" and len(instance.object.data.polygons):
+            mesh = bpy.data.meshes.new_from_object(instance.object, preserve_all_data_layers=True, depsgraph=graph)
+            mesh.transform(instance.matrix_world)
+            meshes.append(mesh)
+    for imported in list(bpy.data.objects):
+        bpy.data.objects.remove(imported)
+    if not meshes:
+        raise RefusedMesh("it has no faces")
+    objects = [bpy.data.objects.new("part", mesh) for mesh in meshes]
+    for part in objects:
+        bpy.context.scene.collection.objects.link(part)
+        part.pass_index = 1
+        if not any(part.data.materials):
+            part.data.materials.clear()
+            part.data.materials.append(colored_material(part.data.color_attributes))
+    return objects
+
+
+def colored_material(attributes: Any) -> Any:
+    """Return a material of the vertices' colours, or of Blender's default grey."""
+    material, shader = new_material()
+    if len(attributes):
+        attribute = material.node_tree.nodes.new("ShaderNodeVertexColor")
+        attribute.layer_name = attributes[0].name
+        material.node_tree.links.new(attribute.outputs["Color"], shader.inputs["Base Color"])
+    return material
+
+
+def new_material() -> tuple[Any, Any]:
+    material = bpy.data.materials.new("material")
+    material.use_nodes = True
+    return material, material.node_tree.nodes["Principled BSDF"]
+
+
+def normalize(objects: list[Any]) -> tuple[list[float], float, float]:
+    """Move the bounding box's centre to the origin and the farthest vertex to distance 1.
+
+    Returns:
+        The former centre, the factor of the scale, and the height of the object's lowest point.
+    """
+    coordinates = []
+    for part in objects:
+        flat = np.empty(3 * len(part.data.vertices), np.float32)
+        part.data.vertices.foreach_get("co", flat)
+        coordinates.append(flat.reshape(-1, 3).astype(np.float64))
+    points = np.concatenate(coordinates)
+    if not np.isfinite(points).all():
+        raise RefusedMesh("it has vertices that are not finite")
+    center = (points.min(0) + points.max(0)) / 2
+    radius = float(np.linalg.norm(points - center, axis=1).max())
+    if not radius > 1e-12:
+        raise RefusedMesh("all its vertices are in one place")
+    for part in objects:
+        part.data.transform(Matrix.Scale(1 / radius, 4) @ Matrix.Translation((-center).tolist()))
+    return center.tolist(), 1 / radius, float((points[:, 2].min() - center[2]) / radius)
+
+
+def add_plane(corners: list[tuple[float, float, float]], surface: dict[str, Any]) -> Any:
+    """Add a rectangle whose texture coordinates are lengths along its first and last side."""
+    mesh = bpy.data.meshes.new("plane")
+    mesh.from_pydata(corners, [], [(0, 1, 2, 3)])
+    width, height = (math.dist(corners[0], corners[k]) for k in (1, 3))
+    layer = mesh.uv_layers.new()
+    for loop, place in zip(layer.data, [(0, 0), (width, 0), (width, height), (0, height)], strict=True):
+        loop.uv = place
+    mesh.materials.append(surface_material(**surface))
+    plane = bpy.data.objects.new("plane", mesh)
+    bpy.context.scene.collection.objects.link(plane)
+    return plane
+
+
+def surface_material(pattern: str, colors: list[list[float]], repeats: float, file: str) -> Any:
+    """Return a matt material: an image file, or two colours in a pattern (`checker` or `noise`)."""
+    material, shader = new_material()
+    shader.inputs["Roughness"].default_value = 0.8
+    nodes, link = material.node_tree.nodes, material.node_tree.links.new
+    scale = nodes.new("ShaderNodeVectorMath")
+    scale.operation = "SCALE"
+    scale.inputs["Scale"].default_value = repeats
+    link(nodes.new("ShaderNodeTexCoord").outputs["UV"], scale.inputs[0])
+    if pattern == "image":
+        texture = nodes.new("ShaderNodeTexImage")
+        texture.image = bpy.data.images.load(file)
+        link(scale.outputs[0], texture.inputs["Vector"])
+        link(texture.outputs["Color"], shader.inputs["Base Color"])
+        return material
+    texture = nodes.new("ShaderNodeTexChecker" if pattern == "checker" else "ShaderNodeTexNoise")
+    mix = nodes.new("ShaderNodeMixRGB")
+    texture.inputs["Scale"].default_value = 1.0
+    for name, color in zip(("Color1", "Color2"), colors, strict=True):
+        mix.inputs[name].default_value = (*color, 1.0)
+    link(scale.outputs[0], texture.inputs["Vector"])
+    link(texture.outputs["Fac"], mix.inputs["Fac"])
+    link(mix.outputs["Color"], shader.inputs["Base Color"])
+    return material
+
+
+def add_surroundings(job: dict[str, Any], ground: float) -> None:
+    """Add the floor below the object and the walls of a room without a ceiling, which throw no shadow."""
+    side = job["room"] if job["wall"] else OPEN_GROUND
+    square = [(-side, -side), (side, -side), (side, side), (-side, side)]
+    if job["floor"]:
+        add_plane([(x, y, ground) for x, y in square], job["floor"])
+    if job["wall"]:
+        for (x, y), (next_x, next_y) in zip(square, [*square[1:], square[0]], strict=True):
+            low, high = ground, ground + 2 * side
+            wall = add_plane([(x, y, low), (next_x, next_y, low), (next_x, next_y, high), (x, y, high)], job["wall"])
+            wall.visible_shadow = False
+
+
+def add_light(light: dict[str, Any]) -> None:
+    """Add an environment map, or a sun and a sky whose colour goes from the horizon's to the zenith's."""
+    world = bpy.data.worlds.new("world")
+    bpy.context.scene.world = world
+    world.use_nodes = True
+    nodes, link = world.node_tree.nodes, world.node_tree.links.new
+    direction = nodes.new("ShaderNodeTexCoord").outputs["Generated"]
+    if "file" in light:
+        turn, texture = nodes.new("ShaderNodeMapping"), nodes.new("ShaderNodeTexEnvironment")
+        turn.inputs["Rotation"].default_value[2] = light["turn"]
+        texture.image = bpy.data.images.load(light["file"])
+        link(direction, turn.inputs["Vector"])
+        link(turn.outputs["Vector"], texture.inputs["Vector"])
+        link(texture.outputs["Color"], nodes["Background"].inputs["Color"])
+        return
+    height, mix = nodes.new("ShaderNodeSeparateXYZ"), nodes.new("ShaderNodeMixRGB")
+    link(direction, height.inputs[0])
+    link(height.outputs["Z"], mix.inputs["Fac"])
+    mix.use_clamp = True
+    for name, color in zip(("Color1", "Color2"), light["sky"], strict=True):
+        mix.inputs[name].default_value = (*color, 1.0)
+    link(mix.outputs["Color"], nodes["Background"].inputs["Color"])
+    sun = bpy.data.lights.new("sun", "SUN")
+    sun.energy, sun.color, sun.angle = light["strength"], light["color"], light["angle"]
+    lamp = bpy.data.objects.new("sun", sun)
+    lamp.rotation_euler = (math.pi / 2 - light["elevation"], 0, light["azimuth"])
+    bpy.context.scene.collection.objects.link(lamp)
+
+
+def set_camera(view: dict[str, Any]) -> None:
+    """Set the camera from `world_to_camera` with OpenCV's axes and intrinsics in pixels.
+
+    Blender's camera looks along -z with +y up. Its shifts are in units of the image's width, and move the frame.
+    """
+    scene, (width, height), (x, y) = bpy.context.scene, view["size"], view["center"]
+    scene.render.resolution_x, scene.render.resolution_y = width, height
+    camera = scene.camera
+    camera.matrix_world = Matrix(view["world_to_camera"]).inverted() @ Matrix.Diagonal((1, -1, -1, 1))
+    camera.data.sensor_fit, camera.data.sensor_width = "HORIZONTAL", SENSOR
+    camera.data.lens = view["focal"] * SENSOR / width
+    camera.data.shift_x, camera.data.shift_y = (width / 2 - x) / width, (y - height / 2) / width
+    camera.data.clip_start, camera.data.clip_end = 1e-3, 1e4
+
+
+def set_up_renderer(objects: list[Any]) -> None:
+    """Select Cycles on one CPU thread, without its caustics, and mark the object for the coverage pass."""
+    scene, layer = bpy.context.scene, bpy.context.view_layer
+    scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(scene.camera)
+    scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
+    scene.render.threads_mode, scene.render.threads = "FIXED", 1
+    scene.render.use_persistent_data, scene.render.resolution_percentage = True, 100
+    scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGB"
+    scene.cycles.use_adaptive_sampling = False
+    scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = False
+    scene.cycles.denoiser = "OPENIMAGEDENOISE"
+    layer.use_pass_z = layer.use_pass_object_index = layer.use_pass_cryptomatte_asset = True
+    owner = bpy.data.objects.new("object", None)  # parts count as one asset if they have one parent
+    scene.collection.objects.link(owner)
+    for part in objects:
+        part.parent = owner
+
+
+def set_up_outputs(folder: Path) -> dict[str, Any]:
+    """Return nodes that write the object's coverage, and depth with object index, as OpenEXR files into `folder`."""
+    scene = bpy.context.scene
+    scene.use_nodes = True
+    nodes, link = scene.node_tree.nodes, scene.node_tree.links.new
+    nodes.clear()
+    layers, both = nodes.new("CompositorNodeRLayers"), nodes.new("CompositorNodeCombineColor")
+    link(layers.outputs["Image"], nodes.new("CompositorNodeComposite").inputs["Image"])
+    matte = nodes.new("CompositorNodeCryptomatteV2")
+    matte.layer_name = f"{bpy.context.view_layer.name}.CryptoAsset"
+    matte.matte_id = "object"
+    link(layers.outputs["Image"], matte.inputs["Image"])
+    link(layers.outputs["Depth"], both.inputs["Red"])
+    link(layers.outputs["IndexOB"], both.inputs["Green"])
+    outputs = {}
+    for name, socket in {"coverage": matte.outputs["Matte"], "geometry": both.outputs["Image"]}.items():
+        outputs[name] = output = nodes.new("CompositorNodeOutputFile")
+        output.base_path, output.file_slots[0].path = str(folder), f"{name}_"
+        output.format.file_format, output.format.color_mode, output.format.color_depth = "OPEN_EXR", "RGB", "32"
+        link(socket, output.inputs[0])
+    return outputs
+
+
+def render(folder: Path, views: list[dict[str, Any]], samples: int) -> None:
+    """Render all views twice: colours and coverage, then geometry at the pixels' centres."""
+    scene, starter = bpy.context.scene, os.getppid()
+    outputs = set_up_outputs(folder)
+    for task in outputs:
+        colors = task == "coverage"
+        scene.cycles.samples, scene.cycles.use_denoising = samples if colors else 1, colors
+        scene.cycles.max_bounces = BOUNCES if colors else 0
+        scene.cycles.pixel_filter_type = "BLACKMAN_HARRIS" if colors else "GAUSSIAN"
+        scene.cycles.filter_width = 1.5 if colors else TINY_FILTER
+        for name, output in outputs.items():
+            output.mute = name != task
+        for number, view in enumerate(views):
+            if os.getppid() != starter:
+                sys.exit("the process that started this one has ended")
+            set_camera(view)
+            scene.frame_current, scene.cycles.seed = number, number
+            scene.render.filepath = str(folder / f"{number:04d}.png")
+            bpy.ops.render.render(write_still=colors)
+    for number in range(len(views)):
+        geometry, coverage = (read_exr(folder / f"{name}_{number:04d}.exr") for name in ("geometry", "coverage"))
+        np.save(folder / f"{number:04d}.npy", np.concatenate([geometry[..., :2], coverage[..., :1]], axis=-1))
+
+
+def read_exr(path: Path) -> Any:
+    """Return the pixels, float32 [height width 4], in rows from the top."""
+    image = bpy.data.images.load(str(path))
+    width, height = image.size
+    pixels = np.empty(4 * width * height, np.float32)
+    image.pixels.foreach_get(pixels)
+    bpy.data.images.remove(image)
+    return pixels.reshape(height, width, 4)[::-1]
+
+
+def run(job: dict[str, Any]) -> dict[str, Any]:
+    """Render the job's mesh; return its place and scale, or the reason for a refusal."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    try:
+        import_mesh(Path(job["mesh"]))
+        objects = baked_objects()
+        center, scale, ground = normalize(objects)
+    except RefusedMesh as reason:
+        return {"refused": str(reason)}
+    set_up_renderer(objects)
+    add_surroundings(job, ground)
+    add_light(job["light"])
+    render(Path(job["folder"]), job["views"], job["samples"])
+    return {"center": center, "scale": scale}
+
+
+if __name__ == "__main__":
+    job_file = Path(sys.argv[-1])
+    result = run(json.loads(job_file.read_text()))
+    job_file.with_name("result.json").write_text(json.dumps(result))
+    os._exit(0)  # all is written, and Blender sometimes crashes when it frees its memory
