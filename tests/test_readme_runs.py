@@ -30,11 +30,12 @@ BRIEF |= {
     f"fit experiment=toy_{of}_diffusion": [*BRIEF["fit"], "conditioning.channels=[8,8,16,16]"]
     for of in ("minis", "views")
 }
-# What they need cannot be made here: CO3D, eight GPUs, VGG16 (`test_sweeps` has these two sweeps with a random one),
-# Splatter Image's published weights (`test_published` has made-up ones), images that Python lines of a README write
-# (`test_scene_files` runs them).
+# What they need cannot be made here: Blender (`test_rendering` has such commands), CO3D, eight GPUs, VGG16
+# (`test_sweeps` has these two sweeps with a random one), Splatter Image's published weights (`test_published` has
+# made-up ones), images that Python lines of a README write (`test_scene_files` runs them).
 NEEDS_MORE = (
     "IMAGES",
+    "RENDERS",
     "SPLATS",
     "evaluation=co3d",
     "trainer.devices=8",

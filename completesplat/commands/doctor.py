@@ -19,7 +19,8 @@ from rich.text import Text
 
 from completesplat import __version__
 from completesplat.commands.protocol import write_json
-from completesplat.errors import WeightsError
+from completesplat.data.rendered.blender import find_blender
+from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.weights import SHIPPED, SUMS_FILE, check_folder
 
 EXTRAS = {
@@ -127,7 +128,7 @@ def check_weights(folder: Path = SHIPPED) -> Iterator[Finding]:
 
 
 def check_tools(place: Path) -> Iterator[Finding]:
-    """Yield ffmpeg (for videos; a package brings it), Node.js (for exports) and free space on `place`'s disk."""
+    """Yield ffmpeg (a package brings it), Node.js (for exports), Blender (for meshes) and the free space of a disk."""
     try:
         import imageio_ffmpeg
 
@@ -136,6 +137,11 @@ def check_tools(place: Path) -> Iterator[Finding]:
         yield Finding("ffmpeg", "broken", f"{error}; for videos, `pip install --force-reinstall imageio-ffmpeg`")
     node = shutil.which("node")
     yield Finding("node", "yes" if node else "no", node or "formats spz, sog and html need it: https://nodejs.org")
+    try:
+        blender = find_blender()
+        yield Finding("blender", "yes", f"{blender.version}, {blender.command[0]}: to render meshes (data render)")
+    except CompleteSplatError as error:
+        yield Finding("blender", "no", f"data render needs it: {error}")
     free = shutil.disk_usage(place).free
     short = ": too little for a prediction's files" if free < LEAST_SPACE else ""
     yield Finding("free disk", "broken" if short else "yes", f"{decimal(free)} in {place}{short}")

@@ -69,9 +69,10 @@ def test_weights_are_broken_if_changed_or_incomplete(tmp_path):
     assert states(doctor.check_weights(tmp_path)) == {"small": "broken"}
 
 
-def test_a_missing_node_is_no_error_but_ffmpeg_and_space_are_needed(tmp_path, monkeypatch):
+def test_missing_node_and_blender_are_no_errors_but_ffmpeg_and_space_are_needed(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    expected = {"ffmpeg": "yes", "node": "no", "free disk": "yes"}
+    monkeypatch.delenv("COMPLETESPLAT_BLENDER", raising=False)
+    expected = {"ffmpeg": "yes", "node": "no", "blender": "no", "free disk": "yes"}
     assert states(doctor.check_tools(tmp_path)) == expected
     monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: 1 / 0)
     usage = shutil.disk_usage(tmp_path)

@@ -36,7 +36,7 @@ def draw_cameras(rng: np.random.Generator, kind: str, views: int, fov: Sequence[
     if kind not in ("turn", "hemisphere"):
         return read_cameras(Path(kind), size)
     azimuth, elevation = turn(rng, views) if kind == "turn" else hemisphere(rng, views)
-    degrees = rng.uniform(fov[0], fov[1])
+    degrees = rng.uniform(min(fov), max(fov))
     distance = rng.uniform(NEAREST, FARTHEST) / math.sin(math.radians(degrees) / 2) * rng.normal(1, 0.03, views)
     level = np.cos(elevation)
     eyes = distance * np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
@@ -68,11 +68,11 @@ def draw_light(rng: np.random.Generator, light: str) -> dict[str, Any]:
     """Draw a sun and a sky (`random`), or the turn of an environment map's file."""
     if light != "random":
         return {"file": light, "turn": rng.uniform(0, 2 * np.pi)}
-    warm, brightness = rng.uniform(0, 1), rng.uniform(0.25, 0.9)
+    warm, brightness = rng.uniform(0, 1), rng.uniform(0.4, 1.2)
     horizon, zenith = np.array([0.9, 0.95, 1.0]), np.array([0.3, 0.5, 1.0]) + rng.uniform(0, 0.6)
     return {
         "sky": [(brightness * color.clip(0, 1)).tolist() for color in (horizon, zenith)],
-        "strength": rng.uniform(1.0, 4.0),
+        "strength": rng.uniform(1.5, 5.0),
         "color": [1.0, 1 - 0.15 * warm, 1 - 0.4 * warm],
         "angle": math.radians(rng.uniform(0.5, 10)),  # a larger sun has softer shadows
         "elevation": math.radians(rng.uniform(20, 80)),
@@ -88,7 +88,7 @@ def draw_surface(rng: np.random.Generator, surface: str) -> dict[str, Any] | Non
         return {"pattern": "checker", "colors": [[GREY] * 3] * 2, "repeats": 1.0, "file": ""}
     repeats = float(np.exp(rng.uniform(np.log(0.3), np.log(3))))
     if surface == "random":
-        base = rng.uniform(0.05, 0.7) * (1 - rng.uniform(0, 0.5) * rng.uniform(size=3))
+        base = rng.uniform(0.1, 0.9) * (1 - rng.uniform(0, 0.5) * rng.uniform(size=3))
         colors = [base.tolist(), (base * rng.uniform(0.5, 1, 3)).tolist()]
         return {"pattern": str(rng.choice(["checker", "noise"])), "colors": colors, "repeats": repeats, "file": ""}
     file = str(rng.choice(textures_of(Path(surface))))

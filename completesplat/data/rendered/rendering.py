@@ -32,7 +32,7 @@ from completesplat.data.images.files import to_bytes
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
 from completesplat.data.rendered.drawing import check_surroundings, draw_cameras, draw_light, draw_surface, room_size
 from completesplat.data.sequences import shortened
-from completesplat.data.validation import MissingFile
+from completesplat.data.validation import MissingFile, UnreadableFile, read_points
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder, folder_names, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
@@ -112,6 +112,10 @@ def render(
             can be rendered; `broken.json` has the reasons.
         DiskError: the disk is full.
     """
+    if out.resolve().is_relative_to(Path(meshes).resolve()):
+        raise DataError(
+            f"lies in meshes={meshes}, and its points would be taken for meshes; choose another", f"out={out}"
+        )
     objects, program = find_meshes(Path(meshes)), find_blender(blender)
     check_surroundings(light, floor, wall)
     settings = {"views": views, "size": size, "cameras": cameras, "fov": list(fov)}
@@ -183,6 +187,9 @@ def _write_object(
     if (size := mesh.path.stat().st_size) > most_bytes:
         return mesh.name, f"{size // MEGABYTE:,} MB, more than max_megabytes={most_bytes // MEGABYTE}"
     try:
+        # Blender's importer would move such vertices to the origin.
+        if mesh.path.suffix.lower() == ".ply" and not np.isfinite(read_points(mesh.path)).all():
+            raise BrokenMesh("it has vertices that are not finite")
         with atomic_folder(category / mesh.name) as folder:
             files = folder / "blender"
             files.mkdir()
@@ -193,7 +200,7 @@ def _write_object(
             record = {"mesh": mesh.relative, **result, **_write_sequence(folder, mesh.name, files, cameras)}
             (folder / OBJECT).write_text(json.dumps(record) + "\n")
             shutil.rmtree(files)
-    except BrokenMesh as error:
+    except (BrokenMesh, UnreadableFile) as error:
         return mesh.name, error.reason
     return mesh.name, ""
 

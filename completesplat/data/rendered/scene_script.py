@@ -25,6 +25,8 @@ IMPORTERS = {
     "fbx": "import_scene.fbx",
     **dict.fromkeys(("usd", "usda", "usdc"), "wm.usd_import"),
 }
+# With these, an importer keeps vertices that are not finite, which it would otherwise move to the origin.
+AS_STORED = {"obj": {"validate_meshes": False}, "stl": {"use_mesh_validate": False}}
 SENSOR = 36.0  # its width; the unit cancels out
 BOUNCES = 4
 OPEN_GROUND = 30.0  # half size of a floor without walls
@@ -37,13 +39,14 @@ class RefusedMesh(Exception):
 
 def import_mesh(path: Path) -> None:
     """Import a file into the empty scene; refuse one that Blender cannot read or whose textures are missing."""
-    module, name = IMPORTERS[path.suffix[1:].lower()].split(".")
-    if path.suffix.lower() == ".obj":
+    kind = path.suffix[1:].lower()
+    module, name = IMPORTERS[kind].split(".")
+    if kind == "obj":
         with path.open("rb") as file:
             names = [line[6:].strip().decode(errors="replace") for line in file if line.startswith(b"mtllib")]
         require_files([path.parent / name for name in names], "material file")
     try:
-        getattr(getattr(bpy.ops, module), name)(filepath=str(path))
+        getattr(getattr(bpy.ops, module), name)(filepath=str(path), **AS_STORED.get(kind, {}))
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip() and "Location:" not in line]
         reason = lines[-1] if "Traceback" in lines[0] else lines[0]
@@ -116,6 +119,7 @@ def normalize(objects: list[Any]) -> tuple[list[float], float, float]:
     if not radius > 1e-12:
         raise RefusedMesh("all its vertices are in one place")
     for part in objects:
+        part.data.validate()
         part.data.transform(Matrix.Scale(1 / radius, 4) @ Matrix.Translation((-center).tolist()))
     return center.tolist(), 1 / radius, float((points[:, 2].min() - center[2]) / radius)
 
