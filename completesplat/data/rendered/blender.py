@@ -82,8 +82,10 @@ def run_job(blender: Blender, job: dict[str, Any], folder: Path, stopped: Event)
     separator = () if PYTHON_OPTIONS[0] in blender.command else ("--",)
     with messages.open("wb") as output:
         command = [*blender.command, str(SCRIPT), *separator, str(path)]
-        streams = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": subprocess.STDOUT}
-        process = subprocess.Popen(command, env={**os.environ, "TMPDIR": str(folder)}, **streams)
+        variables = {**os.environ, "TMPDIR": str(folder)}
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, env=variables
+        )
         while process.poll() is None:
             if stopped.is_set():
                 process.kill()

@@ -32,8 +32,13 @@ def draw_cameras(rng: np.random.Generator, kind: str, views: int, fov: Sequence[
         kind: `turn`: around the object at varying heights, as people film for CO3D; `hemisphere`: from random
             directions above the ground; or the path of a `transforms.json`, whose cameras are taken.
         fov: smallest and largest field of view in degrees, drawn once for an object.
+
+    Raises:
+        CompleteSplatError: the kind is unknown, or the file's cameras cannot be read.
     """
     if kind not in ("turn", "hemisphere"):
+        if Path(kind).suffix != ".json":
+            raise CompleteSplatError(f"cameras={kind}: choose turn, hemisphere or the path of a transforms.json")
         return read_cameras(Path(kind), size)
     azimuth, elevation = turn(rng, views) if kind == "turn" else hemisphere(rng, views)
     degrees = rng.uniform(min(fov), max(fov))

@@ -230,11 +230,13 @@ def test_all_commands_read_renders(command, cubes, tmp_path):
         assert (tmp_path / task / file).is_file()
     assert strict_json(tmp_path / "check/check.json")["refused"] == []
     assert command("data", "prepare", *given, "workers=1", f"out={tmp_path / 'store'}").status == 0
-    for root in (cubes / "data", tmp_path / "store"):
-        fit = ["experiment=toy_var", *SMALL, "data=rendered", f"data.root={root}", "data.batch_size=1"]
-        finished = command("fit", *fit, "callbacks.images=null", f"out={tmp_path / root.name}")
-        assert finished.status == 0, finished.err
-        assert strict_json(tmp_path / root.name / "metrics.json")["steps"] == 2
+    packed = ["data=rendered", f"data.root={tmp_path / 'store'}", "data.image_size=32"]
+    assert command("data", "check", *packed, f"out={tmp_path / 'packed'}").status == 0
+    small = [*SMALL, "data.batch_size=1", "data.targets=2", "data.workers=0", "callbacks.images=null"]
+    finished = command("fit", "experiment=toy_var", *given, *small, f"out={tmp_path / 'run'}")
+    assert finished.status == 0, finished.err
+    metrics = strict_json(tmp_path / "run/metrics.json")
+    assert (metrics["steps"], metrics["data_set"]) == (2, "rendered")
 
 
 def test_the_object_lies_within_its_depth_range_and_depth_is_read(cubes):

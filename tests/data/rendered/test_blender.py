@@ -1,0 +1,131 @@
+"""Finding Blender, and programs that are none, are too old, crash or fail: small scripts stand for them."""
+
+import stat
+import sys
+
+import meshes
+import pytest
+from support import refused
+
+from completesplat.data.rendered import blender
+from completesplat.data.rendered.blender import VARIABLE, find_blender
+from completesplat.data.rendered.rendering import render
+from completesplat.errors import DataError
+
+QUICK = ["views=2", "size=8", "workers=1"]
+
+
+@pytest.fixture(autouse=True)
+def bare(tmp_path, monkeypatch):
+    """Leave no Blender to be found."""
+    monkeypatch.setenv("PATH", "/usr/bin:/bin")
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setattr(blender, "find_spec", lambda name: None)
+    monkeypatch.setattr(blender.shutil, "which", lambda name: None)
+
+
+@pytest.fixture
+def program(tmp_path):
+    """Write a shell script."""
+
+    def write(text, name="blender"):
+        path = tmp_path / name
+        path.write_text(f"#!/bin/sh\n{text}\n")
+        path.chmod(path.stat().st_mode | stat.S_IXUSR)
+        return str(path)
+
+    return write
+
+
+VERSION = 'if [ "$1" = --version ]; then echo "Color management: a warning"; echo "Blender {}"; exit; fi\n'
+
+
+@pytest.fixture
+def line(tmp_path):
+    """Render one cube and return the line that refuses it."""
+    meshes.write_cube(tmp_path / "meshes/cube.obj")
+    return lambda *given: refused("data", "data_task=render", f"meshes={tmp_path / 'meshes'}", *QUICK, *given)
+
+
+@pytest.fixture
+def into(line, tmp_path):
+    """Render the cube into a folder and return the reason for which that fails."""
+
+    def run(out, program, **settings):
+        with pytest.raises(DataError) as caught:
+            render(str(tmp_path / "meshes"), out, 2, 8, workers=1, blender=program, progress=False, **settings)
+        return str(caught.value)
+
+    return run
+
+
+def test_without_blender_two_commands_say_how_to_get_one(line):
+    message = line()
+    assert message.startswith("no Blender: give blender=PATH, or get one by `python3.11 -m venv BLENDER` and `")
+    assert message.count("`") == 4
+
+
+def test_the_given_program_goes_before_the_variable_and_that_before_the_path(program, monkeypatch):
+    given, variable, path = (program(VERSION.format(f"4.{n}.1 LTS"), str(n)) for n in (2, 3, 4))
+    monkeypatch.setattr(blender.shutil, "which", lambda name: path)
+    assert find_blender().version == "4.4.1"
+    monkeypatch.setenv(VARIABLE, variable)
+    assert find_blender().version == "4.3.1"
+    found = find_blender(given)
+    assert (found.version, found.command[0]) == ("4.2.1", given)
+    assert found.command[-1] == "--python"
+
+
+@pytest.mark.parametrize("version", ["4.1.1", "3.6.12", "2.79"])
+def test_an_old_blender_is_refused(line, program, version):
+    message = line(f"blender={program(VERSION.format(version))}")
+    assert f"Blender {version} is older than 4.2; get one by " in message
+
+
+def test_programs_that_are_no_blender_are_refused(line, program, tmp_path):
+    assert "neither Blender nor a Python with bpy (hello)" in line(f"blender={program('echo hello')}")
+    assert "(it prints nothing)" in line(f"blender={program('exit 3')}")
+    assert f"{tmp_path / 'gone'}: cannot be run: No such file or directory" in line(f"blender={tmp_path / 'gone'}")
+    assert f"{tmp_path}: cannot be run: Permission denied" in line(f"blender={tmp_path}")
+    # The Python of these tests is one without bpy.
+    message = line(f"blender={sys.executable}")
+    assert "neither Blender nor a Python with bpy (ModuleNotFoundError: No module named 'bpy')" in message
+
+
+def test_a_blender_that_crashes_or_fails_leaves_meshes_out(into, program, tmp_path):
+    for text, reason in {
+        "kill -SEGV $$": "Blender ended by signal 11 (a crash, or out of memory)",
+        "echo; echo Error: no license; exit 1": "Blender failed: Error: no license",
+        "exit 0": "Blender failed: no message",
+    }.items():
+        message = into(tmp_path / "data", program(VERSION.format("4.2.0") + text))
+        assert message == f"{tmp_path / 'meshes'}: none of 1 meshes can be rendered: {reason}"
+        assert [path.name for path in (tmp_path / "data/rendered").glob("*/")] == []
+
+
+def test_bad_settings_are_refused_before_anything_is_written(line, program, tmp_path):
+    found = f"blender={program(VERSION.format('4.2.0'))}"
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "cameras.json").write_text('{"frames": []}')
+    for given, message in {
+        f"meshes={tmp_path / 'empty'}": f"{tmp_path / 'empty'}: no meshes there (glb, gltf, obj, ply, stl, fbx, usd",
+        f"meshes={tmp_path / 'gone'}": f"{tmp_path / 'gone'}: no such folder",
+        "light=lamp": "light=lamp: neither random nor a file (.hdr, .exr)",
+        "light=gone.hdr": "gone.hdr: no such file",
+        "floor=gone": "gone: no textures there (.jpg, ",
+        f"wall={tmp_path / 'empty'}": f"{tmp_path / 'empty'}: no textures there",
+        "cameras=circle": "cameras=circle: choose turn, hemisphere or the path of a transforms.json",
+        f"cameras={tmp_path / 'cameras.json'}": f"{tmp_path / 'cameras.json'}: 0 frames; at least 2 are rendered",
+        "views=1": "views=1: must lie between 2 and 1000",
+        "fov=[5]": "fov=[5]: must have 2 entries",
+        "fov=[0,50]": "fov=[0, 50]: must lie between 5 and 120",
+    }.items():
+        assert message in line(found, given), given
+
+
+def test_a_folder_of_other_settings_or_among_the_meshes_is_refused(into, program, tmp_path):
+    found, out = program(VERSION.format("4.2.0")), tmp_path / "data"
+    assert "none of 1 meshes" in into(out, found)
+    assert into(out, found, seed=1).startswith(f"{out / 'rendered'} already holds something else")
+    within = tmp_path / "meshes/data"
+    assert into(within, found).startswith(f"out={within}: lies in meshes={tmp_path / 'meshes'}, and its points would")
