@@ -13,6 +13,10 @@ from completesplat.geometry.cameras import Cameras, invert_rigid
 SQUARES = 4
 """Squares along an edge of the checker cube."""
 
+SETTINGS = {"cameras": "turn", "fov": [36, 55], "light": "random", "floor": "random", "wall": "none", "seed": 0}
+SETTINGS |= {"max_megabytes": 500}
+"""Settings of renders, without views, size and samples."""
+
 CORNERS = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 FACES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 

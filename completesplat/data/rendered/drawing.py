@@ -1,9 +1,11 @@
 """Random cameras, light, floor and wall of a rendered scene, described for `scene_script.py`."""
 
+import hashlib
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 import torch
@@ -13,6 +15,7 @@ from completesplat.data.captures.transforms_json import read_cameras
 from completesplat.data.validation import MissingFile, require_file
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
+from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 # Distance at which the ball around the object touches the image's border, times this.
@@ -23,6 +26,42 @@ ENVIRONMENTS = (".hdr", ".exr")
 GREY = 0.5
 
 Angles = Float[np.ndarray, " view"]
+
+
+class RenderSettings(TypedDict):
+    """Settings of all scenes; see `draw_cameras`, `draw_light` and `draw_surface`."""
+
+    views: Annotated[int, Range(2, 1000)]
+    size: Side
+    samples: Positive
+    cameras: str
+    fov: Annotated[Sequence[Annotated[float, Range(5, 120)]], Entries(2, 2)]
+    light: str
+    floor: str
+    wall: str
+    seed: Natural
+
+
+def draw_scene(name: str, settings: RenderSettings) -> tuple[dict[str, Any], list[Cameras]]:
+    """Draw surroundings and cameras by the seed and an object's name; return them for `scene_script.py`."""
+    digest = hashlib.sha256(name.encode()).digest()
+    rng = np.random.default_rng([settings["seed"], int.from_bytes(digest[:8])])
+    cameras = draw_cameras(rng, settings["cameras"], settings["views"], settings["fov"], settings["size"])
+    job = {
+        "samples": settings["samples"],
+        "views": [_view(camera) for camera in cameras],
+        "room": room_size(cameras),
+        "light": draw_light(rng, settings["light"]),
+        "floor": draw_surface(rng, settings["floor"]),
+        "wall": draw_surface(rng, settings["wall"]),
+    }
+    return job, cameras
+
+
+def _view(camera: Cameras) -> dict[str, Any]:
+    focal, center = camera.intrinsics[0, 0].item(), camera.intrinsics[:2, 2].tolist()
+    size = camera.image_size[::-1]
+    return {"world_to_camera": camera.world_to_camera.tolist(), "focal": focal, "center": center, "size": size}
 
 
 def draw_cameras(rng: np.random.Generator, kind: str, views: int, fov: Sequence[float], size: int) -> list[Cameras]:
@@ -72,7 +111,7 @@ def room_size(cameras: Sequence[Cameras]) -> float:
 def draw_light(rng: np.random.Generator, light: str) -> dict[str, Any]:
     """Draw a sun and a sky (`random`), or the turn of an environment map's file."""
     if light != "random":
-        return {"file": light, "turn": rng.uniform(0, 2 * np.pi)}
+        return {"file": os.path.abspath(light), "turn": rng.uniform(0, 2 * np.pi)}
     warm, brightness = rng.uniform(0, 1), rng.uniform(0.4, 1.2)
     horizon, zenith = np.array([0.9, 0.95, 1.0]), np.array([0.3, 0.5, 1.0]) + rng.uniform(0, 0.6)
     return {
@@ -108,12 +147,12 @@ def textures_of(folder: Path) -> list[str]:
     return paths
 
 
-def check_surroundings(light: str, floor: str, wall: str) -> None:
+def check_surroundings(settings: RenderSettings) -> None:
     """Refuse a light's file or a folder of textures that does not exist."""
-    if light != "random" and Path(light).suffix.lower() not in ENVIRONMENTS:
-        raise CompleteSplatError(f"light={light}: neither random nor a file ({', '.join(ENVIRONMENTS)})")
+    light = settings["light"]
     if light != "random":
+        if Path(light).suffix.lower() not in ENVIRONMENTS:
+            raise CompleteSplatError(f"light={light}: neither random nor a file ({', '.join(ENVIRONMENTS)})")
         require_file(Path(light))
-    for surface in (floor, wall):
-        if surface not in ("none", "plain", "random"):
-            textures_of(Path(surface))
+    for surface in {settings["floor"], settings["wall"]} - {"none", "plain", "random"}:
+        textures_of(Path(surface))

@@ -1,6 +1,5 @@
 """Renders of a folder of meshes: list of objects, jobs of worker processes, continuation, broken meshes."""
 
-import hashlib
 import json
 import logging
 import math
@@ -11,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
 from threading import Event
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 import torch
@@ -30,13 +29,12 @@ from completesplat.data.co3d.writing import (
 )
 from completesplat.data.images.files import to_bytes
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
-from completesplat.data.rendered.drawing import check_surroundings, draw_cameras, draw_light, draw_surface, room_size
-from completesplat.data.sequences import shortened
+from completesplat.data.rendered.drawing import RenderSettings, check_surroundings, draw_scene
 from completesplat.data.validation import MissingFile, UnreadableFile, read_points
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder, folder_names, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
-from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
+from completesplat.settings.schema import Positive
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +45,6 @@ SUFFIXES = ("glb", "gltf", "obj", "ply", "stl", "fbx", "usd", "usda", "usdc")
 MOST_POINTS = 20_000
 SKY = 1e9  # Cycles has 1e10 where no surface is
 MEGABYTE = 1_000_000
-Fields = Annotated[Sequence[Annotated[float, Range(5, 120)]], Entries(2, 2)]
 
 
 class Mesh(NamedTuple):
@@ -80,28 +77,18 @@ def find_meshes(folder: Path) -> list[Mesh]:
 def render(
     meshes: str,
     out: Path,
-    views: Annotated[int, Range(2, 1000)] = 24,
-    size: Side = 128,
-    samples: Positive = 32,
-    cameras: str = "turn",
-    fov: Fields = (36.0, 55.0),
-    light: str = "random",
-    floor: str = "random",
-    wall: str = "none",
-    seed: Natural = 0,
-    max_megabytes: Positive = 500,
+    max_megabytes: Positive,
     blender: str | None = None,
     workers: Positive | None = None,
     progress: bool = True,
+    **settings: Unpack[RenderSettings],
 ) -> Path:
     """Render every mesh of a folder into `out`/rendered, and return this folder.
 
-    What an object's images show depends on the settings, the seed and its path alone. Objects that are rendered
-    already remain; meshes that cannot be rendered are left out and tried again the next time.
+    What an object's images show depends on the settings, which include the seed, and on its path alone. Objects that
+    are rendered already remain; meshes that cannot be rendered are left out and tried again the next time.
 
     Args:
-        cameras, fov: see `draw_cameras`.
-        light: see `draw_light`; floor, wall: see `draw_surface`.
         max_megabytes: largest size of a mesh's file.
         blender: see `find_blender`.
         workers: number of Blender's processes, each with one object and one thread (None: one for each core).
@@ -113,56 +100,28 @@ def render(
         DiskError: the disk is full.
     """
     if out.resolve().is_relative_to(Path(meshes).resolve()):
-        raise DataError(
-            f"lies in meshes={meshes}, and its points would be taken for meshes; choose another", f"out={out}"
-        )
-    objects, program = find_meshes(Path(meshes)), find_blender(blender)
-    check_surroundings(light, floor, wall)
-    settings = {"views": views, "size": size, "cameras": cameras, "fov": list(fov)}
-    settings |= {"samples": samples, "light": light, "floor": floor, "wall": wall, "seed": seed}
-    draw_scene(objects[0], settings)  # refuses cameras that cannot be read
-    category = out / CATEGORY
+        raise DataError(f"lies in meshes={meshes}, and its points would be taken for meshes", f"out={out}")
+    objects, program, category = find_meshes(Path(meshes)), find_blender(blender), out / CATEGORY
+    check_surroundings(settings)
+    draw_scene(objects[0].relative, settings)  # refuses cameras that cannot be read
     parameters = {"format": FORMAT_VERSION, **settings}
     if not is_written(category / DESCRIPTION, parameters):
         with atomic_folder(category) as unfinished:
             (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1) + "\n")
     waiting = [mesh for mesh in objects if not (category / mesh.name).exists()]
     write_one = partial(_write_object, category, program, settings, MEGABYTE * max_megabytes)
-    broken = dict(track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting), disable=not progress))
-    broken = {name: reason for name, reason in sorted(broken.items()) if reason}
+    results = track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting), disable=not progress)
+    broken = {name: reason for name, reason in sorted(results) if reason}
     write_text(category / BROKEN, json.dumps(broken, indent=1) + "\n")
     for name, reason in broken.items():
         logger.warning("left out: %s: %s", name, reason)
     records = [json.loads(path.read_text()) for path in sorted(category.glob(f"[!.]*/{OBJECT}"))]
     if not records:
-        raise DataError(f"none of {len(objects)} meshes can be rendered: {shortened([*broken.values()], 1)}", meshes)
+        raise DataError(f"none of {len(objects)} meshes can be rendered: {next(iter(broken.values()))}", meshes)
     frames = [frame for record in records for frame in record["frames"]]
     write_annotations(category, frames, [record["sequence"] for record in records])
     logger.info("%d objects in %s, %d meshes left out", len(records), category, len(broken))
     return category
-
-
-def draw_scene(mesh: Mesh, settings: dict[str, Any]) -> tuple[dict[str, Any], list[Cameras]]:
-    """Draw a mesh's surroundings and cameras by the seed and the mesh's path, as a job of `scene_script.py`."""
-    digest = hashlib.sha256(mesh.relative.encode()).digest()
-    rng = np.random.default_rng([settings["seed"], int.from_bytes(digest[:8])])
-    cameras = draw_cameras(rng, *(settings[key] for key in ("cameras", "views", "fov", "size")))
-    job = {
-        "mesh": str(mesh.path.absolute()),
-        "samples": settings["samples"],
-        "views": [_view(camera) for camera in cameras],
-        "room": room_size(cameras),
-        "light": draw_light(rng, settings["light"]),
-        "floor": draw_surface(rng, settings["floor"]),
-        "wall": draw_surface(rng, settings["wall"]),
-    }
-    return job, cameras
-
-
-def _view(camera: Cameras) -> dict[str, Any]:
-    focal, center = camera.intrinsics[0, 0].item(), camera.intrinsics[:2, 2].tolist()
-    size = camera.image_size[::-1]
-    return {"world_to_camera": camera.world_to_camera.tolist(), "focal": focal, "center": center, "size": size}
 
 
 def _in_threads(
@@ -181,7 +140,7 @@ def _in_threads(
 
 
 def _write_object(
-    category: Path, program: Blender, settings: dict[str, Any], most_bytes: int, mesh: Mesh, stopped: Event
+    category: Path, program: Blender, settings: RenderSettings, most_bytes: int, mesh: Mesh, stopped: Event
 ) -> tuple[str, str]:
     """Render a mesh into its folder, whole or not at all; return its name, and why it is left out or an empty text."""
     if (size := mesh.path.stat().st_size) > most_bytes:
@@ -193,8 +152,9 @@ def _write_object(
         with atomic_folder(category / mesh.name) as folder:
             files = folder / "blender"
             files.mkdir()
-            job, cameras = draw_scene(mesh, settings)
-            result = run_job(program, job | {"folder": str(files.absolute())}, files, stopped)
+            job, cameras = draw_scene(mesh.relative, settings)
+            job |= {"mesh": str(mesh.path.absolute()), "folder": str(files.absolute())}
+            result = run_job(program, job, files, stopped)
             if "refused" in result:
                 raise BrokenMesh(result["refused"])
             record = {"mesh": mesh.relative, **result, **_write_sequence(folder, mesh.name, files, cameras)}

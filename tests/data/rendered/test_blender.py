@@ -52,8 +52,9 @@ def into(line, tmp_path):
     """Render the cube into a folder and return the reason for which that fails."""
 
     def run(out, program, **settings):
+        given = meshes.SETTINGS | {"views": 2, "size": 8, "samples": 1, "blender": program} | settings
         with pytest.raises(DataError) as caught:
-            render(str(tmp_path / "meshes"), out, 2, 8, workers=1, blender=program, progress=False, **settings)
+            render(str(tmp_path / "meshes"), out, workers=1, progress=False, **given)
         return str(caught.value)
 
     return run

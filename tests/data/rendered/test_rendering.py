@@ -26,7 +26,7 @@ from completesplat.files import folder_names
 from completesplat.geometry.cameras import Cameras, look_at, pixel_rays, project
 
 pytestmark = pytest.mark.blender
-QUICK = {"views": 3, "size": 32, "samples": 4, "workers": 1, "progress": False}
+QUICK = meshes.SETTINGS | {"views": 3, "size": 32, "samples": 4, "workers": 1, "progress": False}
 HALF = 1 / np.sqrt(3)
 """Half edge of the cube after scaling: its corners are at distance 1."""
 
@@ -235,8 +235,7 @@ def test_all_commands_read_renders(command, cubes, tmp_path):
     small = [*SMALL, "data.batch_size=1", "data.targets=2", "data.workers=0", "callbacks.images=null"]
     finished = command("fit", "experiment=toy_var", *given, *small, f"out={tmp_path / 'run'}")
     assert finished.status == 0, finished.err
-    metrics = strict_json(tmp_path / "run/metrics.json")
-    assert (metrics["steps"], metrics["data_set"]) == (2, "rendered")
+    assert strict_json(tmp_path / "run/metrics.json")["steps"] == 2
 
 
 def test_the_object_lies_within_its_depth_range_and_depth_is_read(cubes):
