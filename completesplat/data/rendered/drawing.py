@@ -19,11 +19,12 @@ from completesplat.settings.schema import Entries, Natural, Positive, Range, Sid
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 # Distance at which the ball around the object touches the image's border, times this.
-NEAREST, FARTHEST = 1.0, 1.35
+NEAREST, FARTHEST = 1.05, 1.35
 ROOM, SMALLEST_ROOM = 1.3, 3.0  # half size of a room: relative to the farthest camera, and at least
 TEXTURES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 ENVIRONMENTS = (".hdr", ".exr")
 GREY = 0.5
+WHITE_FLOOR = 0.5, 1.1
 
 Angles = Float[np.ndarray, " view"]
 
@@ -48,6 +49,7 @@ def draw_scene(name: str, settings: RenderSettings) -> tuple[dict[str, Any], lis
     rng = np.random.default_rng([settings["seed"], int.from_bytes(digest[:8])])
     cameras = draw_cameras(rng, settings["cameras"], settings["views"], settings["fov"], settings["size"])
     job = {
+        "seed": int(rng.integers(2**31)),
         "samples": settings["samples"],
         "views": [_view(camera) for camera in cameras],
         "room": room_size(cameras),
@@ -112,14 +114,16 @@ def draw_light(rng: np.random.Generator, light: str) -> dict[str, Any]:
     """Draw a sun and a sky (`random`), or the turn of an environment map's file."""
     if light != "random":
         return {"file": os.path.abspath(light), "turn": rng.uniform(0, 2 * np.pi)}
-    warm, brightness = rng.uniform(0, 1), rng.uniform(0.4, 1.2)
+    warm, elevation = rng.uniform(), math.radians(rng.uniform(30, 80))
+    # Radiance of a white floor, as if the camera had chosen its exposure, and the sun's part of it.
+    white, part = rng.uniform(*WHITE_FLOOR), rng.uniform(0.2, 0.8)
     horizon, zenith = np.array([0.9, 0.95, 1.0]), np.array([0.3, 0.5, 1.0]) + rng.uniform(0, 0.6)
     return {
-        "sky": [(brightness * color.clip(0, 1)).tolist() for color in (horizon, zenith)],
-        "strength": rng.uniform(1.5, 5.0),
+        "sky": [((1 - part) * white * color.clip(0, 1)).tolist() for color in (horizon, zenith)],
+        "strength": math.pi * part * white / math.sin(elevation),
         "color": [1.0, 1 - 0.15 * warm, 1 - 0.4 * warm],
         "angle": math.radians(rng.uniform(0.5, 10)),  # a larger sun has softer shadows
-        "elevation": math.radians(rng.uniform(20, 80)),
+        "elevation": elevation,
         "azimuth": rng.uniform(0, 2 * np.pi),
     }
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Event
 from typing import Any, NamedTuple, Unpack
 
@@ -31,7 +32,7 @@ from completesplat.data.images.files import to_bytes
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
 from completesplat.data.rendered.drawing import RenderSettings, check_surroundings, draw_scene
 from completesplat.data.validation import MissingFile, UnreadableFile, read_points
-from completesplat.errors import DataError
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import atomic_folder, folder_names, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
 from completesplat.settings.schema import Positive
@@ -47,19 +48,20 @@ SKY = 1e9  # Cycles has 1e10 where no surface is
 MEGABYTE = 1_000_000
 
 
-class Mesh(NamedTuple):
-    """Mesh file with the name of its sequence, and its path in the folder of meshes."""
+class Asset(NamedTuple):
+    """Object to render: the name of its sequence, a key that draws its surroundings, and its mesh or factory."""
 
     name: str
-    path: Path
-    relative: str
+    key: str
+    mesh: Path | None = None
+    factory: str | None = None
 
 
 class BrokenMesh(DataError, kind="broken mesh"):
     """Mesh that Blender cannot render, or of which no image shows anything."""
 
 
-def find_meshes(folder: Path) -> list[Mesh]:
+def find_meshes(folder: Path) -> list[Asset]:
     """List the mesh files below a folder by path; a sequence is named after its file's path.
 
     Raises:
@@ -71,11 +73,24 @@ def find_meshes(folder: Path) -> list[Mesh]:
     if not paths:
         raise MissingFile(f"no meshes there ({', '.join(SUFFIXES)})", str(folder))
     relative = [path.relative_to(folder).as_posix() for path in paths]
-    return [Mesh(*mesh) for mesh in zip(folder_names(relative), paths, relative, strict=True)]
+    return [Asset(*mesh) for mesh in zip(folder_names(relative), relative, paths, strict=True)]
+
+
+def procedural_objects(program: Blender, factory: str, count: int) -> list[Asset]:
+    """List objects of a factory of Infinigen; refuse one that the program's Python does not have."""
+    if not factory.isidentifier():
+        raise CompleteSplatError(f"factory={factory}: must be the name of a class, such as SofaFactory")
+    with TemporaryDirectory() as folder:
+        result = run_job(program, {"factory": factory, "views": []}, Path(folder), Event())
+    if "refused" in result:
+        raise CompleteSplatError(f"factory={factory}: {result['refused']}")
+    return [Asset(name, name, factory=factory) for name in (f"{factory}_{index:05d}" for index in range(count))]
 
 
 def render(
-    meshes: str,
+    meshes: str | None,
+    factory: str | None,
+    count: Positive,
     out: Path,
     max_megabytes: Positive,
     blender: str | None = None,
@@ -83,54 +98,64 @@ def render(
     progress: bool = True,
     **settings: Unpack[RenderSettings],
 ) -> Path:
-    """Render every mesh of a folder into `out`/rendered, and return this folder.
+    """Render objects into `out`/rendered, and return this folder.
 
-    What an object's images show depends on the settings, which include the seed, and on its path alone. Objects that
-    are rendered already remain; meshes that cannot be rendered are left out and tried again the next time.
+    What an object's images show depends on the settings, which include the seed, and on its path or number alone.
+    Objects that are rendered already remain; those that cannot be rendered are left out and tried again the next time.
 
     Args:
+        meshes, factory: a folder of meshes, or a class of Infinigen, of which `count` objects are made.
         max_megabytes: largest size of a mesh's file.
         blender: see `find_blender`.
         workers: number of Blender's processes, each with one object and one thread (None: one for each core).
 
     Raises:
         CompleteSplatError: there is no Blender, or it is too old.
-        DataError: there are no meshes, a file of the settings is missing, the folder holds something else, or no mesh
+        DataError: there are no meshes, a file of the settings is missing, the folder holds something else, or nothing
             can be rendered; `broken.json` has the reasons.
         DiskError: the disk is full.
     """
-    if out.resolve().is_relative_to(Path(meshes).resolve()):
+    if (meshes is None) == (factory is None):
+        raise CompleteSplatError("give either meshes=FOLDER or factory=NAME (of Infinigen, such as SofaFactory)")
+    if meshes is not None and out.resolve().is_relative_to(Path(meshes).resolve()):
         raise DataError(f"lies in meshes={meshes}, and its points would be taken for meshes", f"out={out}")
-    objects, program, category = find_meshes(Path(meshes)), find_blender(blender), out / CATEGORY
     check_surroundings(settings)
-    draw_scene(objects[0].relative, settings)  # refuses cameras that cannot be read
+    draw_scene("", settings)  # refuses cameras that cannot be read
+    objects = find_meshes(Path(meshes)) if meshes is not None else []
+    program, category = find_blender(blender), out / CATEGORY
+    objects = objects or procedural_objects(program, str(factory), count)
     parameters = {"format": FORMAT_VERSION, **settings}
     if not is_written(category / DESCRIPTION, parameters):
         with atomic_folder(category) as unfinished:
             (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1) + "\n")
-    waiting = [mesh for mesh in objects if not (category / mesh.name).exists()]
+    waiting = [asset for asset in objects if not (category / asset.name).exists()]
     write_one = partial(_write_object, category, program, settings, MEGABYTE * max_megabytes)
     results = track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting), disable=not progress)
     broken = {name: reason for name, reason in sorted(results) if reason}
+    _write_lists(category, broken)
+    return category
+
+
+def _write_lists(category: Path, broken: dict[str, str]) -> None:
+    """Write the reasons for objects that are left out, and the annotations of all that there are."""
     write_text(category / BROKEN, json.dumps(broken, indent=1) + "\n")
     for name, reason in broken.items():
         logger.warning("left out: %s: %s", name, reason)
     records = [json.loads(path.read_text()) for path in sorted(category.glob(f"[!.]*/{OBJECT}"))]
     if not records:
-        raise DataError(f"none of {len(objects)} meshes can be rendered: {next(iter(broken.values()))}", meshes)
+        raise DataError(f"none of {len(broken)} objects can be rendered: {next(iter(broken.values()))}", str(category))
     frames = [frame for record in records for frame in record["frames"]]
     write_annotations(category, frames, [record["sequence"] for record in records])
-    logger.info("%d objects in %s, %d meshes left out", len(records), category, len(broken))
-    return category
+    logger.info("%d objects in %s, %d left out", len(records), category, len(broken))
 
 
 def _in_threads(
-    function: Callable[[Mesh, Event], tuple[str, str]], meshes: Sequence[Mesh], workers: int | None
+    function: Callable[[Asset, Event], tuple[str, str]], assets: Sequence[Asset], workers: int | None
 ) -> Iterator[tuple[str, str]]:
     """Yield the results as they come; at an exception, end those that run and start no others."""
     stopped = Event()
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
-        futures = [pool.submit(function, mesh, stopped) for mesh in meshes]
+        futures = [pool.submit(function, asset, stopped) for asset in assets]
         try:
             for future in as_completed(futures):
                 yield future.result()
@@ -140,29 +165,30 @@ def _in_threads(
 
 
 def _write_object(
-    category: Path, program: Blender, settings: RenderSettings, most_bytes: int, mesh: Mesh, stopped: Event
+    category: Path, program: Blender, settings: RenderSettings, most_bytes: int, asset: Asset, stopped: Event
 ) -> tuple[str, str]:
-    """Render a mesh into its folder, whole or not at all; return its name, and why it is left out or an empty text."""
-    if (size := mesh.path.stat().st_size) > most_bytes:
-        return mesh.name, f"{size // MEGABYTE:,} MB, more than max_megabytes={most_bytes // MEGABYTE}"
+    """Render an object into its folder, whole or not at all; return its name, and why it is left out (or "")."""
+    mesh = asset.mesh
+    if mesh is not None and (size := mesh.stat().st_size) > most_bytes:
+        return asset.name, f"{size // MEGABYTE:,} MB, more than max_megabytes={most_bytes // MEGABYTE}"
     try:
         # Blender's importer would move such vertices to the origin.
-        if mesh.path.suffix.lower() == ".ply" and not np.isfinite(read_points(mesh.path)).all():
+        if mesh is not None and mesh.suffix.lower() == ".ply" and not np.isfinite(read_points(mesh)).all():
             raise BrokenMesh("it has vertices that are not finite")
-        with atomic_folder(category / mesh.name) as folder:
+        with atomic_folder(category / asset.name) as folder:
             files = folder / "blender"
             files.mkdir()
-            job, cameras = draw_scene(mesh.relative, settings)
-            job |= {"mesh": str(mesh.path.absolute()), "folder": str(files.absolute())}
-            result = run_job(program, job, files, stopped)
+            job, cameras = draw_scene(asset.key, settings)
+            job |= {"factory": asset.factory} if mesh is None else {"mesh": str(mesh.absolute())}
+            result = run_job(program, job | {"folder": str(files.absolute())}, files, stopped)
             if "refused" in result:
                 raise BrokenMesh(result["refused"])
-            record = {"mesh": mesh.relative, **result, **_write_sequence(folder, mesh.name, files, cameras)}
+            record = {"source": asset.key, **result, **_write_sequence(folder, asset.name, files, cameras)}
             (folder / OBJECT).write_text(json.dumps(record) + "\n")
             shutil.rmtree(files)
     except (BrokenMesh, UnreadableFile) as error:
-        return mesh.name, error.reason
-    return mesh.name, ""
+        return asset.name, error.reason
+    return asset.name, ""
 
 
 def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Cameras]) -> dict[str, Any]:

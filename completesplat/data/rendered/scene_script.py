@@ -1,4 +1,4 @@
-"""Program for Blender's Python, or a Python with `bpy`: render one mesh as a job (a JSON file) describes.
+"""Program for Blender's Python, or a Python with `bpy`: render one object as a job (a JSON file) describes.
 
 It imports nothing of this package, because Blender's Python does not have it. For every view it writes `NNNN.png`, the
 colours, and `NNNN.npy`, float32 [height width 3]: depth along the optical axis, 1 where the pixel's centre shows the
@@ -8,7 +8,9 @@ object, and the object's coverage of the pixel. `result.json` has the object's p
 import json
 import math
 import os
+import re
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +57,29 @@ def import_mesh(path: Path) -> None:
     require_files([Path(bpy.path.abspath(image.filepath)) for image in images], "texture")
 
 
+def find_factory(name: str) -> Any:
+    """Return Infinigen's class of procedural objects; import only the package that names it, which saves seconds."""
+    try:
+        import infinigen.assets.objects as kinds
+    except ImportError as error:
+        raise RefusedMesh(f"Blender's Python lacks Infinigen ({error}); pip install infinigen there") from None
+    packages = sorted(Path(kinds.__path__[0]).glob("*/__init__.py"))
+    named = [path.parent.name for path in packages if re.search(rf"\b{name}\b", path.read_text())]
+    if not named:
+        raise RefusedMesh(f"Infinigen has no {name}")
+    return getattr(import_module(f"{kinds.__name__}.{named[0]}"), name)
+
+
+def make_object(name: str, seed: int) -> None:
+    """Make a procedural object of Infinigen in the empty scene."""
+    factory_class = find_factory(name)
+    from infinigen.core.util.math import FixedSeed
+
+    with FixedSeed(seed):
+        factory = factory_class(seed)
+        factory.finalize_assets(factory.spawn_asset(0))
+
+
 def require_files(paths: list[Path], what: str) -> None:
     for path in paths:
         if not path.is_file():
@@ -66,8 +91,9 @@ def baked_objects() -> list[Any]:
     graph = bpy.context.evaluated_depsgraph_get()
     meshes = []
     for instance in graph.object_instances:
-        if instance.object.type == "MESH" and len(instance.object.data.polygons):
-            mesh = bpy.data.meshes.new_from_object(instance.object, preserve_all_data_layers=True, depsgraph=graph)
+        source = instance.object
+        if source.type == "MESH" and len(source.data.polygons) and not source.original.hide_render:
+            mesh = bpy.data.meshes.new_from_object(source, preserve_all_data_layers=True, depsgraph=graph)
             mesh.transform(instance.matrix_world)
             meshes.append(mesh)
     for imported in list(bpy.data.objects):
@@ -298,10 +324,19 @@ def read_exr(path: Path) -> Any:
 
 
 def run(job: dict[str, Any]) -> dict[str, Any]:
-    """Render the job's mesh; return its place and scale, or the reason for a refusal."""
+    """Render the job's mesh or procedural object; return its place and scale, or the reason for a refusal.
+
+    Without views, only look for the factory of procedural objects.
+    """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     try:
-        import_mesh(Path(job["mesh"]))
+        if not job["views"]:
+            find_factory(job["factory"])
+            return {}
+        if "mesh" in job:
+            import_mesh(Path(job["mesh"]))
+        else:
+            make_object(job["factory"], job["seed"])
         objects = baked_objects()
         center, scale, ground = normalize(objects)
     except RefusedMesh as reason:

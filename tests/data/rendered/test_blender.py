@@ -54,7 +54,7 @@ def into(line, tmp_path):
     def run(out, program, **settings):
         given = meshes.SETTINGS | {"views": 2, "size": 8, "samples": 1, "blender": program} | settings
         with pytest.raises(DataError) as caught:
-            render(str(tmp_path / "meshes"), out, workers=1, progress=False, **given)
+            render(str(tmp_path / "meshes"), out=out, workers=1, progress=False, **given)
         return str(caught.value)
 
     return run
@@ -100,7 +100,7 @@ def test_a_blender_that_crashes_or_fails_leaves_meshes_out(into, program, tmp_pa
         "exit 0": "Blender failed: no message",
     }.items():
         message = into(tmp_path / "data", program(VERSION.format("4.2.0") + text))
-        assert message == f"{tmp_path / 'meshes'}: none of 1 meshes can be rendered: {reason}"
+        assert message == f"{tmp_path / 'data/rendered'}: none of 1 objects can be rendered: {reason}"
         assert [path.name for path in (tmp_path / "data/rendered").glob("*/")] == []
 
 
@@ -108,6 +108,9 @@ def test_bad_settings_are_refused_before_anything_is_written(line, program, tmp_
     found = f"blender={program(VERSION.format('4.2.0'))}"
     (tmp_path / "empty").mkdir()
     (tmp_path / "cameras.json").write_text('{"frames": []}')
+    assert line("meshes=null").startswith("give either meshes=FOLDER or factory=NAME")
+    message = line("meshes=null", "factory=a.b", found)
+    assert message == "factory=a.b: must be the name of a class, such as SofaFactory"
     for given, message in {
         f"meshes={tmp_path / 'empty'}": f"{tmp_path / 'empty'}: no meshes there (glb, gltf, obj, ply, stl, fbx, usd",
         f"meshes={tmp_path / 'gone'}": f"{tmp_path / 'gone'}: no such folder",
@@ -117,6 +120,7 @@ def test_bad_settings_are_refused_before_anything_is_written(line, program, tmp_
         f"wall={tmp_path / 'empty'}": f"{tmp_path / 'empty'}: no textures there",
         "cameras=circle": "cameras=circle: choose turn, hemisphere or the path of a transforms.json",
         f"cameras={tmp_path / 'cameras.json'}": f"{tmp_path / 'cameras.json'}: 0 frames; at least 2 are rendered",
+        "factory=SofaFactory": "give either meshes=FOLDER or factory=NAME",
         "views=1": "views=1: must lie between 2 and 1000",
         "fov=[5]": "fov=[5]: must have 2 entries",
         "fov=[0,50]": "fov=[0, 50]: must lie between 5 and 120",
@@ -126,7 +130,7 @@ def test_bad_settings_are_refused_before_anything_is_written(line, program, tmp_
 
 def test_a_folder_of_other_settings_or_among_the_meshes_is_refused(into, program, tmp_path):
     found, out = program(VERSION.format("4.2.0")), tmp_path / "data"
-    assert "none of 1 meshes" in into(out, found)
+    assert "none of 1 objects" in into(out, found)
     assert into(out, found, seed=1).startswith(f"{out / 'rendered'} already holds something else")
     within = tmp_path / "meshes/data"
     assert into(within, found).startswith(f"out={within}: lies in meshes={tmp_path / 'meshes'}, and its points would")

@@ -56,7 +56,7 @@ def cube(tmp_path_factory: pytest.TempPathFactory) -> Path:
     meshes.write_cube(root / "meshes/cube.obj", half=3, center=(50, 20, -10))
     path = meshes.write_transforms(root / "cameras.json", off_center(240, 180))
     settings = QUICK | {"size": 180, "samples": 16, "cameras": str(path), "floor": "none"}
-    render(str(root / "meshes"), root / "data", **settings)
+    render(str(root / "meshes"), out=root / "data", **settings)
     return root / "data"
 
 
@@ -122,7 +122,7 @@ def test_depth_and_mask_are_those_of_rays_through_the_pixel_centers(cube):
 
 def test_place_and_scale_of_the_mesh_are_kept(cube):
     record = strict_json(cube / "rendered/cube.obj/object.json")
-    assert record["mesh"] == "cube.obj"
+    assert record["source"] == "cube.obj"
     assert record["scale"] == pytest.approx(HALF / 3, rel=1e-5)
     assert record["center"] == pytest.approx([50, 10, 20], abs=1e-4)  # OBJ's y axis becomes z
 
@@ -157,7 +157,7 @@ def reasons(tmp_path: Path) -> dict[str, str]:
 def test_broken_meshes_are_reported_and_left_out(tmp_path, caplog):
     expected = reasons(tmp_path)
     meshes.write_cube(tmp_path / "meshes/sub/good.obj")
-    category = render(str(tmp_path / "meshes"), tmp_path / "data", **QUICK)
+    category = render(str(tmp_path / "meshes"), out=tmp_path / "data", **QUICK)
     broken = json.loads((category / "broken.json").read_text())
     assert broken.keys() == expected.keys()
     assert {name: broken[name] for name in broken if expected[name] not in broken[name]} == {}
@@ -165,7 +165,7 @@ def test_broken_meshes_are_reported_and_left_out(tmp_path, caplog):
     assert [path.name for path in category.iterdir() if path.is_dir()] == ["sub_good.obj"]
     # What is put right is rendered the next time.
     meshes.write_cube(tmp_path / "meshes/bad.obj")
-    render(str(tmp_path / "meshes"), tmp_path / "data", **QUICK)
+    render(str(tmp_path / "meshes"), out=tmp_path / "data", **QUICK)
     assert len(frames_of(tmp_path / "data", "bad.obj")) == QUICK["views"]
 
 
@@ -175,7 +175,7 @@ def cubes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("cubes")
     for number in range(3):
         meshes.write_cube(root / f"meshes/{number}/cube.obj", half=number + 1)
-    render(str(root / "meshes"), root / "data", **QUICK)
+    render(str(root / "meshes"), out=root / "data", **QUICK)
     return root
 
 
@@ -201,7 +201,7 @@ def test_renders_that_were_killed_continue_without_half_written_scenes(cubes, tm
     before = {path.parent.name: contents(path.parent) for path in category.glob("[!.]*/object.json")}
     assert 0 < len(before) < 3
     assert all(len([name for name in files if name.startswith("images/")]) == 3 for files in before.values())
-    render(str(cubes / "meshes"), tmp_path, **QUICK)
+    render(str(cubes / "meshes"), out=tmp_path, **QUICK)
     assert not list(category.glob(".*"))
     assert contents(category) == contents(cubes / "data/rendered")  # as if nothing had happened
 
@@ -216,7 +216,7 @@ def _session_of(pid: int) -> int | None:
 def test_images_do_not_depend_on_the_other_meshes_or_on_the_number_of_workers(cubes, tmp_path):
     meshes.write_cube(tmp_path / "meshes/1/cube.obj", half=2)
     meshes.write_cube(tmp_path / "meshes/cube.obj", half=2)
-    category = render(str(tmp_path / "meshes"), tmp_path / "data", **QUICK | {"workers": 2})
+    category = render(str(tmp_path / "meshes"), out=tmp_path / "data", **QUICK | {"workers": 2})
     assert contents(category / "1_cube.obj") == contents(cubes / "data/rendered/1_cube.obj")
     images = [(category / name / "images/frame000001.jpg").read_bytes() for name in ("1_cube.obj", "cube.obj")]
     assert images[0] != images[1]
@@ -251,8 +251,32 @@ def test_surroundings_show_the_textures_of_a_folder_and_walls_hide_the_sky(tmp_p
     (tmp_path / "red").mkdir()
     Image.new("RGB", (8, 8), (200, 0, 0)).save(tmp_path / "red/red.png")
     red, settings = str(tmp_path / "red"), QUICK | {"cameras": "hemisphere"}
-    category = render(str(tmp_path / "meshes"), tmp_path / "data", **settings, floor=red, wall=red)
+    category = render(str(tmp_path / "meshes"), out=tmp_path / "data", **settings, floor=red, wall=red)
     folder = category / folder_names(["cube.obj"])[0]
     for image, mask in zip(sorted(folder.glob("images/*")), sorted(folder.glob("masks/*")), strict=True):
         pixels = np.asarray(Image.open(image)).astype(float)[np.asarray(Image.open(mask)) == 0]
         assert (pixels[:, 0] > 1.5 * pixels[:, 1:].max(axis=1)).mean() > 0.98
+
+
+def test_an_environment_map_lights_object_and_sky(tmp_path):
+    meshes.write_cube(tmp_path / "meshes/cube.obj")
+    green = bytes([8, 128, 8, 128])  # red, green, blue and their common exponent: 1/32, 1/2, 1/32
+    (tmp_path / "sky.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 4\n" + 8 * green)
+    settings = QUICK | {"light": str(tmp_path / "sky.hdr"), "floor": "none"}
+    category = render(str(tmp_path / "meshes"), out=tmp_path / "data", **settings)
+    for image in (category / "cube.obj/images").iterdir():
+        pixels = np.asarray(Image.open(image)).astype(float)
+        bright = pixels[pixels.max(axis=-1) > 60]
+        assert len(bright) > 300
+        assert (bright[:, 1] > 1.5 * bright[:, [0, 2]].max(axis=1)).mean() > 0.95
+
+
+def test_procedural_objects_of_infinigen_are_made_by_number(tmp_path):
+    settings = QUICK | {"factory": "SofaFactory", "count": 1, "views": 2}
+    with pytest.raises(CompleteSplatError, match=r"^factory=CouchFactory: .*(lacks|has no) ") as caught:
+        render(None, out=tmp_path, **settings | {"factory": "CouchFactory"})
+    if "lacks" in str(caught.value):
+        pytest.skip(str(caught.value))
+    category = render(None, out=tmp_path, **settings)
+    record = strict_json(category / "SofaFactory_00000/object.json")
+    assert record["source"] == "SofaFactory_00000"
