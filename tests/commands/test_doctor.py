@@ -74,6 +74,11 @@ def test_missing_node_and_blender_are_no_errors_but_ffmpeg_and_space_are_needed(
     monkeypatch.delenv("COMPLETESPLAT_BLENDER", raising=False)
     expected = {"ffmpeg": "yes", "node": "no", "blender": "no", "free disk": "yes"}
     assert states(doctor.check_tools(tmp_path)) == expected
+    blender = tmp_path / "program"
+    blender.write_text("#!/bin/sh\necho Blender 4.5.1 LTS\n")
+    blender.chmod(0o700)
+    monkeypatch.setenv("COMPLETESPLAT_BLENDER", str(blender))
+    expected["blender"] = "yes"
     monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: 1 / 0)
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda place: usage._replace(free=10_000_000))

@@ -57,8 +57,11 @@ class Asset(NamedTuple):
     factory: str | None = None
 
 
-class BrokenMesh(DataError, kind="broken mesh"):
-    """Mesh that Blender cannot render, or of which no image shows anything."""
+class BrokenMesh(Exception):
+    """Object that Blender cannot render, or of which no image shows anything.
+
+    It is no CompleteSplatError, so that `atomic_folder` looks whether a full disk is the reason.
+    """
 
 
 def find_meshes(folder: Path) -> list[Asset]:
@@ -186,7 +189,9 @@ def _write_object(
             record = {"source": asset.key, **result, **_write_sequence(folder, asset.name, files, cameras)}
             (folder / OBJECT).write_text(json.dumps(record) + "\n")
             shutil.rmtree(files)
-    except (BrokenMesh, UnreadableFile) as error:
+    except BrokenMesh as error:
+        return asset.name, str(error)
+    except UnreadableFile as error:
         return asset.name, error.reason
     return asset.name, ""
 

@@ -1,5 +1,6 @@
 """Finding Blender, and programs that are none, are too old, crash or fail: small scripts stand for them."""
 
+import errno
 import stat
 import sys
 
@@ -7,10 +8,11 @@ import meshes
 import pytest
 from support import refused
 
+from completesplat import files
 from completesplat.data.rendered import blender
 from completesplat.data.rendered.blender import VARIABLE, find_blender
 from completesplat.data.rendered.rendering import render
-from completesplat.errors import DataError
+from completesplat.errors import DataError, DiskError
 
 QUICK = ["views=2", "size=8", "workers=1"]
 
@@ -102,6 +104,15 @@ def test_a_blender_that_crashes_or_fails_leaves_meshes_out(into, program, tmp_pa
         message = into(tmp_path / "data", program(VERSION.format("4.2.0") + text))
         assert message == f"{tmp_path / 'data/rendered'}: none of 1 objects can be rendered: {reason}"
         assert [path.name for path in (tmp_path / "data/rendered").glob("*/")] == []
+
+
+def test_a_full_disk_is_no_reason_to_leave_meshes_out(line, program, tmp_path, monkeypatch):
+    given = meshes.SETTINGS | {"views": 2, "size": 8, "samples": 1}
+    given["blender"] = program(VERSION.format("4.2.0") + "echo cannot write; exit 1")
+    monkeypatch.setattr(files, "_asked", lambda path: OSError(errno.ENOSPC, "No space left on device"))
+    with pytest.raises(DiskError, match="No space left on device"):
+        render(str(tmp_path / "meshes"), out=tmp_path / "data", workers=1, progress=False, **given)
+    assert not (tmp_path / "data/rendered/broken.json").exists()
 
 
 def test_bad_settings_are_refused_before_anything_is_written(line, program, tmp_path):
