@@ -30,6 +30,9 @@ NEVER_IMPORTED = {
     "ruff": "a program",
 }
 
+# A script that Blender's Python runs, which has its own packages.
+FOR_BLENDER = ROOT / "completesplat/data/rendered/scene_script.py"
+
 
 def declared(lines: Iterable[str]) -> set[str]:
     return {canonicalize_name(Requirement(line).name) for line in lines}
@@ -51,7 +54,9 @@ def imported(folder: str) -> dict[str, set[str]]:
 
     Modules of the configurations' `_target_` are imported as well.
     """
-    names = {name.split(".")[0] for path in (ROOT / folder).rglob("*.py") for name in modules(path)}
+    names = {
+        name.split(".")[0] for path in (ROOT / folder).rglob("*.py") if path != FOR_BLENDER for name in modules(path)
+    }
     if folder == "completesplat":
         texts = [path.read_text() for path in (ROOT / "conf").rglob("*.yaml")]
         names |= {name for text in texts for name in re.findall(r"_target_: (\w+)\.", text)}

@@ -130,7 +130,7 @@ def render(
     parameters = {"format": FORMAT_VERSION, **settings}
     if not is_written(category / DESCRIPTION, parameters):
         with atomic_folder(category) as unfinished:
-            (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1) + "\n")
+            (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
     waiting = [asset for asset in objects if not (category / asset.name).exists()]
     write_one = partial(_write_object, category, program, settings, MEGABYTE * max_megabytes)
     results = track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting), disable=not progress)

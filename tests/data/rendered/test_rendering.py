@@ -185,7 +185,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_renders_that_were_killed_continue_without_half_written_scenes(cubes, tmp_path, number):
-    given = [f"{key}={value}" for key, value in QUICK.items() if key != "progress"]
+    given = [f"{key}={value}" for key, value in QUICK.items() if key not in ("progress", "factory")]
     command = ["data", "render", f"meshes={cubes / 'meshes'}", f"out={tmp_path}", *given]
     process = subprocess.Popen([sys.executable, "-P", "-m", "completesplat", *command], start_new_session=True)
     category = tmp_path / "rendered"
@@ -251,7 +251,7 @@ def test_surroundings_show_the_textures_of_a_folder_and_walls_hide_the_sky(tmp_p
     (tmp_path / "red").mkdir()
     Image.new("RGB", (8, 8), (200, 0, 0)).save(tmp_path / "red/red.png")
     red, settings = str(tmp_path / "red"), QUICK | {"cameras": "hemisphere"}
-    category = render(str(tmp_path / "meshes"), out=tmp_path / "data", **settings, floor=red, wall=red)
+    category = render(str(tmp_path / "meshes"), out=tmp_path / "data", **settings | {"floor": red, "wall": red})
     folder = category / folder_names(["cube.obj"])[0]
     for image, mask in zip(sorted(folder.glob("images/*")), sorted(folder.glob("masks/*")), strict=True):
         pixels = np.asarray(Image.open(image)).astype(float)[np.asarray(Image.open(mask)) == 0]
