@@ -8,13 +8,13 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
 from completesplat.data.images.photograph import ImageLike, Photograph, image_features, read_photograph
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.files import atomic_path, make_folder, write_text
+from completesplat.files import make_folder, write_bytes, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
 from completesplat.rasterizers.color_fitting import fit_colors
@@ -230,8 +230,7 @@ class SceneModel(nn.Module):
         folder.parent.mkdir(parents=True, exist_ok=True)
         make_folder(folder)
         weights = {key: value.contiguous().cpu() for key, value in self.state_dict().items()}
-        with atomic_path(folder / WEIGHTS_FILE, size=sum(value.nbytes for value in weights.values())) as temporary:
-            save_file(weights, temporary)
+        write_bytes(folder / WEIGHTS_FILE, save(weights))  # safetensors' own files are readable by their owner alone
         write_text(folder / CONFIG_FILE, json.dumps(self.architecture, indent=2) + "\n")
         write_sums(folder)
 

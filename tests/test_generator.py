@@ -41,6 +41,10 @@ def same(first, second) -> bool:
     return all(torch.equal(getattr(first, name), getattr(second, name)) for name in vars(first))
 
 
+def test_whoever_may_read_the_settings_may_read_the_weights(folder):
+    assert len({path.stat().st_mode for path in folder.iterdir()}) == 1
+
+
 def test_what_is_saved_is_loaded_bit_for_bit(model, folder, photo):
     loaded = CompleteSplat.from_pretrained(folder)
     assert loaded.architecture == model.architecture == json.loads(json.dumps(model.architecture))

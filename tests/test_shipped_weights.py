@@ -19,7 +19,7 @@ NAME = "toy_objects"
 
 def test_they_are_small_and_complete():
     assert list(shipped()) == [NAME]
-    assert sum(path.stat().st_size for path in SHIPPED.rglob("*") if path.is_file()) < 32e6
+    assert sum(path.stat().st_size for path in SHIPPED.rglob("*") if path.is_file()) < 16e6
     assert (SHIPPED / NAME / SUMS_FILE).is_file()
     assert locate(NAME).parent == SHIPPED / NAME
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import torch
 from jaxtyping import Float
 from rich.progress import track
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from completesplat.baselines.fitting import FittingSettings, fit_gaussians
@@ -21,7 +21,7 @@ from completesplat.data.loading.distributed import gathered, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.errors import CompleteSplatError
 from completesplat.export.prediction import write_fitted_scene
-from completesplat.files import atomic_path, make_folder, safe_name
+from completesplat.files import make_folder, safe_name, write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.rotations import normalize_quaternion
@@ -156,8 +156,7 @@ class FittedScenes:
             store = self.stores[name]
             sequence = store.source.read(name)
             gaussians = self.fit(stack([store.scene(sequence, 0, range(1, len(sequence.frames)))]))[0]
-            with atomic_path(path) as temporary:
-                save_file({key: value.cpu().contiguous() for key, value in vars(gaussians).items()}, temporary)
+            write_bytes(path, save({key: value.cpu().contiguous() for key, value in vars(gaussians).items()}))
         return Gaussians(**load_file(path))
 
     def _path(self, name: str) -> Path:
