@@ -14,7 +14,7 @@ SQUARES = 4
 """Squares along an edge of the checker cube."""
 
 SETTINGS = {"cameras": "turn", "fov": [36, 55], "light": "random", "floor": "random", "wall": "none", "seed": 0}
-SETTINGS |= {"factory": None, "count": 1, "max_megabytes": 500}
+SETTINGS |= {"front": None, "hidden": "none", "factory": None, "count": 1, "max_megabytes": 500}
 """Settings of renders, without views, size and samples."""
 
 CORNERS = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]

@@ -5,7 +5,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict
 
 import numpy as np
 import torch
@@ -19,12 +19,29 @@ from completesplat.settings.schema import Entries, Natural, Positive, Range, Sid
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 # Distance at which the ball around the object touches the image's border, times this.
-NEAREST, FARTHEST = 1.05, 1.35
+NEAREST, FARTHEST = 0.9, 1.2
 ROOM, SMALLEST_ROOM = 1.3, 3.0  # half size of a room: relative to the farthest camera, and at least
 TEXTURES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 ENVIRONMENTS = (".hdr", ".exr")
 GREY = 0.5
 WHITE_FLOOR = 0.5, 1.1
+ASIDE = 45.0
+"""Largest angle in degrees between the first camera's azimuth and the object's front."""
+
+
+class Paint(NamedTuple):
+    """Paint of the back: the light that it reflects, linear RGB, and its probability."""
+
+    color: tuple[float, float, float]
+    chance: float
+
+
+PAINTS = {
+    "red": Paint((0.5, 0.03, 0.03), 0.4),
+    "green": Paint((0.04, 0.3, 0.06), 0.3),
+    "blue": Paint((0.03, 0.08, 0.5), 0.2),
+    "yellow": Paint((0.8, 0.5, 0.02), 0.1),
+}
 
 Angles = Float[np.ndarray, " view"]
 
@@ -36,10 +53,12 @@ class RenderSettings(TypedDict):
     size: Side
     samples: Positive
     cameras: str
+    front: float | None
     fov: Annotated[Sequence[Annotated[float, Range(5, 120)]], Entries(2, 2)]
     light: str
     floor: str
     wall: str
+    hidden: Literal["none", "back", "modes"]
     seed: Natural
 
 
@@ -47,7 +66,8 @@ def draw_scene(name: str, settings: RenderSettings) -> tuple[dict[str, Any], lis
     """Draw surroundings and cameras by the seed and an object's name; return them for `scene_script.py`."""
     digest = hashlib.sha256(name.encode()).digest()
     rng = np.random.default_rng([settings["seed"], int.from_bytes(digest[:8])])
-    cameras = draw_cameras(rng, settings["cameras"], settings["views"], settings["fov"], settings["size"])
+    views, size, front = settings["views"], settings["size"], settings["front"]
+    cameras = draw_cameras(rng, settings["cameras"], views, settings["fov"], size, front)
     job = {
         "seed": int(rng.integers(2**31)),
         "samples": settings["samples"],
@@ -56,6 +76,7 @@ def draw_scene(name: str, settings: RenderSettings) -> tuple[dict[str, Any], lis
         "light": draw_light(rng, settings["light"]),
         "floor": draw_surface(rng, settings["floor"]),
         "wall": draw_surface(rng, settings["wall"]),
+        "hidden": draw_back(rng, cameras[0], settings["hidden"]),
     }
     return job, cameras
 
@@ -66,12 +87,16 @@ def _view(camera: Cameras) -> dict[str, Any]:
     return {"world_to_camera": camera.world_to_camera.tolist(), "focal": focal, "center": center, "size": size}
 
 
-def draw_cameras(rng: np.random.Generator, kind: str, views: int, fov: Sequence[float], size: int) -> list[Cameras]:
+def draw_cameras(
+    rng: np.random.Generator, kind: str, views: int, fov: Sequence[float], size: int, front: float | None = None
+) -> list[Cameras]:
     """Draw the cameras of an object whose farthest vertex has distance 1 from the origin; z points up.
 
     Args:
         kind: `turn`: around the object at varying heights, as people film for CO3D; `hemisphere`: from random
             directions above the ground; or the path of a `transforms.json`, whose cameras are taken.
+        front: azimuth of the object's front in degrees, from x to y; the first camera is within `ASIDE` of it. None: it
+            is anywhere.
         fov: smallest and largest field of view in degrees, drawn once for an object.
 
     Raises:
@@ -80,8 +105,12 @@ def draw_cameras(rng: np.random.Generator, kind: str, views: int, fov: Sequence[
     if kind not in ("turn", "hemisphere"):
         if Path(kind).suffix != ".json":
             raise CompleteSplatError(f"cameras={kind}: choose turn, hemisphere or the path of a transforms.json")
+        if front is not None:
+            raise CompleteSplatError(f"front={front}: has no effect on the cameras of a file; leave it out")
         return read_cameras(Path(kind), size)
     azimuth, elevation = turn(rng, views) if kind == "turn" else hemisphere(rng, views)
+    if front is not None:
+        azimuth = azimuth - azimuth[0] + math.radians(front + rng.uniform(-ASIDE, ASIDE))
     degrees = rng.uniform(min(fov), max(fov))
     distance = rng.uniform(NEAREST, FARTHEST) / math.sin(math.radians(degrees) / 2) * rng.normal(1, 0.03, views)
     level = np.cos(elevation)
@@ -141,6 +170,26 @@ def draw_surface(rng: np.random.Generator, surface: str) -> dict[str, Any] | Non
         return {"pattern": str(rng.choice(["checker", "noise"])), "colors": colors, "repeats": repeats, "file": ""}
     file = str(rng.choice(textures_of(Path(surface))))
     return {"pattern": "image", "colors": [], "repeats": repeats, "file": file}
+
+
+def draw_back(rng: np.random.Generator, first: Cameras, hidden: str) -> dict[str, Any] | None:
+    """Draw the paint of what points away from the first camera, which does not see it (see `scene_script.paint_back`).
+
+    Returns:
+        The direction toward the camera, the least part of it that a painted face's normal points away, and the names
+        and colours of paints: the drawn one, then all others if `hidden` is `modes`. None if `hidden` is `none`.
+    """
+    if hidden == "none":
+        return None
+    drawn = str(rng.choice(list(PAINTS), p=[paint.chance for paint in PAINTS.values()]))
+    names = [drawn, *(name for name in PAINTS if name != drawn and hidden == "modes")]
+    distance = first.centers.norm().item()
+    return {
+        "toward": (first.centers / distance).tolist(),
+        "least": 1 / distance,
+        "modes": names,
+        "colors": [PAINTS[name].color for name in names],
+    }
 
 
 def textures_of(folder: Path) -> list[str]:

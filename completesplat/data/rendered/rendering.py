@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image
 from rich.progress import track
 
@@ -28,7 +29,7 @@ from completesplat.data.co3d.writing import (
     write_frame,
     write_points,
 )
-from completesplat.data.images.files import to_bytes
+from completesplat.data.images.files import save_jpeg, to_bytes
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
 from completesplat.data.rendered.drawing import RenderSettings, check_surroundings, draw_scene
 from completesplat.data.validation import MissingFile, UnreadableFile, read_points
@@ -186,7 +187,11 @@ def _write_object(
             result = run_job(program, job | {"folder": str(files.absolute())}, files, stopped)
             if "refused" in result:
                 raise BrokenMesh(result["refused"])
+            modes = job["hidden"]["modes"] if job["hidden"] else []
             record = {"source": asset.key, **result, **_write_sequence(folder, asset.name, files, cameras)}
+            record["hidden"] = (*modes, None)[0]
+            if settings["hidden"] == "modes":
+                _write_modes(folder, modes, files)
             (folder / OBJECT).write_text(json.dumps(record) + "\n")
             shutil.rmtree(files)
     except BrokenMesh as error:
@@ -202,7 +207,7 @@ def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Came
         (folder / kind).mkdir()
     frames, points, colors = list[Annotation](), [], []
     for number, camera in enumerate(cameras):
-        image = np.asarray(Image.open(files / f"{number:04d}.png").convert("RGB")) / 255.0
+        image = _pixels(files / f"{number:04d}.png")
         depth, seen, coverage = np.moveaxis(np.load(files / f"{number:04d}.npy"), -1, 0)
         depth[depth > SKY] = 0
         place = CATEGORY, name, number
@@ -216,6 +221,24 @@ def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Came
     cloud = np.concatenate(points)[::step]
     write_points(folder / "pointcloud.ply", cloud, np.concatenate(colors)[::step])
     return {"frames": frames, "sequence": sequence_annotation(CATEGORY, name, len(cloud))}
+
+
+def _write_modes(folder: Path, modes: Sequence[str], files: Path) -> None:
+    """Write the images with each paint of the back into a folder of its name."""
+    for index, mode in enumerate(modes):
+        (folder / mode).mkdir()
+        prefix = f"{index}_" if index else ""
+        for number, image in enumerate(sorted((folder / "images").iterdir())):
+            save_jpeg(_pixels(files / f"{prefix}{number:04d}.png"), in_mode(image, mode))
+
+
+def in_mode(image: Path, mode: str) -> Path:
+    """Return the path of an image with another paint of the back."""
+    return image.parent.parent / mode / image.name
+
+
+def _pixels(path: Path) -> Float[np.ndarray, "height width 3"]:
+    return np.asarray(Image.open(path).convert("RGB")) / 255.0
 
 
 def _viewpoint(camera: Cameras) -> dict[str, object]:

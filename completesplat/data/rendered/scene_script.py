@@ -2,7 +2,8 @@
 
 It imports nothing of this package, because Blender's Python does not have it. For every view it writes `NNNN.png`, the
 colours, and `NNNN.npy`, float32 [height width 3]: depth along the optical axis, 1 where the pixel's centre shows the
-object, and the object's coverage of the pixel. `result.json` has the object's place and scale, or why it is refused.
+object, and the object's coverage of the pixel. With paints for the back, `K_NNNN.png` has the colours with paint K, and
+`NNNN.png` those with paint 0. `result.json` has the object's place and scale, or why it is refused.
 """
 
 import json
@@ -104,9 +105,11 @@ def baked_objects() -> list[Any]:
     for part in objects:
         bpy.context.scene.collection.objects.link(part)
         part.pass_index = 1
-        if not any(part.data.materials):
-            part.data.materials.clear()
-            part.data.materials.append(colored_material(part.data.color_attributes))
+        materials = part.data.materials
+        if not materials:
+            materials.append(None)
+        for slot, material in enumerate(materials):
+            materials[slot] = material or colored_material(part.data.color_attributes)
     return objects
 
 
@@ -148,6 +151,40 @@ def normalize(objects: list[Any]) -> tuple[list[float], float, float]:
         part.data.validate()
         part.data.transform(Matrix.Scale(1 / radius, 4) @ Matrix.Translation((-center).tolist()))
     return center.tolist(), 1 / radius, float((points[:, 2].min() - center[2]) / radius)
+
+
+def paint_back(objects: list[Any], toward: list[float], least: float) -> Any:
+    """Paint all faces that point away from a camera; return the socket of the paint's colour.
+
+    These are the faces whose normal n has n . d < -`least`, for the direction d `toward` the camera. A camera at e sees
+    of both sides of a face at p the one with n . (e - p) > 0. In the unit ball this means n . d > -1 / |e|. So with
+    `least` = 1 / |e| the camera at e sees no paint. Nor does light: it is reflected as if there was no paint.
+    """
+    group = bpy.data.node_groups.new("back", "ShaderNodeTree")
+    for side in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Shader", in_out=side, socket_type="NodeSocketShader")
+    new, link = group.nodes.new, group.links.new
+    color, paint, mix = (new(f"ShaderNode{kind}") for kind in ("RGB", "BsdfDiffuse", "MixShader"))
+    facing, away, seen = new("ShaderNodeVectorMath"), new("ShaderNodeMath"), new("ShaderNodeMath")
+    facing.operation, away.operation, seen.operation = "DOT_PRODUCT", "LESS_THAN", "MULTIPLY"
+    facing.inputs[1].default_value, away.inputs[1].default_value = toward, -least
+    link(new("ShaderNodeNewGeometry").outputs["True Normal"], facing.inputs[0])
+    link(facing.outputs["Value"], away.inputs[0])
+    link(away.outputs[0], seen.inputs[0])
+    link(new("ShaderNodeLightPath").outputs["Is Camera Ray"], seen.inputs[1])
+    link(color.outputs[0], paint.inputs["Color"])
+    for socket, source in enumerate((seen, new("NodeGroupInput"), paint)):
+        link(source.outputs[0], mix.inputs[socket])
+    link(mix.outputs[0], new("NodeGroupOutput").inputs[0])
+    for material in {material for part in objects for material in part.data.materials}:
+        material.use_nodes = True
+        output = material.node_tree.get_output_node("CYCLES")
+        if output and output.inputs["Surface"].links:
+            node = material.node_tree.nodes.new("ShaderNodeGroup")
+            node.node_tree = group
+            material.node_tree.links.new(output.inputs["Surface"].links[0].from_socket, node.inputs[0])
+            material.node_tree.links.new(node.outputs[0], output.inputs["Surface"])
+    return color.outputs[0]
 
 
 def add_plane(corners: list[tuple[float, float, float]], surface: dict[str, Any]) -> Any:
@@ -256,6 +293,7 @@ def set_up_renderer(objects: list[Any]) -> None:
     scene.render.threads_mode, scene.render.threads = "FIXED", 1
     scene.render.use_persistent_data, scene.render.resolution_percentage = True, 100
     scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGB"
+    scene.view_settings.view_transform = "Standard"
     scene.cycles.use_adaptive_sampling = False
     scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = False
     scene.cycles.denoiser = "OPENIMAGEDENOISE"
@@ -289,25 +327,28 @@ def set_up_outputs(folder: Path) -> dict[str, Any]:
     return outputs
 
 
-def render(folder: Path, views: list[dict[str, Any]], samples: int) -> None:
-    """Render all views twice: colours and coverage, then geometry at the pixels' centres."""
+def render(folder: Path, views: list[dict[str, Any]], samples: int, paint: Any, colors: list[list[float]]) -> None:
+    """Render all views with every colour of the paint (`[]`: without), then geometry at the pixels' centres."""
     scene, starter = bpy.context.scene, os.getppid()
     outputs = set_up_outputs(folder)
-    for task in outputs:
-        colors = task == "coverage"
-        scene.cycles.samples, scene.cycles.use_denoising = samples if colors else 1, colors
-        scene.cycles.max_bounces = BOUNCES if colors else 0
-        scene.cycles.pixel_filter_type = "BLACKMAN_HARRIS" if colors else "GAUSSIAN"
-        scene.cycles.filter_width = 1.5 if colors else TINY_FILTER
+    further = [("", f"{index}_", color) for index, color in enumerate(colors) if index]
+    for task, prefix, color in [("coverage", "", (*colors, None)[0]), *further, ("geometry", "", None)]:
+        images = task != "geometry"
+        scene.cycles.samples, scene.cycles.use_denoising = samples if images else 1, images
+        scene.cycles.max_bounces = BOUNCES if images else 0
+        scene.cycles.pixel_filter_type = "BLACKMAN_HARRIS" if images else "GAUSSIAN"
+        scene.cycles.filter_width = 1.5 if images else TINY_FILTER
         for name, output in outputs.items():
             output.mute = name != task
+        if color:
+            paint.default_value = (*color, 1.0)
         for number, view in enumerate(views):
             if os.getppid() != starter:
                 sys.exit("the process that started this one has ended")
             set_camera(view)
             scene.frame_current, scene.cycles.seed = number, number
-            scene.render.filepath = str(folder / f"{number:04d}.png")
-            bpy.ops.render.render(write_still=colors)
+            scene.render.filepath = str(folder / f"{prefix}{number:04d}.png")
+            bpy.ops.render.render(write_still=images)
     for number in range(len(views)):
         geometry, coverage = (read_exr(folder / f"{name}_{number:04d}.exr") for name in ("geometry", "coverage"))
         np.save(folder / f"{number:04d}.npy", np.concatenate([geometry[..., :2], coverage[..., :1]], axis=-1))
@@ -342,9 +383,11 @@ def run(job: dict[str, Any]) -> dict[str, Any]:
     except RefusedMesh as reason:
         return {"refused": str(reason)}
     set_up_renderer(objects)
+    hidden = job["hidden"]
+    paint = paint_back(objects, hidden["toward"], hidden["least"]) if hidden else None
     add_surroundings(job, ground)
     add_light(job["light"])
-    render(Path(job["folder"]), job["views"], job["samples"])
+    render(Path(job["folder"]), job["views"], job["samples"], paint, hidden["colors"] if hidden else [])
     return {"center": center, "scale": scale}
 
 
