@@ -1,7 +1,7 @@
 """CO3D sequences as posed sequences: cropped, scaled to a common object size, with a depth range around the object."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -112,6 +112,14 @@ class CO3DSource(SequenceSource):
         self._members = members
         self._files = files
         self._sequences: dict[str, PosedSequence] = {}
+
+    def with_images(self, path_of: Callable[[Path], Path]) -> "CO3DSource":
+        """Return the same sequences with images of other paths."""
+        frames = {
+            name: [replace(frame, image=path_of(frame.image)) for frame in frames]
+            for name, frames in self._members.frames.items()
+        }
+        return CO3DSource(replace(self._members, frames=frames), self.framing, self._files, self.refused)
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the annotations, not of the images."""

@@ -155,7 +155,9 @@ class SceneDataModule(LightningDataModule):
         Raises:
             CompleteSplatError: the alternatives for what the reference image hides are not known.
         """
-        raise CompleteSplatError("evaluation=hidden_modes needs data whose hidden parts are known: toy objects")
+        raise CompleteSplatError(
+            "evaluation=hidden_modes needs data whose hidden parts are known: toy objects, or data render hidden=modes"
+        )
 
     def setup(self, stage: str | None = None) -> None:
         """List the sequences (images are read later).

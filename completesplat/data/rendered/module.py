@@ -1,8 +1,10 @@
 """Data module of rendered meshes."""
 
+from functools import partial
 from typing import Any
 
 from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.rendered.modes import RenderedHiddenModes
 from completesplat.data.rendered.rendering import CATEGORY
 
 
@@ -14,3 +16,8 @@ class RenderedDataModule(CO3DDataModule):
 
     def describe(self) -> dict[str, str | None]:
         return super().describe() | {"data_set": CATEGORY}
+
+    def hidden_modes(self, views: int, spread_views: int) -> RenderedHiddenModes:
+        """Return the test scenes with all paints of the back; see `RenderedHiddenModes`."""
+        choose = partial(self.evaluation_views, split="test")
+        return RenderedHiddenModes(self.root / CATEGORY, self.store("test"), choose, views, spread_views)

@@ -10,11 +10,10 @@ from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
-from completesplat.data.hidden_modes import HiddenModes
+from completesplat.data.hidden_modes import LEAK, HiddenModes, Shown, differ, spread_views, views_of_modes
 from completesplat.data.images.crop import cut_square, principal_square
 from completesplat.data.images.files import to_bytes
 from completesplat.data.loading.scenes import Choice, SceneStore, with_true_depths
-from completesplat.data.loading.view_selection import evaluation_views
 from completesplat.data.sequences import PosedSequence
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, render_frame
 from completesplat.data.toy.raytracing import WHITE, trace
@@ -51,16 +50,8 @@ def frame_camera(scene: ToyScene, frame: int, size: int) -> Cameras:
     return Cameras(invert_rigid(pose), pinhole(scene.fov_degrees, size).double(), (size, size))
 
 
-# A pixel belongs to the patch if a channel differs between two modes by more than this; blurred edges differ less.
-DIFFERENCE = 0.1
-# Largest difference of modes in the reference image, which rounding to bytes may cause.
-LEAK = 1.5 / 255
-# Smallest share of an image that the patch must cover.
-SMALLEST_PATCH = 0.005
 # Limit of the RMS difference between an image and its render: JPEG causes less, another patch colour more.
 SAME_IMAGE = 0.025
-
-Chosen = tuple[list[int], Float[Tensor, "mode view 3 size size"], Bool[Tensor, "view size size"]]
 
 
 @dataclass
@@ -97,7 +88,7 @@ class ToyHiddenModes:
         toy, sequence, reference = self._read(name)
         frames = sequence.frames
         behind, truths, region = self._from_behind(toy, name, frames, reference)
-        spread = self._spread(len(frames), reference)
+        spread = spread_views(len(frames), reference, self.spread_views)
         targets = sorted({*behind, *spread})
         scene = stack([with_true_depths(self.store.scene(sequence, reference, targets), sequence, reference, targets)])
         true_mode, views = list(PATCH_COLORS).index(toy.patch_color), tuple(map(targets.index, behind))
@@ -113,7 +104,7 @@ class ToyHiddenModes:
     def versions(self, index: int) -> SceneBatch:
         """See `HiddenModeScenes`."""
         toy, sequence, reference = self._read(self.store.names[index])
-        spread = self._spread(len(sequence.frames), reference)
+        spread = spread_views(len(sequence.frames), reference, self.spread_views)
         scene = self.store.scene(sequence, reference, spread)
         truths = torch.stack([self._truths(toy, sequence.frames[view]) for view in spread], dim=1)
         return stack([replace(scene, targets=replace(scene.targets, images=images)) for images in truths])
@@ -122,13 +113,9 @@ class ToyHiddenModes:
         """Return a scene (drawn again), its sequence on the disk, and the index of its reference view."""
         toy, sequence = self._drawn_again(name), self.store.source.read(name)
         reference, _ = self.choose(sequence)
-        if self._differs(self._truths(toy, sequence.frames[reference]), LEAK).any():
+        if differ(self._truths(toy, sequence.frames[reference]), LEAK).any():
             raise DataError("the reference view tells the patch's colour", sequence=name)
         return toy, sequence, reference
-
-    def _spread(self, frames: int, reference: int) -> list[int]:
-        others = [view for view in range(frames) if view != reference]
-        return [others[place - 1] for place in evaluation_views(frames, self.spread_views)[1]]
 
     def _drawn_again(self, name: str) -> ToyScene:
         number, _, family = name.partition("_")
@@ -152,25 +139,9 @@ class ToyHiddenModes:
         square = principal_square((self.size / 2, self.size / 2), (self.size, self.size))
         return cut_square(image, square, self.image_size).float() / 255
 
-    def _from_behind(self, scene: ToyScene, name: str, frames: tuple[int, ...], reference: int) -> Chosen:
-        """Select the most frontal views that show enough of the patch; return their truths and patch pixels, too."""
+    def _from_behind(self, scene: ToyScene, name: str, frames: tuple[int, ...], reference: int) -> Shown:
+        """Select the most frontal views of the patch."""
         toward = scene.camera_to_world[:, :3, 3] * np.array([1, 0, 1])
-        facing = toward @ scene.patch.facing / np.linalg.norm(toward, axis=-1)
-        chosen: list[int] = []
-        truths, regions = [], []
-        for view in sorted(range(len(frames)), key=lambda view: -facing[frames[view]]):
-            if len(chosen) == self.views or facing[frames[view]] <= 0:
-                break
-            images = self._truths(scene, frames[view])
-            region = self._differs(images, DIFFERENCE)
-            if view != reference and region.float().mean() >= SMALLEST_PATCH:
-                chosen.append(view)
-                truths.append(images)
-                regions.append(region)
-        if not chosen:
-            raise DataError("no view shows enough of the patch", sequence=name)
-        return chosen, torch.stack(truths, dim=1), torch.stack(regions)
-
-    @staticmethod
-    def _differs(truths: Float[Tensor, "mode 3 size size"], by: float) -> Bool[Tensor, "size size"]:
-        return ((truths.amax(0) - truths.amin(0)) > by).any(0)
+        facing = (toward @ scene.patch.facing / np.linalg.norm(toward, axis=-1))[list(frames)]
+        views = [view for view in np.argsort(-facing, kind="stable").tolist() if facing[view] > 0 and view != reference]
+        return views_of_modes(views, lambda view: self._truths(scene, frames[view]), self.views, name)

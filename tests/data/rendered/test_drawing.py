@@ -10,8 +10,8 @@ import torch
 from support import write_capture
 
 from completesplat.data.captures.transforms_json import read_cameras, read_transforms
-from completesplat.data.rendered.drawing import draw_cameras, draw_light, draw_surface, room_size
-from completesplat.errors import DataError
+from completesplat.data.rendered.drawing import PAINTS, draw_back, draw_cameras, draw_light, draw_surface, room_size
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.tensors import stack
 
@@ -28,7 +28,7 @@ def test_cameras_stand_level_above_the_ground_and_see_most_of_the_object(kind):
         assert (cameras.centers[:, 2] > 0).all()
         assert cameras.world_to_camera[:, 0, 2].abs().max() < 1e-9  # x is level
         assert (cameras.world_to_camera[:, 1, 2] < 0).all()  # y points down
-        pixels, depth = project(cameras, directions.double())
+        pixels, depth = project(cameras, 0.85 * directions.double())
         assert (depth > 0).all()
         assert ((pixels > 0) & (pixels < 64)).all(-1).double().mean() > 0.9
         focal = cameras.intrinsics[:, 0, 0]
@@ -103,3 +103,35 @@ def test_cameras_that_cannot_be_rendered_are_refused(tmp_path, change, message):
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(DataError, match=message):
         read_cameras(path, 32)
+
+
+@pytest.mark.parametrize("kind", ["turn", "hemisphere"])
+def test_the_first_camera_stands_before_the_front(kind, tmp_path):
+    rng, aside = np.random.default_rng(0), []
+    for _ in range(50):
+        x, y, _ = draw_cameras(rng, kind, 8, [40, 50], 64, 120.0)[0].centers.tolist()
+        aside.append(math.degrees(math.atan2(y, x)) - 120)
+    assert min(aside) == pytest.approx(-45, abs=8)
+    assert max(aside) == pytest.approx(45, abs=8)
+    assert all(-45 <= degrees <= 45 for degrees in aside)
+    with pytest.raises(CompleteSplatError, match="front=0: has no effect on the cameras of a file"):
+        draw_cameras(rng, str(tmp_path / "transforms.json"), 8, [40, 50], 64, 0)
+
+
+def test_paints_have_their_chances_and_no_face_of_the_unit_ball_that_the_first_camera_sees_has_one():
+    rng = np.random.default_rng(0)
+    first = draw_cameras(rng, "turn", 8, [40, 50], 64)[0]
+    assert draw_back(rng, first, "none") is None
+    backs = [draw_back(rng, first, "back") for _ in range(2000)]
+    drawn = [name for back in backs for name in back["modes"]]
+    for name, paint in PAINTS.items():
+        assert drawn.count(name) / 2000 == pytest.approx(paint.chance, abs=0.04)
+    assert set(draw_back(rng, first, "modes")["modes"]) == set(PAINTS)
+    assert [back["colors"] for back in backs] == [[PAINTS[back["modes"][0]].color] for back in backs]
+    generator = torch.Generator().manual_seed(0)
+    points, normals = torch.nn.functional.normalize(torch.randn(2, 100_000, 3, generator=generator).double(), dim=-1)
+    points *= torch.rand(100_000, 1, generator=generator)
+    away = normals @ torch.tensor(backs[0]["toward"]).double() < -backs[0]["least"]
+    seen = (normals * (first.centers - points)).sum(-1) > 0
+    assert not (away & seen).any()
+    assert (away | seen).double().mean() > 0.75  # most of what is not seen is painted

@@ -19,6 +19,7 @@ from support import SMALL, strict_json, waited_for
 from completesplat.data.co3d.annotations import read_frames
 from completesplat.data.images.files import read_depth
 from completesplat.data.rendered.blender import find_blender
+from completesplat.data.rendered.drawing import PAINTS
 from completesplat.data.rendered.module import RenderedDataModule
 from completesplat.data.rendered.rendering import render
 from completesplat.errors import CompleteSplatError
@@ -269,6 +270,27 @@ def test_an_environment_map_lights_object_and_sky(tmp_path):
         bright = pixels[pixels.max(axis=-1) > 60]
         assert len(bright) > 300
         assert (bright[:, 1] > 1.5 * bright[:, [0, 2]].max(axis=1)).mean() > 0.95
+
+
+def test_paint_of_the_back_changes_its_pixels_from_behind_and_none_from_the_front(tmp_path):
+    meshes.write_cube(tmp_path / "meshes/cube.obj")
+    settings = QUICK | {"views": 6, "floor": "plain", "front": 0.0}
+    folders = {}
+    for hidden in ("none", "back", "modes"):
+        category = render(str(tmp_path / "meshes"), out=tmp_path / hidden, **settings | {"hidden": hidden})
+        folders[hidden] = category / "cube.obj"
+    plain, back, modes = folders.values()
+    drawn = strict_json(modes / "object.json")["hidden"]
+    assert strict_json(plain / "object.json")["hidden"] is None
+    assert contents(back / "images") == contents(modes / "images") == contents(modes / drawn)
+    assert contents(back / "depths") == contents(modes / "depths") == contents(plain / "depths")
+    front = "frame000001.jpg"
+    assert {(modes / mode / front).read_bytes() for mode in PAINTS} == {(plain / "images" / front).read_bytes()}
+    images = [[np.asarray(Image.open(path)) / 255 for path in sorted((modes / mode).iterdir())] for mode in PAINTS]
+    differences = np.ptp(np.array(images), axis=0).max(axis=-1)
+    masks = np.array([np.asarray(Image.open(path)) for path in sorted((modes / "masks").iterdir())])
+    assert (differences[2:4] > 0.1).mean(axis=(1, 2)).min() > 0.05
+    assert (differences[masks == 0] < 0.1).all()  # neither floor nor sky
 
 
 def test_procedural_objects_of_infinigen_are_made_by_number(tmp_path):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from completesplat.data.toy.modes import DIFFERENCE, SAME_IMAGE, frame_camera, unseen
+from completesplat.data.hidden_modes import DIFFERENCE
+from completesplat.data.toy.modes import SAME_IMAGE, frame_camera, unseen
 from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS, draw_scene, render_frame
 from completesplat.errors import CompleteSplatError, DataError
