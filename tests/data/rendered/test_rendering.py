@@ -290,7 +290,7 @@ def test_paint_of_the_back_changes_its_pixels_from_behind_and_none_from_the_fron
     differences = np.ptp(np.array(images), axis=0).max(axis=-1)
     masks = np.array([np.asarray(Image.open(path)) for path in sorted((modes / "masks").iterdir())])
     assert (differences[2:4] > 0.1).mean(axis=(1, 2)).min() > 0.05
-    assert (differences[masks == 0] < 0.1).all()  # neither floor nor sky
+    assert (differences[masks == 0] > 0.1).mean() < 0.01  # neither floor nor sky, but for JPEG's edges
 
 
 def test_procedural_objects_of_infinigen_are_made_by_number(tmp_path):
