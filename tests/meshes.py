@@ -14,7 +14,7 @@ SQUARES = 4
 """Squares along an edge of the checker cube."""
 
 SETTINGS = {"cameras": "turn", "fov": [36, 55], "light": "random", "floor": "random", "wall": "none", "seed": 0}
-SETTINGS |= {"front": None, "hidden": "none", "factory": None, "count": 1, "max_megabytes": 500}
+SETTINGS |= {"front": None, "hidden": "none", "factory": None, "count": 1, "max_megabytes": 500, "max_minutes": 5}
 """Settings of renders, without views, size and samples."""
 
 CORNERS = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
@@ -47,6 +47,14 @@ def write_ply(path: Path, vertices: Sequence[Sequence[float]]) -> Path:
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex 3\n{properties}{faces}end_header\n"
     content = np.array(vertices, dtype="<f4").tobytes() + bytes([3]) + np.arange(3, dtype="<i4").tobytes()
     path.write_bytes(header.encode() + content)
+    return path
+
+
+def write_usd(path: Path, corner: str = "0 1 0") -> Path:
+    """Write a triangle as text; `corner` is its third vertex."""
+    points = f"point3f[] points = [(0, 0, 0), (1, 0, 0), ({corner.replace(' ', ', ')})]"
+    faces = "int[] faceVertexCounts = [3]\nint[] faceVertexIndices = [0, 1, 2]"
+    path.write_text(f'#usda 1.0\ndef Mesh "triangle"\n{{\n{points}\n{faces}\n}}\n')
     return path
 
 

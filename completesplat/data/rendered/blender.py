@@ -1,6 +1,7 @@
 """Blender as a separate program: where it is, whether it is new enough, and one job."""
 
 import json
+import math
 import os
 import re
 import shutil
@@ -70,13 +71,17 @@ def _output_of(*command: str) -> str:
     return done.stdout + done.stderr
 
 
-def run_job(blender: Blender, job: dict[str, Any], folder: Path, stopped: Event) -> dict[str, Any]:
+def run_job(
+    blender: Blender, job: dict[str, Any], folder: Path, stopped: Event, minutes: float = math.inf
+) -> dict[str, Any]:
     """Run `scene_script.py` with a job; return its result, or `refused` with the reason for which Blender failed.
 
     Args:
         folder: an existing folder for the job's files and Blender's messages.
         stopped: an event after which Blender is killed.
+        minutes: time after which Blender is killed.
     """
+    end = time.monotonic() + 60 * minutes
     path, messages = folder / "job.json", folder / "messages.txt"
     path.write_text(json.dumps(job))
     separator = () if PYTHON_OPTIONS[0] in blender.command else ("--",)
@@ -87,12 +92,14 @@ def run_job(blender: Blender, job: dict[str, Any], folder: Path, stopped: Event)
             command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, env=variables
         )
         while process.poll() is None:
-            if stopped.is_set():
+            if stopped.is_set() or time.monotonic() > end:
                 process.kill()
             time.sleep(SECONDS_BETWEEN_LOOKS)
     result = folder / "result.json"
     if process.returncode == 0 and result.is_file():
         return dict(json.loads(result.read_text()))
+    if time.monotonic() > end:
+        return {"refused": f"took longer than max_minutes={minutes:g}"}
     if process.returncode < 0:
         return {"refused": f"Blender ended by signal {-process.returncode} (a crash, or out of memory)"}
     last = (messages.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]

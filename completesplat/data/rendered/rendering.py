@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event
-from typing import Any, NamedTuple, Unpack
+from typing import Annotated, Any, NamedTuple, Unpack
 
 import numpy as np
 import torch
@@ -36,14 +36,14 @@ from completesplat.data.validation import MissingFile, UnreadableFile, read_poin
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import atomic_folder, folder_names, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
-from completesplat.settings.schema import Positive
+from completesplat.settings.schema import Positive, Range
 
 logger = logging.getLogger(__name__)
 
 CATEGORY = "rendered"
 DESCRIPTION, OBJECT, BROKEN = "rendered.json", "object.json", "broken.json"
 FORMAT_VERSION = 1
-SUFFIXES = ("glb", "gltf", "obj", "ply", "stl", "fbx", "usd", "usda", "usdc")
+SUFFIXES = ("glb", "gltf", "obj", "ply", "stl", "fbx", "usd", "usda", "usdc", "usdz")
 MOST_POINTS = 20_000
 SKY = 1e9  # Cycles has 1e10 where no surface is
 MEGABYTE = 1_000_000
@@ -97,6 +97,7 @@ def render(
     count: Positive,
     out: Path,
     max_megabytes: Positive,
+    max_minutes: Annotated[float, Range(0)],
     blender: str | None = None,
     workers: Positive | None = None,
     progress: bool = True,
@@ -110,6 +111,7 @@ def render(
     Args:
         meshes, factory: a folder of meshes, or a class of Infinigen, of which `count` objects are made.
         max_megabytes: largest size of a mesh's file.
+        max_minutes: longest time of an object.
         blender: see `find_blender`.
         workers: number of Blender's processes, each with one object and one thread (None: one for each core).
 
@@ -133,7 +135,7 @@ def render(
         with atomic_folder(category) as unfinished:
             (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
     waiting = [asset for asset in objects if not (category / asset.name).exists()]
-    write_one = partial(_write_object, category, program, settings, MEGABYTE * max_megabytes)
+    write_one = partial(_write_object, category, program, settings, (MEGABYTE * max_megabytes, max_minutes))
     results = track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting), disable=not progress)
     broken = {name: reason for name, reason in sorted(results) if reason}
     _write_lists(category, broken)
@@ -169,10 +171,10 @@ def _in_threads(
 
 
 def _write_object(
-    category: Path, program: Blender, settings: RenderSettings, most_bytes: int, asset: Asset, stopped: Event
+    category: Path, program: Blender, settings: RenderSettings, most: tuple[int, float], asset: Asset, stopped: Event
 ) -> tuple[str, str]:
     """Render an object into its folder, whole or not at all; return its name, and why it is left out (or "")."""
-    mesh = asset.mesh
+    mesh, (most_bytes, minutes) = asset.mesh, most
     if mesh is not None and (size := mesh.stat().st_size) > most_bytes:
         return asset.name, f"{size // MEGABYTE:,} MB, more than max_megabytes={most_bytes // MEGABYTE}"
     try:
@@ -184,7 +186,7 @@ def _write_object(
             files.mkdir()
             job, cameras = draw_scene(asset.key, settings)
             job |= {"factory": asset.factory} if mesh is None else {"mesh": str(mesh.absolute())}
-            result = run_job(program, job | {"folder": str(files.absolute())}, files, stopped)
+            result = run_job(program, job | {"folder": str(files.absolute())}, files, stopped, minutes)
             if "refused" in result:
                 raise BrokenMesh(result["refused"])
             modes = job["hidden"]["modes"] if job["hidden"] else []

@@ -26,10 +26,10 @@ IMPORTERS = {
     "ply": "wm.ply_import",
     "stl": "wm.stl_import",
     "fbx": "import_scene.fbx",
-    **dict.fromkeys(("usd", "usda", "usdc"), "wm.usd_import"),
+    **dict.fromkeys(USD := ("usd", "usda", "usdc", "usdz"), "wm.usd_import"),
 }
 # With these, an importer keeps vertices that are not finite, which it would otherwise move to the origin.
-AS_STORED = {"obj": {"validate_meshes": False}, "stl": {"use_mesh_validate": False}}
+AS_STORED = {"stl": {"use_mesh_validate": False}, **{kind: {"validate_meshes": False} for kind in ("obj", *USD)}}
 SENSOR = 36.0  # its width; the unit cancels out
 BOUNCES = 4
 OPEN_GROUND = 30.0  # half size of a floor without walls

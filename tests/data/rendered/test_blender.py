@@ -106,6 +106,12 @@ def test_a_blender_that_crashes_or_fails_leaves_meshes_out(into, program, tmp_pa
         assert [path.name for path in (tmp_path / "data/rendered").glob("*/")] == []
 
 
+def test_a_blender_that_hangs_leaves_its_mesh_out(into, program, tmp_path):
+    hanging = program(VERSION.format("4.2.0") + "exec sleep 60")
+    message = into(tmp_path / "data", hanging, max_minutes=0.01)
+    assert message.endswith("none of 1 objects can be rendered: took longer than max_minutes=0.01")
+
+
 def test_a_full_disk_is_no_reason_to_leave_meshes_out(line, program, tmp_path, monkeypatch):
     given = meshes.SETTINGS | {"views": 2, "size": 8, "samples": 1}
     given["blender"] = program(VERSION.format("4.2.0") + "echo cannot write; exit 1")
@@ -132,6 +138,7 @@ def test_bad_settings_are_refused_before_anything_is_written(line, program, tmp_
         "cameras=circle": "cameras=circle: choose turn, hemisphere or the path of a transforms.json",
         f"cameras={tmp_path / 'cameras.json'}": f"{tmp_path / 'cameras.json'}: 0 frames; at least 2 are rendered",
         "factory=SofaFactory": "give either meshes=FOLDER or factory=NAME",
+        "hidden=front": "hidden=front: ",
         "views=1": "views=1: must lie between 2 and 1000",
         "fov=[5]": "fov=[5]: must have 2 entries",
         "fov=[0,50]": "fov=[0, 50]: must lie between 5 and 120",

@@ -129,7 +129,7 @@ def test_place_and_scale_of_the_mesh_are_kept(cube):
 
 
 def reasons(tmp_path: Path) -> dict[str, str]:
-    """Write twelve meshes that cannot be rendered; return a part of each one's reason."""
+    """Write thirteen meshes that cannot be rendered; return a part of each one's reason."""
     folder = tmp_path / "meshes"
     folder.mkdir()
     for name in ("bad.glb", "bad.fbx", "bad.usd", "bad.ply", "bad.stl", "bad.obj"):
@@ -138,6 +138,7 @@ def reasons(tmp_path: Path) -> dict[str, str]:
     meshes.write_triangle(folder / "material.obj", vertices="mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\n")
     meshes.write_triangle(folder / "nan.obj", vertices="v 0 0 0\nv nan 0 0\nv 0 1 0\n")
     meshes.write_ply(folder / "nan.ply", [[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]])
+    meshes.write_usd(folder / "nan.usda", "0 nan 0")
     meshes.write_triangle(folder / "point.obj", vertices="v 1 1 1\nv 1 1 1\nv 1 1 1\n")
     with (folder / "huge.glb").open("wb") as file:
         file.truncate(2_000_000_000)
@@ -149,6 +150,7 @@ def reasons(tmp_path: Path) -> dict[str, str]:
         "texture.gltf": "its texture gone.png is missing",
         "material.obj": "its material file gone.mtl is missing",
         "nan.obj": "it has vertices that are not finite",
+        "nan.usda": "it has vertices that are not finite",
         "nan.ply": "it has vertices that are not finite",
         "point.obj": "all its vertices are in one place",
         "huge.glb": "2,000 MB, more than max_megabytes=500",
