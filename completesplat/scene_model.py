@@ -203,17 +203,6 @@ class SceneModel(nn.Module):
         """Whether parts of the images were hidden in training; False if the weights do not record it."""
         return bool(self.architecture.get("training", {}).get("box_masks", 0) > 0)
 
-    def distance(self, photograph: Photograph) -> float | None:
-        """Return a photo's distance from the training images in their standard deviations; None if it is unknown.
-
-        It is the root mean square over the `image_features`: about 1 for an image of the same kind.
-        """
-        training = self.architecture.get("training", {})
-        if not {"picture_mean", "picture_std"} <= training.keys():
-            return None
-        mean, std = (torch.tensor(training[name]) for name in ("picture_mean", "picture_std"))
-        return ((image_features(photograph.image) - mean) / std).square().mean().sqrt().item()
-
     def camera(self, photograph: Photograph) -> Cameras:
         """Return the camera that took a photo, at the origin of the world."""
         device = self.up.device
@@ -233,6 +222,18 @@ class SceneModel(nn.Module):
         write_bytes(folder / WEIGHTS_FILE, save(weights))  # safetensors' own files are readable by their owner alone
         write_text(folder / CONFIG_FILE, json.dumps(self.architecture, indent=2) + "\n")
         write_sums(folder)
+
+
+def distance_to_training(photograph: Photograph, architecture: Mapping[str, Any]) -> float | None:
+    """Return a photo's distance from the training images of weights, in standard deviations; None if it is unknown.
+
+    It is the root mean square over the `image_features`: about 1 for an image of the same kind.
+    """
+    training = architecture.get("training", {})
+    if not {"picture_mean", "picture_std"} <= training.keys():
+        return None
+    mean, std = (torch.tensor(training[name]) for name in ("picture_mean", "picture_std"))
+    return ((image_features(photograph.image) - mean) / std).square().mean().sqrt().item()
 
 
 def camera_tensors(camera: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -1,5 +1,6 @@
 """`completesplat predict`: complete scenes, each from one photo, or one scene from several photos."""
 
+import json
 import logging
 import math
 import os
@@ -29,14 +30,15 @@ from completesplat.files import folder_names, printable, safe_name
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.trajectories import PATHS
 from completesplat.rasterizers import Rasterizer
-from completesplat.scene_model import SceneModel
+from completesplat.scene_model import SceneModel, distance_to_training
 from completesplat.settings.checks import REMOVE
+from completesplat.weights import CONFIG_FILE, read_small, shipped
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5
 """Ratio of tan(fov / 2), photo to training, from which a warning is given."""
 UNLIKE = 2.0
-"""Distance from the training images (`SceneModel.distance`) from which a warning is given."""
+"""Distance from the training images (`distance_to_training`) from which a warning is given."""
 
 log = logging.getLogger(__name__)
 
@@ -231,13 +233,23 @@ def _predict(
 def remarks(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]:
     """Return warnings about a photo that is unlike the training images; its contents are compared only if `whole`."""
     warnings = [unusual_field_of_view(photograph, model.fov_degrees.item())]
-    distance = model.distance(photograph) if whole else None
+    distance = distance_to_training(photograph, model.architecture) if whole else None
     if distance is not None and distance > UNLIKE:
         warnings.append(
             f"colours, contrast or detail lie {distance:.1f} standard deviations from the training images'"
-            f" ({UNLIKE:g} is far): expect little of it in the scenes"
+            f" ({UNLIKE:g} is far): expect little of it in the scenes{nearer_weights(photograph, distance)}"
         )
     return [warning for warning in warnings if warning]
+
+
+def nearer_weights(photograph: Photograph, distance: float) -> str:
+    """Name the shipped weights whose training images are nearer to a photo; return "" if there are none."""
+    nearest = ""
+    for name, folder in shipped().items():
+        other = distance_to_training(photograph, json.loads(read_small(folder / CONFIG_FILE)))
+        if other is not None and other < distance:
+            nearest, distance = f"; weights={name} were trained on images that are nearer ({other:.1f})", other
+    return nearest
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:

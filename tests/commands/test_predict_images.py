@@ -1,5 +1,6 @@
 """Predictions of several images at once, file formats, videos, warnings and refusals."""
 
+import json
 import os
 import re
 import subprocess
@@ -157,6 +158,25 @@ def test_a_photo_unlike_the_training_images_gets_a_warning(tiny_weights, tmp_pat
     assert unlike.startswith("colours, contrast or detail lie 5.0 standard deviations from the training images'")
     assert len(remarks(red, model, whole=True)) == len(remarks(blue, model, whole=False)) == 1
     assert len(remarks(blue, model_with(tiny_weights), whole=True)) == 1  # nothing is known of the training
+
+
+def test_shipped_weights_that_are_nearer_to_a_photo_are_named(tiny_weights, tmp_path, monkeypatch):
+    model = model_with(tiny_weights, picture_mean=[1.0, 0, 0, 0, 0, 0, 0, 0], picture_std=[0.1] * 8)
+    folders = {}
+    for name, mean in (("reds", [0.9, 0, 0]), ("blues", [0, 0, 1.0]), ("greens", [0, 0.5, 0]), ("unknown", None)):
+        folders[name] = tmp_path / name
+        folders[name].mkdir()
+        training = {} if mean is None else {"picture_mean": mean + [0.0] * 5, "picture_std": [0.1] * 8}
+        (folders[name] / "config.json").write_text(json.dumps({"training": training}))
+    monkeypatch.setattr("completesplat.commands.predict.shipped", lambda: folders)
+    blue, red = (model.read(save(tmp_path / f"{color}.png", color)) for color in ("blue", "red"))
+    (unlike,) = remarks(blue, model, whole=True)
+    assert unlike.endswith("; weights=blues were trained on images that are nearer (0.0)")
+    assert remarks(red, model, whole=True) == []
+    monkeypatch.setattr("completesplat.commands.predict.shipped", lambda: {"reds": folders["reds"]})
+    assert remarks(blue, model, whole=True)[0].endswith(
+        "expect little of it in the scenes; weights=reds were trained on images that are nearer (4.8)"
+    )
 
 
 def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
