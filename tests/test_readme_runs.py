@@ -8,11 +8,15 @@ import subprocess
 import sys
 
 import co3d_trees
+import meshes
 import numpy as np
 import pytest
 from PIL import Image
 from support import LIMIT, SMALL, write_capture
 from written_commands import CARDS, DOCUMENTS, arguments_of, block_commands
+
+from completesplat.data.rendered.blender import find_blender
+from completesplat.errors import CompleteSplatError
 
 # Appended to make them short; everything else is as printed.
 BRIEF = {
@@ -30,12 +34,21 @@ BRIEF |= {
     f"fit experiment=toy_{of}_diffusion": [*BRIEF["fit"], "conditioning.channels=[8,8,16,16]"]
     for of in ("minis", "views")
 }
-# What they need cannot be made here: Blender (`test_rendering` has such commands), CO3D, eight GPUs, VGG16
+RENDERED = [*SMALL, "test=false", "callbacks.images=null"]
+BRIEF |= {
+    "data render": ["views=6", "size=32", "samples=1"],
+    "data prepare data=rendered": ["data.image_size=32", "workers=1"],
+    "plan experiment=rendered_var": ["data.image_size=32"],
+    "fit experiment=rendered_var": [*RENDERED, "data.batch_size=1", "data.targets=4"],
+    "fit experiment=rendered_diffusion": [*RENDERED, "data.batch_size=2", "conditioning.channels=[8,8,16,16]"],
+}
+NEED_BLENDER = ("RENDERS", "ASSET", "RUN40", "RUN41")
+# What they need cannot be made here: Infinigen (`test_rendering` has such commands), CO3D, eight GPUs, VGG16
 # (`test_sweeps` has these two sweeps with a random one), Splatter Image's published weights (`test_published` has
 # made-up ones), images that Python lines of a README write (`test_scene_files` runs them).
 NEEDS_MORE = (
     "IMAGES",
-    "RENDERS",
+    "SOFA",
     "SPLATS",
     "evaluation=co3d",
     "trainer.devices=8",
@@ -77,7 +90,7 @@ def named_in(command: str) -> set[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A photograph, a folder of three with their cameras, a capture, and CO3D's hydrants (in its layout)."""
+    """A photograph, a folder of three with their cameras, a capture, CO3D's hydrants in its layout, three meshes."""
     place = tmp_path_factory.mktemp("readme")
     rng = np.random.default_rng(0)
     Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)).save(place / "photo.jpg")
@@ -89,6 +102,8 @@ def folder(tmp_path_factory):
     write_capture(place, frames=6, names=("a.jpg", "b.jpg"))
     # Two cameras of a circle would face each other, and look at no one place.
     write_capture(place / "FOLDER", frames=3, names=("photo.jpg", "other.png"))
+    for name in "abc":
+        meshes.write_cube(place / f"MESHES/{name}.obj")
     return place
 
 
@@ -123,5 +138,10 @@ def test_the_command_does_what_it_is_printed_for(command, folder):
         pytest.skip("no Node.js here, which html needs")
     if "hydra/sweeper=optuna" in command:
         pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="hydra-optuna-sweeper is not installed")
+    if any(word in command for word in NEED_BLENDER):
+        try:
+            find_blender()
+        except CompleteSplatError as reason:
+            pytest.skip(str(reason))
     finished = run(command, folder)
     assert finished.returncode == 0, finished.stderr[-3000:]
