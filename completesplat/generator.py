@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.autoreconstructor.model import VariationalAutoReconstructor
+from completesplat.autoreconstructor.encoder import Images
+from completesplat.autoreconstructor.model import DepthRange, VariationalAutoReconstructor
 from completesplat.baselines.splatter_image.files import is_published
 from completesplat.baselines.splatter_image.model import PublishedOneAnswer
 from completesplat.diffusion.guidance import allowed_skip_weight
@@ -24,7 +25,7 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.opening import locate, read_saved
 from completesplat.opening.parts import PartConfig, build, check_architecture, untrained
 from completesplat.scene import Views
-from completesplat.scene_model import SceneModel, camera_tensors
+from completesplat.scene_model import SceneModel, Visible, camera_tensors
 from completesplat.settings.schema import Natural, Positive, Seed
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import concatenate
@@ -87,10 +88,7 @@ class CompleteSplat(SceneModel):
 
     @torch.no_grad()
     def encode(
-        self,
-        images: Float[Tensor, "batch 3 height width"],
-        views: Views | None = None,
-        depth_range: Float[Tensor, "batch 2"] | None = None,
+        self, images: Images, views: Views | None = None, depth_range: DepthRange | None = None
     ) -> Float[Tensor, "batch channel _ _"]:
         """Draw each scene's standardised latent from the frozen posterior ("we also sample latent codes", supplement).
 
@@ -110,15 +108,15 @@ class CompleteSplat(SceneModel):
     @torch.no_grad()
     def generate(  # type: ignore[override]
         self,
-        images: Float[Tensor, "batch 3 height width"],
+        images: Images,
         cameras: Cameras,
-        depth_range: Float[Tensor, "batch 2"],
+        depth_range: DepthRange,
         samples: Positive = 1,
         skip_weight: float | None = None,
         guidance_weight: float = 0.0,
         steps: int | None = None,
         seed: Seed | Sequence[Seed] = 0,
-        visible: Float[Tensor, "batch 1 height width"] | None = None,
+        visible: Visible | None = None,
         color_fits: Natural = 0,
         batch: Positive | None = None,
         on_step: Callable[[int, int, Gaussians], None] | None = None,

@@ -41,11 +41,6 @@ class SceneBatch(TensorDataclass):
     names: str | tuple[str, ...]
     seen: "SceneBatch | None" = None
 
-    def __getitem__(self, index: int | slice) -> "SceneBatch":
-        """Select one scene of a batch, or several."""
-        seen = None if self.seen is None else self.seen[index]
-        return replace(super().__getitem__(index), names=self.names[index], seen=seen)
-
     def all_views(self) -> Views:
         """Join reference and targets along one view axis, the reference first: [batch 1+view ...]."""
         axis = self.depth_range.ndim - 1
@@ -69,10 +64,6 @@ class CachedScene(TensorDataclass):
     condition: Float[Tensor, "*batch _ _ _"]
     reference_frame: Int64[Tensor, "*batch"]
     names: str | tuple[str, ...]
-
-    def __getitem__(self, index: int | slice) -> "CachedScene":
-        """Select one scene of a batch, or several."""
-        return replace(super().__getitem__(index), names=self.names[index])
 
 
 Batch = SceneBatch | CachedScene

@@ -11,7 +11,8 @@ from jaxtyping import Float
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
+from completesplat.autoreconstructor.encoder import Images
+from completesplat.autoreconstructor.model import DepthRange, Reconstruction, ReconstructionModel
 from completesplat.data.images.photograph import ImageLike, Photograph, image_features, read_photograph
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import make_folder, write_bytes, write_text
@@ -25,6 +26,8 @@ from completesplat.splatter_image import Parameterization
 from completesplat.tensors import concatenate
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
 
+Visible = Float[Tensor, "batch 1 height width"]
+"""Masks that are 0 where an image is hidden, and 1 elsewhere."""
 _rasterizer = cache(auto)
 
 
@@ -66,12 +69,12 @@ class SceneModel(nn.Module):
     @torch.no_grad()
     def generate(
         self,
-        images: Float[Tensor, "batch 3 height width"],
+        images: Images,
         cameras: Cameras,
-        depth_range: Float[Tensor, "batch 2"],
+        depth_range: DepthRange,
         *,
         samples: int = 1,
-        visible: Float[Tensor, "batch 1 height width"] | None = None,
+        visible: Visible | None = None,
         color_fits: Natural = 0,
         **settings: object,
     ) -> Gaussians:
@@ -96,12 +99,7 @@ class SceneModel(nn.Module):
         return self.fitted(plain, images, cameras, visible, color_fits)
 
     def fitted(
-        self,
-        scenes: Gaussians,
-        images: Float[Tensor, "batch 3 height width"],
-        cameras: Cameras,
-        visible: Float[Tensor, "batch 1 height width"] | None,
-        color_fits: int,
+        self, scenes: Gaussians, images: Images, cameras: Cameras, visible: Visible | None, color_fits: int
     ) -> Gaussians:
         """Return scenes [batch * samples] with colours fitted to what is visible of their images."""
         if not color_fits:

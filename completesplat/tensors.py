@@ -50,8 +50,13 @@ class TensorDataclass:
         return self.map(torch.Tensor.detach)
 
     def __getitem__(self: T, index: Any) -> T:
-        """Index the leading batch axes of every tensor alike."""
-        return self.map(lambda tensor: tensor[index])
+        """Index the leading batch axes of every tensor alike, and texts (such as names) that `stack` has collected."""
+
+        def select(value: Any) -> object:
+            texts = isinstance(value, tuple) and all(isinstance(part, str) for part in value)
+            return value[index] if texts or isinstance(value, Tensor | TensorDataclass) else value
+
+        return replace(self, **{field.name: select(getattr(self, field.name)) for field in fields(self)})
 
 
 def stack(items: Sequence[T]) -> T:

@@ -15,6 +15,9 @@ from completesplat.data.images.files import image_bytes
 from completesplat.files import write_bytes
 from completesplat.rasterizers import Rendering
 
+Maps = Float[Tensor, "*batch 1 height width"]
+Colors = Float[Tensor, "*batch 3 height width"]
+
 READABLE_SIDE = 144
 GAP, LINE, MARGIN = 6, 20, 12
 INK, PAPER = "black", "white"
@@ -30,7 +33,7 @@ STOPS = [
 ]
 
 
-def to_bytes(images: Float[Tensor, "*batch 3 height width"]) -> UInt8[np.ndarray, "*batch height width 3"]:
+def to_bytes(images: Colors) -> UInt8[np.ndarray, "*batch height width 3"]:
     """Convert images (sRGB, clamped to [0, 1]) to bytes with the channels last.
 
     Raises:
@@ -108,14 +111,12 @@ def image_sheet(
     return sheet
 
 
-def surface_depth(rendering: Rendering) -> Float[Tensor, "*batch 1 height width"]:
+def surface_depth(rendering: Rendering) -> Maps:
     """Return the expected depth of pixels that are more than half opaque, and 0 elsewhere (no surface)."""
     return torch.where(rendering.alpha > OPAQUE, rendering.expected_depth(), 0)
 
 
-def color_depth(
-    depth: Float[Tensor, "*batch 1 height width"],
-) -> tuple[Float[Tensor, "*batch 3 height width"], tuple[float, float]]:
+def color_depth(depth: Maps) -> tuple[Colors, tuple[float, float]]:
     """Colour depths linearly in inverse depth, near bright and far dark, on one scale for all images.
 
     The scale ignores the nearest and the farthest 2 % of the pixels, so that stray Gaussians do not compress the rest.
@@ -136,7 +137,7 @@ def color_depth(
     return torch.where(seen, colors, NOTHING), (near.item(), far.item())
 
 
-def ramp(values: Float[Tensor, "*batch 1 height width"]) -> Float[Tensor, "*batch 3 height width"]:
+def ramp(values: Maps) -> Colors:
     """Return colours for values from 0 (dark) to 1 (bright); clamp other values."""
     position = values.clamp(0, 1) * (len(STOPS) - 1)
     stops = torch.tensor(STOPS, dtype=values.dtype, device=values.device)
@@ -146,7 +147,7 @@ def ramp(values: Float[Tensor, "*batch 1 height width"]) -> Float[Tensor, "*batc
     return torch.lerp(stops[index], stops[index + 1], mix).movedim(-1, -3)
 
 
-def color_normals(normals: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 3 height width"]:
+def color_normals(normals: Colors) -> Colors:
     """Return (n + 1) / 2 of unit normals in the camera's frame, with the axes of normal maps: right, up, to the viewer.
 
     Surfaces that face the camera are light blue (0.5, 0.5, 1), those that face right red, those that face up green. In

@@ -16,6 +16,7 @@ from completesplat.rasterizers import Rasterizer
 SMALLEST_SIDE = 256
 CHUNK = 8  # views that are rendered at a time
 Frames = Float[Tensor, "frame 3 height width"]
+Depths = Float[Tensor, "frame 1 height width"]
 
 
 def orbit_views(
@@ -26,7 +27,7 @@ def orbit_views(
     frames: int,
     background: float,
     up: Float[Tensor, "3"],
-) -> tuple[Frames, Float[Tensor, "frame 1 height width"]]:
+) -> tuple[Frames, Depths]:
     """Call `render_views` for a full turn around the upward axis through the pivot, from the reference camera on."""
     return render_views(rasterizer, gaussians, orbit(reference, pivot, up, frames), background)
 
@@ -34,7 +35,7 @@ def orbit_views(
 @torch.no_grad()
 def render_views(
     rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras, background: float
-) -> tuple[Frames, Float[Tensor, "frame 1 height width"]]:
+) -> tuple[Frames, Depths]:
     """Return images of one unbatched scene from several cameras, and expected depths (0 where nothing is seen)."""
     images, depths = [], []
     for start in range(0, len(cameras.world_to_camera), CHUNK):

@@ -6,10 +6,11 @@ from torch import Tensor
 
 from completesplat.geometry.cameras import Cameras, pixel_centers, pixel_rays, project, unproject
 
+DepthMaps = Float[Tensor, "*batch 1 height width"]
+VectorMaps = Float[Tensor, "*batch 3 height width"]
 
-def normals_from_depth(
-    depth: Float[Tensor, "*batch 1 height width"], cameras: Cameras
-) -> Float[Tensor, "*batch 3 height width"]:
+
+def normals_from_depth(depth: DepthMaps, cameras: Cameras) -> VectorMaps:
     """Return unit normals in the camera's frame (+x right, +y down, +z forward) that face the camera.
 
     A pixel's normal is orthogonal to two lines: through the points of its left and right neighbours, and through those
@@ -31,9 +32,7 @@ def normals_from_depth(
     return torch.where(known, normals, 0)
 
 
-def _difference(
-    points: Float[Tensor, "*batch 3 height width"], known: Bool[Tensor, "*batch 1 height width"], axis: int
-) -> Float[Tensor, "*batch 3 height width"]:
+def _difference(points: VectorMaps, known: Bool[Tensor, "*batch 1 height width"], axis: int) -> VectorMaps:
     """Subtract the point before from the next one; the point itself replaces a missing one."""
     indices = torch.arange(points.shape[axis], device=points.device)
     before, following = (

@@ -21,6 +21,8 @@ SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 SMALLEST_NORM = 1e-10
 RGB = tuple[float, float, float]
+Images = Float[Tensor, "image 3 height width"]
+Head = Float[Tensor, "1 _ 1 1"]
 
 
 class Activations(nn.Module):
@@ -30,7 +32,7 @@ class Activations(nn.Module):
         super().__init__()
         self.features, self.ends = nn.Sequential(*layers), ends
 
-    def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _ _ _"]]:
+    def forward(self, images: Images) -> list[Float[Tensor, "image _ _ _"]]:
         outputs = []
         for number, layer in enumerate(self.features, 1):
             images = layer(images)
@@ -94,9 +96,7 @@ class PerceptualDistance(nn.Module):
     shift: Tensor
     scale: Tensor
 
-    def __init__(
-        self, features: Activations, heads: list[Float[Tensor, "1 _ 1 1"]], shift: RGB = SHIFT, scale: RGB = SCALE
-    ) -> None:
+    def __init__(self, features: Activations, heads: list[Head], shift: RGB = SHIFT, scale: RGB = SCALE) -> None:
         super().__init__()
         self.features = features
         self.heads = nn.ParameterList(heads)
@@ -104,9 +104,7 @@ class PerceptualDistance(nn.Module):
         self.register_buffer("scale", torch.tensor(scale).view(3, 1, 1))
         self.requires_grad_(False)
 
-    def forward(
-        self, first: Float[Tensor, "image 3 height width"], second: Float[Tensor, "image 3 height width"]
-    ) -> Float[Tensor, " image"]:
+    def forward(self, first: Images, second: Images) -> Float[Tensor, " image"]:
         """Return the distance of each pair of sRGB images with values in [0, 1] and sides of at least 16 pixels."""
         # Weights moved to a device in inference mode (validation before the first step) could not be used in training.
         if self.shift.device != first.device:
@@ -116,7 +114,7 @@ class PerceptualDistance(nn.Module):
         maps = [nn.functional.conv2d((left - right).square(), head) for head, left, right in layers]
         return torch.stack([differences.mean((1, 2, 3)) for differences in maps]).sum(0)
 
-    def directions(self, images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _ _ _"]]:
+    def directions(self, images: Images) -> list[Float[Tensor, "image _ _ _"]]:
         """Return each layer's activations with unit length over the channels; zero where no channel is active."""
         activations = self.features((2 * images - 1 - self.shift) / self.scale)
         # Where all channels are zero, the gradient of this norm is zero; that of a square root of a sum is not finite.
@@ -124,7 +122,7 @@ class PerceptualDistance(nn.Module):
         return [layer / (norm + SMALLEST_NORM) for layer, norm in zip(activations, norms, strict=True)]
 
 
-def load_heads() -> list[Float[Tensor, "1 _ 1 1"]]:
+def load_heads() -> list[Head]:
     """Load the weights of version 0.1 for VGG, which torchmetrics ships."""
     resource = files("torchmetrics.functional.image") / "lpips_models" / "vgg.pth"
     with as_file(resource) as path:

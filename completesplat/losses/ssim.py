@@ -11,10 +11,10 @@ from torch import Tensor
 RADIUS, SIGMA, C1, C2 = 5, 1.5, 0.01**2, 0.03**2
 VALUES_AT_ONCE = 2**17  # on a CPU, so that intermediate results stay in its cache
 
+Images = Float[Tensor, "image channel height width"]
 
-def structural_similarity(
-    first: Float[Tensor, "image channel height width"], second: Float[Tensor, "image channel height width"]
-) -> Float[Tensor, "image channel height width"]:
+
+def structural_similarity(first: Images, second: Images) -> Images:
     """Return the SSIM of each pixel (Wang et al. 2004), for values in [0, 1], in the images' precision.
 
     The Gaussian window is applied as two products with banded matrices, which are three to five times as fast as

@@ -21,6 +21,8 @@ DOWNLOAD_ADVICE = f"fetch Inception with `curl -LO {URL}` and give it as evaluat
 
 Settings = Mapping[str, str | int]
 Descriptors = Float[Tensor, "image feature"]
+FirstSet = Float[Tensor, "first feature"]
+SecondSet = Float[Tensor, "second feature"]  # of another number of images
 
 
 @runtime_checkable
@@ -124,7 +126,7 @@ def load_inception(weights: str = URL, sha256: str | None = SHA256, subset_size:
     return Inception(network, subset_size)
 
 
-def frechet_distance(first: Float[Tensor, "first feature"], second: Float[Tensor, "second feature"]) -> float:
+def frechet_distance(first: FirstSet, second: SecondSet) -> float:
     """Return the squared Frechet distance of normal distributions fitted to two sets (Heusel et al. 2017, Eq. 6).
 
     It is computed in float64 and needs far more items than features. Values for sets of different sizes do not compare.
@@ -141,11 +143,7 @@ def frechet_distance(first: Float[Tensor, "first feature"], second: Float[Tensor
 
 
 def kernel_distance(
-    first: Float[Tensor, "first feature"],
-    second: Float[Tensor, "second feature"],
-    subset_size: int = 1000,
-    subsets: int = 100,
-    seed: int = 0,
+    first: FirstSet, second: SecondSet, subset_size: int = 1000, subsets: int = 100, seed: int = 0
 ) -> float:
     """Return the squared maximum mean discrepancy, unbiased, so at times below 0 (Binkowski et al. 2018, Section 4).
 

@@ -12,6 +12,7 @@ from completesplat.tensors import stack
 
 # In px and px^2. Products of two such numbers are still finite in float32.
 LARGEST_PROJECTION = 1e15
+Alphas = Float[Tensor, "gaussian pixel"]
 PAIRS_AT_ONCE = 2**20  # Gaussian-pixel pairs; intermediate results of a few MB each stay in the cache
 
 
@@ -100,7 +101,7 @@ def _clamp_slope(slope: Tensor, focal: Tensor, principal: Tensor, extent: int, m
 def alphas_at(
     pixels: Float[Tensor, "pixel 2"], centers: Float[Tensor, "gaussian 2"],
     covariances: Float[Tensor, "gaussian 2 2"], opacities: Float[Tensor, " gaussian"], constants: RenderingConstants,
-) -> Float[Tensor, "gaussian pixel"]:  # fmt: skip
+) -> Alphas:  # fmt: skip
     """Return min(max_alpha, opacity * exp(-d^T Sigma^-1 d / 2)) for every pair, zero below min_alpha."""
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     # The determinant of M + blur * 1 is at least blur * (trace of M + blur) for a covariance M; the difference of
@@ -113,9 +114,7 @@ def alphas_at(
     return torch.where((alpha >= constants.min_alpha) & (sigma >= 0), alpha, torch.zeros_like(alpha))
 
 
-def composite(
-    alphas: Float[Tensor, "gaussian pixel"], constants: RenderingConstants
-) -> Float[Tensor, "gaussian pixel"]:
+def composite(alphas: Alphas, constants: RenderingConstants) -> Alphas:
     """Return the weights alpha_i * prod_{j<i} (1 - alpha_j), front to back, until the transmittance is used up.
 
     The Gaussian that would bring it to min_transmittance or below has weight 0, as has every one behind it.

@@ -22,6 +22,7 @@ from completesplat.errors import DataError
 from completesplat.export.images import INK, MARGIN, PAPER, SheetCell, image_sheet, write_png
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, project, transform_points, unproject
 
+Points = Float[Tensor, "_ 3"]
 CELL = 216
 GREY, MASK = (190, 190, 190), (255, 220, 0)
 LEGEND = """Images: a cross marks one point of each scene and must stay at it in all frames;
@@ -166,17 +167,12 @@ def drawings(sequence: PosedSequence, cross: Cross, side: int) -> dict[str, UInt
 
 
 def _line(
-    panel: Axes,
-    plane: Float[Tensor, "2 3"],
-    points: Float[Tensor, "_ 3"],
-    color: str | Sequence[float],
-    width: float,
-    marker: str = "",
+    panel: Axes, plane: Tensor, points: Points, color: str | Sequence[float], width: float, marker: str = ""
 ) -> None:
     panel.plot(*(plane @ points.mT).cpu(), color=color, linewidth=width, marker=marker)
 
 
-def _extent(points: Float[Tensor, "_ 3"]) -> float:
+def _extent(points: Points) -> float:
     extent: float = (points.amax(dim=0) - points.amin(dim=0)).max().item()
     return extent
 

@@ -6,15 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.export.images import (
-    NOTHING,
-    SheetCell,
-    color_depth,
-    color_normals,
-    ramp,
-    strip,
-    surface_depth,
-)
+from completesplat.export.images import NOTHING, SheetCell, color_depth, color_normals, ramp, strip, surface_depth
 from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.scene import SceneBatch
 from completesplat.studies.controls import Row, Settings, Tick, over_settings

@@ -168,9 +168,7 @@ class Measured:
         return rows
 
 
-def in_region(
-    images: Float[Tensor, "_ view 3 height width"], region: Bool[Tensor, "view height width"]
-) -> Float[Tensor, "_ pixel 3"]:
+def in_region(images: Renders, region: Bool[Tensor, "view height width"]) -> Float[Tensor, "sample pixel 3"]:
     """Return the region's pixels of all views in one row."""
     return images.movedim(2, -1)[:, region]
 

@@ -43,7 +43,8 @@ class CheckpointFiles(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: object = None
     ) -> None:
         """Replace the file at this path; if the disk refuses, raise DiskError and keep the old file."""
-        with _replaced(Path(path), bytes_of(checkpoint)) as unfinished:
+        size = sum(leaf.nbytes for leaf in tree_leaves(checkpoint) if isinstance(leaf, Tensor))
+        with _replaced(Path(path), size) as unfinished:
             torch.save(checkpoint, unfinished)
             _add_checksum(unfinished)
 
@@ -183,11 +184,6 @@ def link(source: Path, target: Path) -> None:
 def _replaced(path: Path, size: int = 0) -> AbstractContextManager[Path]:
     """Write a file atomically; its unfinished file has a fixed name, so that repeated kills leave one at most."""
     return atomic_path(path, f".{path.name}.unfinished", size)
-
-
-def bytes_of(contents: object) -> int:
-    """Return the bytes of all tensors in nested containers, the least size of a file that holds them."""
-    return sum(leaf.nbytes for leaf in tree_leaves(contents) if isinstance(leaf, Tensor))
 
 
 def _add_checksum(path: Path) -> None:

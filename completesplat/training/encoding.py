@@ -267,15 +267,9 @@ def _origin(
 ) -> Origin:
     if conditioning is not None and not conditioning.frozen:
         raise CompleteSplatError("a conditioning that is trained needs images, not features: leave conditioning out")
-    return Origin(
-        *fingerprints(autoreconstructor, conditioning),
-        data.source("train").fingerprint(),
-        data.packed_settings(),
-        data.image_size,
-        frames,
-        views,
-        precision,
-    )
+    encoder, features = fingerprints(autoreconstructor, conditioning)
+    fingerprint, settings = data.source("train").fingerprint(), data.packed_settings()
+    return Origin(encoder, features, fingerprint, settings, data.image_size, frames, views, precision)
 
 
 def _refuse_not_finite(rows: Rows, references: Sequence[Reference]) -> None:

@@ -31,6 +31,7 @@ from completesplat.settings.schema import Range
 # farthest point determines the scale of the scene.
 FARTHEST = 5.0
 FEWEST_HELD_OUT = 2
+Members = Callable[[int], list[int]]
 
 
 def members(hold_out: int, held_out: bool, frames: int) -> list[int]:
@@ -69,11 +70,7 @@ class CaptureSource(SequenceSource):
     """
 
     def __init__(
-        self,
-        captures: Mapping[str, Capture],
-        members: Callable[[int], list[int]],
-        framing: ObjectFraming,
-        refused: list[DataError],
+        self, captures: Mapping[str, Capture], members: Members, framing: ObjectFraming, refused: list[DataError]
     ) -> None:
         self.names = sorted(captures)
         self.refused = refused

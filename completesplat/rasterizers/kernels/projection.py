@@ -97,22 +97,19 @@ def clamp(value, low, high):
 
 
 @helper
+def combine(x, a, y, b):
+    """Return x a + y b for 3-vectors a, b."""
+    return x * a[0] + y * b[0], x * a[1] + y * b[1], x * a[2] + y * b[2]
+
+
+@helper
 def image_jacobian(camera, rotation, slope_x, slope_y, inverse_z):
     """Return the rows of J W (EWA splatting, Eq. 29): d(pixel) / d(world point), at the clamped slopes x/z and y/z."""
     x_scale, y_scale = camera[layout.FOCAL_X] * inverse_z, camera[layout.FOCAL_Y] * inverse_z
     x_depth = x_scale * clamp(slope_x, camera[layout.MIN_SLOPE_X], camera[layout.MAX_SLOPE_X])
     y_depth = y_scale * clamp(slope_y, camera[layout.MIN_SLOPE_Y], camera[layout.MAX_SLOPE_Y])
-    row_x = (
-        x_scale * rotation[0] - x_depth * rotation[6],
-        x_scale * rotation[1] - x_depth * rotation[7],
-        x_scale * rotation[2] - x_depth * rotation[8],
-    )
-    row_y = (
-        y_scale * rotation[3] - y_depth * rotation[6],
-        y_scale * rotation[4] - y_depth * rotation[7],
-        y_scale * rotation[5] - y_depth * rotation[8],
-    )
-    return row_x, row_y
+    row_x = combine(x_scale, rotation[:3], -x_depth, rotation[6:])
+    return row_x, combine(y_scale, rotation[3:6], -y_depth, rotation[6:])
 
 
 @helper
@@ -160,12 +157,6 @@ def outer(a, b):
         a[1] * b[0], a[1] * b[1], a[1] * b[2],
         a[2] * b[0], a[2] * b[1], a[2] * b[2],
     )  # fmt: skip
-
-
-@helper
-def combine(x, a, y, b):
-    """Return x a + y b for 3-vectors a, b."""
-    return x * a[0] + y * b[0], x * a[1] + y * b[1], x * a[2] + y * b[2]
 
 
 @helper
