@@ -100,8 +100,8 @@ def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, l
 
 
 def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Listed:
-    """Split at least three sequences by seed, each as a whole."""
-    if len(frames) < 3:
+    """Split at least three sequences by seed, each as a whole; a `test_fraction` of 1 tests all, however many."""
+    if len(frames) < 3 and rule.test_fraction < 1:
         raise DataError(f"{len(frames)} sequences cannot be split into train, val and test; write a set list")
     rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.split_seed)
     # The hashes of the remaining names lie above the test fraction; validation gets the next interval.
