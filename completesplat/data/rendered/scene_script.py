@@ -63,7 +63,8 @@ def find_factory(name: str) -> Any:
     try:
         import infinigen.assets.objects as kinds
     except ImportError as error:
-        raise RefusedMesh(f"Blender's Python lacks Infinigen ({error}); pip install infinigen there") from None
+        advice = "how to install it: completesplat data render --help"
+        raise RefusedMesh(f"Blender's Python lacks Infinigen ({error}); {advice}") from None
     packages = sorted(Path(kinds.__path__[0]).glob("*/__init__.py"))
     named = [path.parent.name for path in packages if re.search(rf"\b{name}\b", path.read_text())]
     if not named:
