@@ -65,10 +65,10 @@ test-processes: $(READY) ## The tests that start processes and servers, send sig
 test-slow: $(READY) ## The tests that take minutes each
 	$(BIN)/python -m pytest -q -m slow
 
-test-wheel: $(READY) ## The wheel in a new environment: a prediction, a sweep and a page from an empty folder
+test-wheel: $(READY) ## The wheel in a new environment: a prediction, a sweep and its tables from an empty folder
 	$(BIN)/python -m pytest -q -m slow tests/test_wheel.py
 
-test-browser: $(READY) ## Viewer and report page in Chromium (apt-get install chromium); skipped where it is missing
+test-browser: $(READY) ## Viewer in Chromium (apt-get install chromium); skipped where it is missing
 	$(BIN)/python -m pytest -q -m browser -rs
 
 # What hypothesis finds is kept in .hypothesis/ and tried first the next time.

@@ -53,7 +53,7 @@ def steps(out: Path, small: bool) -> Iterator[Step]:
     yield verb("data", "data", "toy", "kind=objects", "size=128", f"scenes={20 if small else 1000}", out=out)
     for size in (32, 48) if small else (64, 128):
         yield from training(out, size, small)
-    yield verb("report", "report", "html", f"runs={out}", out=out)
+    yield verb("report", "report", f"runs={out}", out=out)
 
 
 def training(out: Path, size: int, small: bool) -> Iterator[Step]:

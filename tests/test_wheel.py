@@ -37,7 +37,7 @@ def test_the_wheel_has_the_package_its_settings_and_weights_and_no_link_that_lea
     assert "*A toy scene" not in description
 
 
-def test_the_installed_wheel_predicts_sweeps_and_writes_a_page_from_an_empty_folder(installed, toy_root, tmp_path):
+def test_the_installed_wheel_predicts_sweeps_and_writes_tables_from_an_empty_folder(installed, toy_root, tmp_path):
     run = partial(installed.run, tmp_path, "completesplat")
     place = installed.run(tmp_path, "python", "-c", "import completesplat; print(completesplat.__file__)")
     assert place.startswith(str(installed.environment))
@@ -45,10 +45,12 @@ def test_the_installed_wheel_predicts_sweeps_and_writes_a_page_from_an_empty_fol
     run("predict", f"image={image}", "samples=1", "steps=2", "frames=2", "out=SCENES")
     scenes = tmp_path / "SCENES" / image.stem
     assert {path.name for path in scenes.iterdir()} == {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json"}
-    brief = [f"data.root={toy_root}", *SMALL, "callbacks.images=null", "test=false"]
+    brief = [f"data.root={toy_root}", *SMALL, "callbacks.images=null"]
     run("fit", "-m", "experiment=toy_var", *brief, "seed=0,1", "out=SWEEP")
     assert [strict_json(tmp_path / f"SWEEP/seed-{seed}/metrics.json")["steps"] for seed in (0, 1)] == [2, 2]
-    run("report", "html", "runs=.", "out=PAGE")
-    (page,) = (tmp_path / "PAGE").glob("*.html")
-    assert image.stem in page.read_text()
-    assert "seed-1" in page.read_text()
+    run("report", "runs=.", "out=TABLES")
+    tables = {kind: (tmp_path / f"TABLES/tables.{kind}").read_text() for kind in ("md", "csv", "tex")}
+    for text in tables.values():  # the paper's, and that of the sweep's jobs
+        assert "Table 2" in text
+        assert "images, 32 pixels" in text
+    assert "SWEEP/seed-1" in tables["md"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from completesplat import __version__
 from completesplat.files import write_text
 from completesplat.results.machine import machine
-from completesplat.results.runs import origin
+from completesplat.results.runs import read_record, typed
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
@@ -93,7 +93,7 @@ def protocol(
 
 def provenance(data: "SceneDataModule", out: Path) -> dict[str, object]:
     """Return the test data's fingerprint, and program, command (that of `run.json` in `out`) and machine."""
-    program = {"version": __version__, "commit": git_commit(), "command": origin(out, levels=0)["command"]}
+    program = {"version": __version__, "commit": git_commit(), "command": typed(read_record(out).get("command", []))}
     return {"data_fingerprint": data.source("test").fingerprint(), **program, "machine": machine()}
 
 

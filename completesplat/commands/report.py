@@ -1,14 +1,12 @@
-"""`completesplat report`: the paper's tables beside our results, a page of all results, and summaries of sweeps."""
+"""`completesplat report`: the paper's tables beside our results, and summaries of sweeps."""
 
 import logging
 from collections.abc import Sequence
 from pathlib import Path
 
 from completesplat.errors import CompleteSplatError
-from completesplat.files import write_text
-from completesplat.results.html_page import Limits, page
 from completesplat.results.paper_figures import tables as published_tables
-from completesplat.results.runs import find, origin
+from completesplat.results.runs import find
 from completesplat.results.sweeps import write_summary
 from completesplat.results.tables import show, write_tables
 
@@ -36,12 +34,3 @@ def summary(sweeps: Sequence[str], out: Path) -> None:
         if not folder.is_dir():
             raise CompleteSplatError(f"sweeps={folder}: no such folder")
     show(write_summary(out, *folders), width=160)
-
-
-def html(runs: str, most: Limits, out: Path) -> None:
-    """Write `report.html`, the `page` on all results below the folder `runs`, and print its size."""
-    text, warnings = page(Path(runs), out, most, origin(out, levels=0))
-    write_text(out / "report.html", text)
-    for warning in warnings:
-        logger.warning(warning)
-    print(f"{out / 'report.html'}: {(out / 'report.html').stat().st_size / 1e6:.1f} MB")

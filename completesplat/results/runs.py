@@ -1,4 +1,4 @@
-"""Content of the folders of runs: results of tests, the jobs of sweeps, predictions."""
+"""Content of the folders of runs: results of tests, the jobs of sweeps."""
 
 import json
 import os
@@ -17,9 +17,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.results.machine import Machine
 
 SCORES, MODES = "metrics.json", "hidden_modes.json"
-RECORD, CONFIG, PLAN, SCENE = "run.json", "config.yaml", "multirun.yaml", "scene.json"
-ROWS = ("calibration.json", "controls.json", "depth.json", "front.json", "modes.json")
-"""Files that `completesplat report NAME` writes beside its figure: settings and rows."""
+RECORD, CONFIG, PLAN = "run.json", "config.yaml", "multirun.yaml"
 PROTOCOL = "protocol"  # key of the entry that says how results were measured; the others are predictors
 MODEL, UPPER_BOUND = "model", "upper_bound"
 """Name of the predictor that is the run's model; key that marks a predictor that saw the views of its scores."""
@@ -34,7 +32,6 @@ class Record(TypedDict, total=False):
 
     command: list[str]
     overrides: list[str]
-    started: str
     commit: str | None
 
 
@@ -89,11 +86,9 @@ class Result:
 
 @dataclass(frozen=True)
 class RunTree:
-    """Runs and results below a folder, in the order of names, and a line for each file that cannot be used."""
+    """Sweeps and results below a folder, in the order of names, and a line for each file that cannot be used."""
 
     folder: Path
-    runs: list[Path] = field(default_factory=list)
-    predictions: list[Path] = field(default_factory=list)
     sweeps: list[Path] = field(default_factory=list)
     scores: list[Result] = field(default_factory=list)
     modes: list[Result] = field(default_factory=list)
@@ -107,14 +102,10 @@ def find(folder: Path) -> RunTree:
     tree, results = RunTree(folder), []
     for place, folders, names in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        path, files = Path(place), set(names)
-        if SCENE in files:
-            tree.predictions.append(path)
-        elif files & {RECORD, PLAN, SCORES, MODES, *ROWS}:
-            tree.runs.append(path)
-        if PLAN in files:
+        path = Path(place)
+        if PLAN in names:
             tree.sweeps.append(path)
-        results += [path / name for name in (SCORES, MODES) if name in files]
+        results += [path / name for name in (SCORES, MODES) if name in names]
     for path in sorted(results):
         try:
             (tree.scores if path.name == SCORES else tree.modes).append(_result(path, folder))
@@ -147,13 +138,6 @@ def _result(path: Path, root: Path) -> Result:
 
 def _mapping(value: object) -> Mapping[str, object]:
     return value if isinstance(value, Mapping) else {}
-
-
-def origin(path: Path, levels: int = 1) -> dict[str, str]:
-    """Return command, date and commit from the `run.json` of a folder or of one of its `levels` parents."""
-    record = next(filter(None, map(read_record, [path, *path.parents[:levels]])), Record())
-    values = {"started": record.get("started"), "commit": record.get("commit")}
-    return {"command": typed(record.get("command", []))} | {key: value or "" for key, value in values.items()}
 
 
 def typed(command: Sequence[str]) -> str:

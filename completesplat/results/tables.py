@@ -128,16 +128,6 @@ class Table:
     remarks: list[str] = field(default_factory=list)
     notes: Notes = field(default_factory=Notes)
 
-    @property
-    def published(self) -> bool:
-        """Whether the table has the paper's figures only."""
-        return all(row.source == "paper" for row in self.rows)
-
-    def groups(self) -> list[tuple[str, int]]:
-        """Return the group headings and the number of columns of each; empty if there are none."""
-        spans = [(name, len(list(members))) for name, members in groupby(heading.group for heading in self.headings)]
-        return spans if any(name for name, _ in spans) else []
-
     def ruled_rows(self) -> list[tuple[TableRow, bool]]:
         """Return the rows, each with whether a rule separates it from the next one."""
         apart = [row.source != following.source for row, following in pairwise(self.rows)]
@@ -242,8 +232,9 @@ def as_latex(table: Table) -> str:
     lines = [r"% \usepackage{booktabs,graphicx}", r"\begin{table*}", r"\centering"]
     lines.append(rf"\caption{{{escape(table.title)}}}")
     lines += [r"\resizebox{\textwidth}{!}{%", rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
-    if groups := table.groups():
-        above = (rf"\multicolumn{{{count}}}{{c}}{{{escape(name)}}}" for name, count in groups)
+    if any(heading.group for heading in table.headings):
+        groups = groupby(heading.group for heading in table.headings)
+        above = (rf"\multicolumn{{{len(list(members))}}}{{c}}{{{escape(name)}}}" for name, members in groups)
         lines.append(rf"{' & '.join(above)} \\")
     lines += [rf"{' & '.join(escape(heading.text) for heading in table.headings)} \\", r"\midrule"]
     for row, ruled in table.ruled_rows():

@@ -48,7 +48,7 @@ def test_a_wrong_value_is_refused_with_the_allowed_values(verb, setting, message
     assert message in refused(verb, *given.get(verb, ["trainer.max_steps=1"]), *setting.split())
 
 
-@pytest.mark.parametrize("chosen", [*VERBS, "data_task=check", "bench_task=paper", "report_task=html"])
+@pytest.mark.parametrize("chosen", [*VERBS, "data_task=check", "bench_task=paper", "report_task=summary"])
 def test_the_defaults_of_each_verb_pass_the_checks(chosen):
     verb = chosen.partition("_")[0]
     check_verb(verb, compose_config(verb, *([chosen] if "=" in chosen else [])))

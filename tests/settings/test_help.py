@@ -30,7 +30,9 @@ def test_each_own_setting_is_explained_in_conf(verb, task):
     assert unexplained == []
 
 
-@pytest.mark.parametrize(("verb", "task"), [one for one in WITH_TASKS if one[1] in (None, "check", "html", "controls")])
+@pytest.mark.parametrize(
+    ("verb", "task"), [one for one in WITH_TASKS if one[1] in (None, "check", "summary", "controls")]
+)
 def test_a_page_has_examples_settings_and_parts_and_fits(verb, task):
     text = page(verb, [task] if task else [])
     assert text.startswith(f"completesplat {verb}: ")
