@@ -86,9 +86,8 @@ lock: $(READY) ## Write requirements.lock: the newest versions that pyproject.to
 	$(BIN)/python -m uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --upgrade --generate-hashes \
 	  --no-annotate --no-emit-package torch --custom-compile-command "make lock" --quiet --output-file requirements.lock
 
-bench: $(READY) ## Time the rasterizer backends and data loading, side by side
+bench: $(READY) ## Time the rasterizer backends, side by side
 	$(BIN)/completesplat bench rasterizers
-	$(BIN)/completesplat bench data
 
 gpu: $(READY) ## What only a GPU can show, 25 minutes, in outputs/gpu: tests, times, trainings (SMALL=1: tiny sizes, anywhere)
 	PYTHONPATH=. $(BIN)/python tests/gpu_day.py $(if $(SMALL),--small)
