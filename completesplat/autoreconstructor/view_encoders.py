@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import vae_encoder, zeroed
+from completesplat.autoreconstructor.model import DepthRange
 from completesplat.geometry.cameras import pixel_centers, project, rays_through
 from completesplat.scene import Views
 from completesplat.settings.schema import Few, Range, Width, Widths
@@ -46,7 +47,7 @@ class PlaneSweep(nn.Module):
         zeroed(self.network.conv_out)
 
     def forward(
-        self, views: Views, depth_range: Float[Tensor, "batch 2"]
+        self, views: Views, depth_range: DepthRange
     ) -> Float[Tensor, "batch moment latent_height latent_width"]:
         """Return what to add to the moments; the reference is the first view, and its frame is the world."""
         with torch.autocast(views.images.device.type, enabled=False):
@@ -60,9 +61,7 @@ SHARPNESS = 4.0
 """Sharpness of the weights: a view at a right angle to the ray has exp(-4) of the weight of one along it."""
 
 
-def sweep(
-    views: Views, depth_range: Float[Tensor, "batch 2"], planes: int
-) -> Float[Tensor, "batch plane side value height width"]:
+def sweep(views: Views, depth_range: DepthRange, planes: int) -> Float[Tensor, "batch plane side value height width"]:
     """Sample the other views along the rays through the centres of 2 x 2 blocks of the reference's pixels.
 
     Returns:

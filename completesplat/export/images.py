@@ -73,15 +73,16 @@ class SheetCell:
     label: str = ""
 
 
+Sheet = list[list[SheetCell | None]]  # rows of a sheet
+
+
 def strip(images: Float[Tensor, "_ 3 height width"], label: str = "", width: int = 0) -> list[SheetCell | None]:
     """Return images side by side on a sheet, a label above the first, and empty cells up to `width`."""
     cells = [SheetCell(image, "" if index else label) for index, image in enumerate(images)]
     return [*cells, *[None] * (width - len(cells))]
 
 
-def image_sheet(
-    headings: Sequence[str] | None, rows: Sequence[Sequence[SheetCell | None]], title: str | None = None
-) -> Image.Image:
+def image_sheet(headings: Sequence[str] | None, rows: Sheet, title: str | None = None) -> Image.Image:
     """Return images in rows and columns, each enlarged by a whole factor to about 144 px, with its label above it.
 
     Args:

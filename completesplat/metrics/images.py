@@ -60,9 +60,7 @@ def ssim(predicted: Images, true: Images) -> PerImage:
     return structural_similarity(predicted, true).mean((1, 2, 3))
 
 
-def object_only(
-    images: Float[Tensor, "*batch 3 height width"], masks: Float[Tensor, "*batch 1 height width"]
-) -> Float[Tensor, "*batch 3 height width"]:
+def object_only(images: Images, masks: Float[Tensor, "image 1 height width"]) -> Images:
     """Make the background of images black, by the true mask binarised at 0.5 (supplement, "Objects only").
 
     The paper does not say whether its masks are soft; CO3D's own challenge binarises at 0.5.

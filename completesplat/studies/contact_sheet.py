@@ -173,8 +173,7 @@ def _line(
 
 
 def _extent(points: Points) -> float:
-    extent: float = (points.amax(dim=0) - points.amin(dim=0)).max().item()
-    return extent
+    return float((points.amax(dim=0) - points.amin(dim=0)).max())
 
 
 def show(sequences: Sequence[PosedSequence], path: Path, images: int, title: str) -> None:

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from matplotlib import colormaps
 
-from completesplat.export.images import SheetCell, strip
+from completesplat.export.images import Sheet, SheetCell, strip
 from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import diversity
 from completesplat.scene import SceneBatch
@@ -15,6 +16,7 @@ from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import SampleRenderer, farthest, mean_over_scenes, near, object_psnr
 
 Settings = Sequence[tuple[float, float]]  # skip and guidance weights
+Scenes = Sequence[SceneBatch]  # batches of one
 Row = dict[str, float | None]
 Tick = Callable[[str], None]
 Measure = Callable[[SceneBatch, float, float], Mapping[str, float | None]]
@@ -28,9 +30,7 @@ def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> li
     return sorted({*product(map(float, skip_weights), map(float, guidance_weights)), *PAPER})
 
 
-def rows(
-    renderer: SampleRenderer, settings: Settings, scenes: Sequence[SceneBatch], near_degrees: float, tick: Tick
-) -> list[Row]:
+def rows(renderer: SampleRenderer, settings: Settings, scenes: Scenes, near_degrees: float, tick: Tick) -> list[Row]:
     """Return a row for each setting, with means over the scenes.
 
     `reference_psnr` is of the reference view. `near_object_psnr` is of the true object's pixels in targets at most
@@ -50,7 +50,7 @@ def rows(
     return over_settings(settings, scenes, measure, tick)
 
 
-def over_settings(settings: Settings, scenes: Sequence[SceneBatch], measure: Measure, tick: Tick) -> list[Row]:
+def over_settings(settings: Settings, scenes: Scenes, measure: Measure, tick: Tick) -> list[Row]:
     """Return a row for each setting: means over the scenes, measured with its skip and guidance weight."""
     results: list[Row] = []
     for skip_weight, guidance_weight in settings:
@@ -61,9 +61,7 @@ def over_settings(settings: Settings, scenes: Sequence[SceneBatch], measure: Mea
     return results
 
 
-def strips(
-    renderer: SampleRenderer, settings: Settings, scene: SceneBatch, samples: int
-) -> list[list[SheetCell | None]]:
+def strips(renderer: SampleRenderer, settings: Settings, scene: SceneBatch, samples: int) -> Sheet:
     """Return rows by skip weight and columns by guidance weight: one sample's reference view, several far views.
 
     The far view is the target whose direction differs most from the reference's. The first row is the truth.
@@ -88,8 +86,6 @@ PANELS = {"reference_psnr": "Reference view: PSNR, dB", "near_object_psnr": "Obj
 
 def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
     """Write a PNG with a panel for each measure of faithfulness; the paper's three settings are circled and named."""
-    from matplotlib import colormaps
-
     with written_figure(path, title, (13, 5.5)) as figure:
         skips = sorted({row["skip_weight"] for row in rows})
         for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS.items(), strict=True):

@@ -1,15 +1,13 @@
 """Disagreement of one input's samples in depth: the paper's figure of diversity in depth, with numbers."""
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.export.images import NOTHING, SheetCell, color_depth, color_normals, ramp, strip, surface_depth
+from completesplat.export.images import NOTHING, Sheet, color_depth, color_normals, ramp, strip, surface_depth
 from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.scene import SceneBatch
-from completesplat.studies.controls import Row, Settings, Tick, over_settings
+from completesplat.studies.controls import Row, Scenes, Settings, Tick, over_settings
 from completesplat.studies.samples import SampleRenderer, farthest, near
 
 
@@ -25,9 +23,7 @@ def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tens
     return torch.where(count > 1, (from_mean.square().sum(0) / (count - 1)).sqrt(), torch.nan)
 
 
-def rows(
-    renderer: SampleRenderer, settings: Settings, scenes: Sequence[SceneBatch], far_degrees: float, tick: Tick
-) -> list[Row]:
+def rows(renderer: SampleRenderer, settings: Settings, scenes: Scenes, far_degrees: float, tick: Tick) -> list[Row]:
     """Return a row for each (skip weight, guidance weight), with means over the scenes.
 
     `reference_deviation` is the mean of `deviation` over the reference view's pixels, in the scene's units;
@@ -63,9 +59,7 @@ def _mean(values: Float[Tensor, "..."]) -> float | None:
     return known.mean().item() if len(known) else None
 
 
-def strips(
-    renderer: SampleRenderer, scenes: Sequence[SceneBatch], skip_weight: float, guidance_weight: float, shown: int
-) -> list[list[SheetCell | None]]:
+def strips(renderer: SampleRenderer, scenes: Scenes, skip_weight: float, guidance_weight: float, shown: int) -> Sheet:
     """Return a row for each scene: the truth, some samples in the far view, and where all samples disagree.
 
     The far view is the target whose direction differs most from the reference's. The truth is the input and the far

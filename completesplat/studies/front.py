@@ -1,15 +1,14 @@
 """Differences between samples in the reference view, where all should show the input image, and their causes."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from completesplat.export.images import SheetCell, strip
+from completesplat.export.images import Sheet, strip
 from completesplat.scene import SceneBatch
-from completesplat.studies.controls import Row, Tick
+from completesplat.studies.controls import Row, Scenes, Tick
 from completesplat.studies.mode_benchmark import Renders, rungs
 from completesplat.studies.samples import SampleRenderer, farthest, mean_over_scenes, object_psnr
 
@@ -17,9 +16,7 @@ AMPLIFIED = 10  # factor of the differences in the figure
 
 
 @torch.no_grad()
-def rows(
-    renderer: SampleRenderer, scenes: Sequence[SceneBatch], tick: Tick
-) -> tuple[list[dict[str, Any]], list[list[SheetCell | None]]]:
+def rows(renderer: SampleRenderer, scenes: Scenes, tick: Tick) -> tuple[list[dict[str, Any]], Sheet]:
     """Return a row for each rung with means of `figures` over the scenes, and a sheet of the first scene.
 
     The rungs are those of `mode_benchmark.rungs`, then the model's samples at skip weight 1, the same after two

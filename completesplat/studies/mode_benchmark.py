@@ -14,7 +14,7 @@ from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.diffusion.sampling import in_parts
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.export.images import SheetCell, image_sheet, write_png
+from completesplat.export.images import Sheet, SheetCell, image_sheet, write_png
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.mode_coverage import REJECTED, classify, draw_modes, mean_of, scores
 from completesplat.metrics.proper_scores import energy_score
@@ -113,7 +113,7 @@ class Measured:
 
     scores: dict[str, list[dict[str, float | None]]] = field(default_factory=dict)
     classes: dict[str, dict[tuple[float, ...], list[Tensor]]] = field(default_factory=dict)
-    rows: list[list[SheetCell]] = field(default_factory=list)
+    rows: Sheet = field(default_factory=list)
     names: list[str] = field(default_factory=list)
 
     def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
@@ -134,9 +134,8 @@ class Measured:
         labels = [f"{name} (true)" if mode == scene.true_mode else name for mode, name in enumerate(scene.modes)]
         classes = classify(pixels, modes, scene.probabilities).tolist()
         labels += ["rejected" if mode == REJECTED else scene.modes[mode] for mode in classes]
-        cells = [SheetCell(scene.scene.reference.images[0], scene.scene.names[0])]
-        cells += [SheetCell(*cell) for cell in zip([*scene.truths[:, 0], *images[:count, 0]], labels, strict=True)]
-        self.rows.append(cells)
+        shown = [scene.scene.reference.images[0], *scene.truths[:, 0], *images[:count, 0]]
+        self.rows.append([SheetCell(*cell) for cell in zip(shown, [scene.scene.names[0], *labels], strict=True)])
 
     def results(self, samples: int) -> dict[str, dict[str, float]]:
         """Return means over the scenes by method; an energy score without pixels is 0."""

@@ -18,7 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from completesplat.export.cleaning import storable, with_screen_space_dilation
-from completesplat.export.images import SheetCell, color_depth, image_sheet, write_png
+from completesplat.export.images import Sheet, SheetCell, color_depth, image_sheet, write_png
 from completesplat.export.ply import write_ply
 from completesplat.export.prediction import plain_camera
 from completesplat.files import make_folder, write_text
@@ -285,7 +285,7 @@ class SceneDrawings:
 
 def samples_sheet(drawings: list[SceneDrawings]) -> Image.Image:
     """Draw a sheet with a column for each view; views that a scene lacks stay white."""
-    rows: list[list[SheetCell | None]] = []
+    rows: Sheet = []
     for scene in drawings:
         labelled = {"true": scene.true, **{f"sample {n}": images for n, images in enumerate(scene.samples, 1)}}
         for name, images in (labelled | {"depth of 1": color_depth(scene.depth[0])[0]}).items():

@@ -24,7 +24,7 @@ from completesplat.data.validation import (
     require_file,
 )
 from completesplat.errors import DataError
-from completesplat.files import atomic_path
+from completesplat.files import atomic_path, write_bytes
 from completesplat.weights import sha256_of
 
 ADDRESS = "address.txt"
@@ -48,8 +48,7 @@ def local_root(root: str) -> Path:
         store = folder / _digest((folder / MANIFEST).read_bytes())
         store.mkdir(exist_ok=True)
         for name, content in ((ADDRESS, root.encode()), (MANIFEST, (folder / MANIFEST).read_bytes())):
-            with atomic_path(store / name) as temporary:
-                temporary.write_bytes(content)
+            write_bytes(store / name, content)
     return store
 
 
