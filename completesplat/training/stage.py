@@ -201,6 +201,8 @@ class Stage(LightningModule):
         self.evaluation.reset()
         self.seconds = defaultdict(list)
         self.mean_image = self.data.mean_image()
+        if self.mean_image is None:
+            self.evaluation.missing["mean_image"] = "missing: these data have no training images"
 
     def test_step(self, scenes: SceneBatch, index: int) -> None:
         evaluation, names = self.evaluation, scenes.names
@@ -217,7 +219,8 @@ class Stage(LightningModule):
             if depths is not None and depths.shape[-2:] == rendered.alpha.shape[-2:]:
                 evaluation.update_depth(name, rendered[0].expected_depth(), truth[b])
             self.scene_scored(name, samples, cameras[b], images, truth[b])
-        evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
+        if self.mean_image is not None:
+            evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
         evaluation.update("copy_reference", copy_reference(scenes), scenes)
 
     def timed(self, name: str, work: Callable[[], Result], scenes: int) -> Result:

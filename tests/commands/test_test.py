@@ -46,6 +46,14 @@ def test_scores_stand_beside_the_naive_predictors(scored):
     assert "copy_reference" in printed
 
 
+def test_data_without_training_images_have_no_mean_image(scored):
+    printed, metrics = scored("var", "overrides=['data.subset=null','data.test_fraction=1']")
+    described = metrics.pop("protocol")
+    assert list(metrics) == ["model", "copy_reference"]
+    assert described["missing"]["mean_image"] in printed
+    assert metrics["model"]["scenes"] == 4
+
+
 def test_weights_that_only_training_needed_may_be_gone(command, pipeline, tmp_path, monkeypatch):
     shutil.copytree(pipeline.var, tmp_path / "run")
     config = OmegaConf.load(tmp_path / "run/config.yaml")

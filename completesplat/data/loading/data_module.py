@@ -300,9 +300,9 @@ class SceneDataModule(LightningDataModule):
         hidden = 0.0 if self.box_masks is None else self.box_masks.probability
         return {"box_masks": hidden, **feature_moments(self.store("train"))}
 
-    def mean_image(self) -> Float[Tensor, "3 height width"]:
-        """Return the mean of the images that `typical_camera` averages: a baseline that ignores the input."""
-        return mean_image(self.store("train"), self.image_size)
+    def mean_image(self) -> Float[Tensor, "3 height width"] | None:
+        """Return the mean of the images that `typical_camera` averages, a baseline that ignores the input, if any."""
+        return mean_image(self.store("train"), self.image_size) if self.source("train").names else None
 
 
 class ObjectDataModule(SceneDataModule):

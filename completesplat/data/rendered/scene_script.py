@@ -63,8 +63,7 @@ def find_factory(name: str) -> Any:
     try:
         import infinigen.assets.objects as kinds
     except ImportError as error:
-        advice = "how to install it: completesplat data render --help"
-        raise RefusedMesh(f"Blender's Python lacks Infinigen ({error}); {advice}") from None
+        raise RefusedMesh(f"Blender's Python lacks Infinigen ({error}): see completesplat data render --help") from None
     packages = sorted(Path(kinds.__path__[0]).glob("*/__init__.py"))
     named = [path.parent.name for path in packages if re.search(rf"\b{name}\b", path.read_text())]
     if not named:
