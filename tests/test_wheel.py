@@ -3,11 +3,14 @@
 import re
 from email import message_from_bytes
 from functools import partial
+from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
 from support import SMALL, strict_json
 from written_commands import ROOT
+
+from completesplat.weights import SHIPPED, shipped
 
 pytestmark = pytest.mark.slow
 FOLDERS = {"completesplat": "completesplat", "conf": "completesplat/conf"}
@@ -26,7 +29,9 @@ def test_the_wheel_has_the_package_its_settings_and_weights_and_no_link_that_lea
         metadata = message_from_bytes(wheel.read(next(name for name in names if name.endswith(".dist-info/METADATA"))))
     package = {name for name in names if ".dist-info/" not in name}
     assert package == files("completesplat") | files("conf")
-    assert {"completesplat/py.typed", "completesplat/weights/toy_objects/model.safetensors"} <= package
+    weights = {f"completesplat/weights/{name}/model.safetensors" for name in shipped()}
+    assert {"completesplat/py.typed", *weights} <= package
+    assert Path(installed.wheel).stat().st_size < 45e6
     assert "Typing :: Typed" in metadata.get_all("Classifier")
     description, readme = metadata.get_payload(), (ROOT / "README.md").read_text()
     assert [link for link in LINK.findall(description) if "://" not in link] == []
@@ -34,7 +39,7 @@ def test_the_wheel_has_the_package_its_settings_and_weights_and_no_link_that_lea
     commands = [line for line in readme.splitlines() if line.startswith(("completesplat", "##"))]
     assert [line for line in description.splitlines() if line.startswith(("completesplat", "##"))] == commands
     assert "![" not in description
-    assert "*A toy scene" not in description
+    assert "*A rendered couch" not in description
 
 
 def test_the_installed_wheel_predicts_sweeps_and_writes_tables_from_an_empty_folder(installed, toy_root, tmp_path):
@@ -43,8 +48,11 @@ def test_the_installed_wheel_predicts_sweeps_and_writes_tables_from_an_empty_fol
     assert place.startswith(str(installed.environment))
     image = next(toy_root.glob("*/*/images/*.jpg"))
     run("predict", f"image={image}", "samples=1", "steps=2", "frames=2", "out=SCENES")
-    scenes = tmp_path / "SCENES" / image.stem
-    assert {path.name for path in scenes.iterdir()} == {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json"}
+    couch = SHIPPED / "rendered_couches/held_out.jpg"
+    run("predict", f"image={couch}", "weights=rendered_couches", "samples=1", "steps=2", "frames=2", "out=SCENES")
+    for name in (image.stem, couch.stem):
+        scenes = {path.name for path in (tmp_path / "SCENES" / name).iterdir()}
+        assert scenes == {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json"}
     brief = [f"data.root={toy_root}", *SMALL, "callbacks.images=null"]
     run("fit", "-m", "experiment=toy_var", *brief, "seed=0,1", "out=SWEEP")
     assert [strict_json(tmp_path / f"SWEEP/seed-{seed}/metrics.json")["steps"] for seed in (0, 1)] == [2, 2]
