@@ -8,7 +8,8 @@ from urllib.parse import unquote
 
 import pytest
 
-PDOC = [sys.executable, "-m", "pdoc", "--docformat", "google", "completesplat", "--output-directory"]
+FOR_BLENDER = "!completesplat.data.rendered._scene_script"
+PDOC = [sys.executable, "-m", "pdoc", "--docformat", "google", "completesplat", FOR_BLENDER, "--output-directory"]
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ NEVER_IMPORTED = {
 }
 
 # A script that Blender's Python runs, which has its own packages.
-FOR_BLENDER = ROOT / "completesplat/data/rendered/scene_script.py"
+FOR_BLENDER = ROOT / "completesplat/data/rendered/_scene_script.py"
 
 
 def declared(lines: Iterable[str]) -> set[str]:

@@ -49,6 +49,7 @@ NEED_BLENDER = ("RENDERS", "ASSET", "RUN40", "RUN41")
 NEEDS_MORE = (
     "IMAGES",
     "SOFA",
+    "COUCH",
     "SPLATS",
     "evaluation=co3d",
     "trainer.devices=8",

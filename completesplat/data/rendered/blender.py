@@ -20,7 +20,7 @@ VARIABLE = "COMPLETESPLAT_BLENDER"
 ADVICE = (
     '`python3.11 -m venv BLENDER` and `BLENDER/bin/pip install "bpy==4.2.0" "numpy<2"`, then blender=BLENDER/bin/python'
 )
-SCRIPT = Path(__file__).with_name("scene_script.py")
+SCRIPT = Path(__file__).with_name("_scene_script.py")
 SECONDS_TO_START = 120
 SECONDS_BETWEEN_LOOKS = 0.1
 # Neither this package's modules nor those beside the script are for Blender's Python.
@@ -74,7 +74,7 @@ def _output_of(*command: str) -> str:
 def run_job(
     blender: Blender, job: dict[str, Any], folder: Path, stopped: Event, minutes: float = math.inf
 ) -> dict[str, Any]:
-    """Run `scene_script.py` with a job; return its result, or `refused` with the reason for which Blender failed.
+    """Run `_scene_script.py` with a job; return its result, or `refused` with the reason for which Blender failed.
 
     Args:
         folder: an existing folder for the job's files and Blender's messages.

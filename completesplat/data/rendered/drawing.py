@@ -1,4 +1,4 @@
-"""Random cameras, light, floor and wall of a rendered scene, described for `scene_script.py`."""
+"""Random cameras, light, floor and wall of a rendered scene, described for `_scene_script.py`."""
 
 import hashlib
 import math
@@ -63,7 +63,7 @@ class RenderSettings(TypedDict):
 
 
 def draw_scene(name: str, settings: RenderSettings) -> tuple[dict[str, Any], list[Cameras]]:
-    """Draw surroundings and cameras by the seed and an object's name; return them for `scene_script.py`."""
+    """Draw surroundings and cameras by the seed and an object's name; return them for `_scene_script.py`."""
     digest = hashlib.sha256(name.encode()).digest()
     rng = np.random.default_rng([settings["seed"], int.from_bytes(digest[:8])])
     views, size, front = settings["views"], settings["size"], settings["front"]
@@ -173,7 +173,7 @@ def draw_surface(rng: np.random.Generator, surface: str) -> dict[str, Any] | Non
 
 
 def draw_back(rng: np.random.Generator, first: Cameras, hidden: str) -> dict[str, Any] | None:
-    """Draw the paint of what points away from the first camera, which does not see it (see `scene_script.paint_back`).
+    """Draw the paint of what points away from the first camera, which does not see it (see `_scene_script.paint_back`).
 
     Returns:
         The direction toward the camera, the least part of it that a painted face's normal points away, and the names
