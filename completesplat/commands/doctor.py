@@ -27,7 +27,7 @@ EXTRAS = {
     "cuda": "to draw on an NVIDIA GPU",
     "view": "to show scenes in a browser",
     "background": "to cut objects out of photos",
-    "colmap": "to read captures whose lens distorts",
+    "colmap": "to find cameras of photos, to read captures whose lens distorts",
     "slurm": "to spread sweeps over a cluster",
     "perceptual": "to train on perceptual features without a download",
 }

@@ -130,12 +130,12 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
                 if (path := OmegaConf.select(config, f"model.{key}")) is not None:
                     config.model[key] = path
             with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{out}"]):
-                start(verb, config, out)
+                result = start(verb, config, out)
     except Interrupted as stop:
         if first:
             print(_how_to_continue(stop, verb, given, out), file=sys.stderr)
         raise
-    print(out)
+    print(out, *([result] if isinstance(result, str) else []), sep="\n")
     return optimized(config.get("optimized_metric"), out)
 
 
@@ -168,8 +168,8 @@ def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) 
     return f"ended by {stop.signal.name}{checkpoint}; {'go on' if begun else 'start again'} with: {shlex.join(again)}"
 
 
-def start(verb: str, config: DictConfig, out: Path) -> None:
-    """Check the settings and call the function that the config names as its task, or else the verb's `run`."""
+def start(verb: str, config: DictConfig, out: Path) -> object:
+    """Check the settings and call the config's task or else the verb's `run`; return its result (a text is printed)."""
     with importing(), postponing() if verb == "predict" else nullcontext():
         check_verb(verb, config)
         if config.get("task") is None:
@@ -177,7 +177,7 @@ def start(verb: str, config: DictConfig, out: Path) -> None:
         else:
             check_settings(get_method(config.task._target_), resolved_settings(config.task))
             run = partial(instantiate, config.task, out=out, _convert_="all")
-    run()
+    return run()
 
 
 def is_finished(out: Path, config: Mapping[str, object]) -> bool:

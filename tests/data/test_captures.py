@@ -313,7 +313,7 @@ def test_captures_in_folders_are_sequences_and_broken_ones_are_counted(tmp_path)
     assert other.fingerprint() != fingerprint
     with pytest.raises(BadAnnotation, match=r"c/transforms\.json, c: no frames"):
         CaptureDataModule(str(tmp_path / "c")).source("train")
-    with pytest.raises(MissingFile, match="empty: no capture there"):
+    with pytest.raises(MissingFile, match="empty: no cameras there"):
         CaptureDataModule(str(tmp_path / "empty")).source("train")
 
 

@@ -1,6 +1,7 @@
 """Data module of a user's captures, which are read in place."""
 
 import hashlib
+import shlex
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -158,7 +159,9 @@ class CaptureDataModule(ObjectDataModule):
             if folder == self.root and (captures or refused):
                 break
         if not captures:
-            message = "no capture there: neither transforms.json nor sparse/0, nor folders that have one"
+            command = shlex.join(["completesplat", "data", "import", str(self.root), "cameras=colmap"])
+            message = "no cameras there: neither transforms.json nor sparse/0, nor folders that have one; photos or a "
+            message += f"video get cameras by: {command}"
             raise refused[0] if refused else MissingFile(message, str(self.root))
         training, held_out = partial(members, self.hold_out, False), partial(members, self.hold_out, True)
         parts = {"train": training, "val": held_out, "test": held_out}
