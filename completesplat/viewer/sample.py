@@ -14,6 +14,7 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.ply import read_ply
+from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 
@@ -61,7 +62,7 @@ class Sample:
 
 
 def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
-    """Read a `.ply`, or all samples in the folder of a prediction or fitted scene; return them and the direction up.
+    """Read a file of Gaussians, or all samples of a prediction or fitted scene; return them and the direction up.
 
     A file without `scene.json` beside it is seen by its `framing_camera`.
 
@@ -71,7 +72,7 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     files = [path] if path.is_file() else sorted([*path.glob("sample_*.ply"), *path.glob("scene.ply")])
     if not files:
         raise CompleteSplatError(f"{path}: no sample_*.ply or scene.ply in this folder")
-    scenes = [read_ply(file) for file in files]
+    scenes = [read_gaussians(file) for file in files]
     description = (path.parent if path.is_file() else path) / "scene.json"
     if not description.is_file() or not all(file.name.startswith(("sample_", "scene.")) for file in files):
         return [Sample(scene, 1, framing_camera(scene)) for scene in scenes], UP

@@ -107,12 +107,11 @@ class SplatView:
         self.hidden_layers: set[int] = set()
         self.depth = False
         self.cameras: set[str] = set()
-        self._arrangement: Arrangement | None = None
         self._splats: dict[str, viser.GaussianSplatHandle] = {}
         self._frusta: list[viser.CameraFrustumHandle] = []
         self._lock = threading.RLock()
-        self.up = np.asarray(up, float)
-        server.scene.set_up_direction(self.up)
+        self._arrangement: Arrangement | None = None
+        self.set_up(up)
         server.on_client_connect(self._welcome)
 
     @property
@@ -120,6 +119,12 @@ class SplatView:
         """The samples on the page: the chosen one (or the first, if its number does not exist), or all."""
         samples, chosen = self.samples, self.chosen
         return samples if chosen is None or not samples else [samples[chosen if chosen < len(samples) else 0]]
+
+    def set_up(self, up: Sequence[float]) -> None:
+        """Set the direction up, and make the next drawing be seen from the front, because it shows another scene."""
+        with self._lock:
+            self.up, self._arrangement = np.asarray(up, float), None
+            self.server.scene.set_up_direction(self.up)
 
     def show(self, samples: Sequence[Sample]) -> None:
         """Replace the samples, and draw the new ones."""
@@ -139,11 +144,6 @@ class SplatView:
             if self._arrangement is None or not arrangement.looks_like(self._arrangement):
                 self._arrangement = arrangement
                 self.look_from_the_front()
-
-    def forget_view(self) -> None:
-        """Make the next drawing be seen from the front, because it shows another image."""
-        with self._lock:
-            self._arrangement = None
 
     def look_from_the_front(self, client: viser.ClientHandle | None = None) -> None:
         """Move a browser's camera (None: those of all present and future browsers) to where the photo was taken."""
