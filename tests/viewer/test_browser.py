@@ -56,7 +56,7 @@ def page(tmp_path_factory):
     view = SplatView(server, (0.0, -1.0, 0.0))
     view.show([balls_sample()])
     saver = Saver(tmp_path_factory.mktemp("saved"), view, ReferenceRasterizer, 2, 0.5)
-    made = Page(server, view, saver, layers=4)
+    made = Page(server, view, saver, {})
     made.completion = Completion(made, tiny_generator(), START)
     yield made
     made.close()
@@ -152,7 +152,7 @@ def test_the_page_has_our_title_and_icon_and_no_errors(tab):
 
 def test_a_phone_shows_the_whole_scene_and_the_panel_when_it_is_wanted(chromium, page):
     phone = open_tab(chromium, page.server.address, {"width": 390, "height": 700})
-    button = phone.get_by_role("button", name="Load an image")
+    button = phone.get_by_role("button", name="Load a file")
     assert not button.is_visible()
     seen = settled(phone)
     assert seen.shape[:2] == (700, 390)
@@ -192,7 +192,7 @@ def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     client = page.server.get_clients()[min(page.server.get_clients())]  # the tab, which came first
     assert abs(client.camera.position).max() > 0.3
     with tab.expect_file_chooser() as chooser:
-        tab.get_by_role("button", name="Load an image").click()
+        tab.get_by_role("button", name="Load a file").click()
     chooser.value.set_files(file)
     tab.get_by_text("1 drawn in").wait_for(timeout=1000 * LIMIT)
     first = changed(tab, turned)
