@@ -145,8 +145,9 @@ def tokens(request: Request, port: int) -> list[bytes]:
 
 
 def with_head(page: str) -> str:
-    """Return viser's HTML with our title, icon and corrections."""
+    """Return viser's HTML with our title, icon and corrections, and a line until its program has started."""
     icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON.read_text())}" />'
     page = re.sub(r'<link\s+rel="icon"\s+href="[^"]*"\s*/>', icon, page, count=1)
     page = re.sub(r"<title>[^<]*</title>", f"<title>{TITLE}</title>", page, count=1)
+    page = page.replace('<div id="root"></div>', f'<div id="root">{TITLE}: starting the page</div>', 1)
     return page.replace("<head>", f"<head><script>{CORRECTIONS.read_text()}</script>", 1)

@@ -3,6 +3,7 @@
 import math
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -160,7 +161,7 @@ class SplatView:
                     camera.fov = view.fov_in(camera.image_width / camera.image_height)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """Let narrow windows of a new browser (a phone's, upright) show the whole image, as wide ones do."""
+        """Fit the view to a new browser's window, as narrow as a phone's, and say there until it has drawn an image."""
         last_aspect: float | None = None
 
         def fit(camera: viser.CameraHandle) -> None:
@@ -172,6 +173,10 @@ class SplatView:
 
         client.camera.on_update(fit)
         fit(client.camera)
+        with suppress(RuntimeError):  # it has left
+            drawing = client.add_notification("Drawing the first image", "", loading=True, with_close_button=False)
+            client.get_render(height=1, width=1)  # returns when the browser has drawn it
+            drawing.remove()
 
     def _draw_splats(self, samples: Sequence[Sample], arrangement: Arrangement) -> None:
         scenes = [sample.for_viewers() for sample in samples]
