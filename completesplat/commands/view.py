@@ -77,16 +77,11 @@ def settings_of(path: Path) -> dict[str, str]:
         return {"weights": str(path)}
     if scenes_in(path):
         return {"scene": str(path)}
-    raise CompleteSplatError(
-        f"{path}: neither weights ({', '.join(WEIGHT_FILES)}, here or in weights/) nor scenes ({', '.join(SPLATS)})"
-    )
+    raise CompleteSplatError(f"{path}: neither weights nor scenes in it ({', '.join((*WEIGHT_FILES, *SPLATS))})")
 
 
 def scenes_in(path: Path) -> dict[str, Path]:
-    """Return a scene itself, or the scenes in a folder and in its `scenes/`, by name.
-
-    A scene is a file of Gaussians, or the folder of a prediction or fitted scene.
-    """
+    """Return a scene itself (a file, a prediction, a fitted scene), or those in a folder and its `scenes/`, by name."""
     if path.is_file() or any(any(path.glob(name)) for name in SCENE_FILES):
         return {path.name: path}
     inner = [entry for folder in (path, path / SCENES) if folder.is_dir() for entry in sorted(folder.iterdir())]

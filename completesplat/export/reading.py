@@ -63,7 +63,7 @@ def _read_spz(content: bytes) -> list[np.ndarray]:
     whole = np.pad(places.reshape(count, 3, 3), ((0, 0), (0, 0), (1, 0)))  # 24 bits in the upper part of 32
     return [
         np.ldexp(whole.view("<i4")[..., 0] >> 8, -bits),
-        _three_bytes(rotations) if version == 2 else _smallest_three(rotations),
+        _quaternions(rotations),
         np.exp(scales / 16 - 10),
         opacities[:, 0] / 255,
         np.maximum(0.5 + SH_C0 * (colors / 255 - 0.5) / 0.15, 0),
@@ -82,18 +82,14 @@ def _unpacked(data: bytes, table: int, streams: int, sizes: np.ndarray) -> bytes
     return b"".join(pyarrow.decompress(x, int(n), "zstd", asbytes=True) for x, n in zip(packed, sizes, strict=True))
 
 
-def _three_bytes(packed: UInt8[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 4"]:
-    """Unpack x, y, z; w is what remains of a unit quaternion."""
-    xyz = packed / 127.5 - 1
-    return np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(-1, keepdims=True))), xyz], axis=-1)
-
-
-def _smallest_three(packed: UInt8[np.ndarray, "gaussian 4"]) -> Float[np.ndarray, "gaussian 4"]:
-    """Unpack the three smallest of x, y, z, w, ten bits each, behind two bits with the index of the largest one."""
-    word = packed.view("<u4")
-    fields = word >> np.array([20, 10, 0], np.uint32)
-    smallest = np.where(fields & 512, -1, 1) * (fields & 511) * (math.sqrt(0.5) / 511)
-    others, quaternions = np.arange(4) != word >> 30, np.empty((len(packed), 4))
-    quaternions[others] = smallest.ravel()
-    quaternions[~others] = np.sqrt(np.maximum(0, 1 - (smallest**2).sum(-1)))
+def _quaternions(packed: UInt8[np.ndarray, "gaussian bytes"]) -> Float[np.ndarray, "gaussian 4"]:
+    """Unpack three of x, y, z, w: a byte each, without w, or ten bits each, behind two with the index of the fourth."""
+    if packed.shape[1] == 3:
+        fourth, three = np.full((len(packed), 1), 3), packed / 127.5 - 1
+    else:
+        word = packed.view("<u4")
+        fourth, fields = word >> 30, word >> np.array([20, 10, 0], np.uint32)
+        three = np.where(fields & 512, -1, 1) * (fields & 511) * (math.sqrt(0.5) / 511)
+    others, quaternions = np.arange(4) != fourth, np.empty((len(packed), 4))
+    quaternions[others], quaternions[~others] = three.ravel(), np.sqrt(np.maximum(0, 1 - (three**2).sum(-1)))
     return np.roll(quaternions, 1, axis=-1)

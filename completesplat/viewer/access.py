@@ -9,7 +9,6 @@ import io
 import logging
 import re
 import secrets
-import threading
 from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
@@ -35,8 +34,6 @@ MOST_FRAME = 2**20  # bytes of one websocket message; the page sends files in pa
 
 Answer = Callable[[ServerConnection, Request], Response | None]
 
-_starting = threading.Lock()
-
 
 class GuardedServer(viser.ViserServer):
     """viser's server behind our checks, on this machine's port or, if that is taken, on the next free one.
@@ -54,13 +51,12 @@ class GuardedServer(viser.ViserServer):
         self.token = secrets.token_urlsafe(32)
         self._guarded = False
         # viser's constructor starts the websocket server in a thread and waits for it, and has no options for it.
-        with _starting:
-            serve = websockets_server.serve
-            websockets_server.serve = partial(self._serve, serve)  # type: ignore[assignment, misc]
-            try:
-                super().__init__(HOST, port, verbose=False)
-            finally:
-                websockets_server.serve = serve  # type: ignore[misc]
+        serve = websockets_server.serve
+        websockets_server.serve = partial(self._serve, serve)  # type: ignore[assignment, misc]
+        try:
+            super().__init__(HOST, port, verbose=False)
+        finally:
+            websockets_server.serve = serve  # type: ignore[misc]
         if not self._guarded:
             self.stop()
             raise CompleteSplatError(f"viser {viser.__version__}: cannot be guarded; pip install viser==1.1.1")

@@ -47,17 +47,11 @@ class Completion:
         if self.photograph is None:
             return self.page.tell(CompleteSplatError("load an image first"), client)
         settings = {name: getattr(self.controls, name).value for name in SLIDERS}
-        job = partial(self._draw, *self.photograph, settings, client)
-        self.page.worker.submit("draw", job)
+        self.page.worker.submit("draw", partial(self._draw, *self.photograph, settings, client))
 
     def complete(self, image: Path, name: str, client: viser.ClientHandle | None) -> None:
-        """Read an image file, show it by its name, and draw its samples.
-
-        Raises:
-            CompleteSplatError: the file is not an image, or the background cannot be removed.
-        """
-        photograph = self.model.read(image, remove_background=self.controls.remove_background.value)
-        self.load(name, photograph, client)
+        """Load an image file; raise a `CompleteSplatError` if it is none, or its background cannot be removed."""
+        self.load(name, self.model.read(image, remove_background=self.controls.remove_background.value), client)
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
         if not isinstance(self.model, CompleteSplat):

@@ -131,10 +131,9 @@ class Saver:
     def _video(self, sample: Sample) -> Path:
         """Write a video of a full turn around a sample."""
         path = self._next("orbit", ".mp4")
-        camera = sample.reference
-        up = camera.intrinsics.new_tensor(self.view.up.tolist())
-        scene, pivot = sample.gaussians, sample.pivot()
-        frames, _ = orbit_views(self.rasterizer(), scene, camera, pivot, self.frames, self.background, up)
+        up = sample.reference.intrinsics.new_tensor(self.view.up.tolist())
+        seen = sample.gaussians, sample.reference, sample.pivot()
+        frames, _ = orbit_views(self.rasterizer(), *seen, self.frames, self.background, up)
         write_video(path, frames)
         return path
 
@@ -177,11 +176,7 @@ class Page:
             self.worker.submit("thumbnails", partial(self._draw_thumbnails, samples))
 
     def open(self, path: Path, name: str) -> None:
-        """Show a file or folder of scenes instead of the samples, from the front.
-
-        Raises:
-            CompleteSplatError: `read_scene` fails.
-        """
+        """Show what `read_scene` reads instead of the samples, from the front."""
         say(self.server, f"reading {name}")
         samples, up = read_scene(path)
         self.view.set_up(up)
@@ -194,12 +189,12 @@ class Page:
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
         """Show an uploaded scene, or complete an uploaded image; its name is never used as a path."""
         file, name = self.opening.upload.value, printable(self.opening.upload.value.name)
-        suffix = next((suffix for suffix in SPLATS if name.lower().endswith(suffix)), "")
+        suffix = Path(name).suffix.lower()
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"upload{suffix}"
+            path = Path(folder) / f"upload{suffix if suffix in SPLATS else ''}"
             path.write_bytes(file.content)
             try:
-                if suffix:
+                if suffix in SPLATS:
                     self.open(path, name)
                 elif self.complete is None:
                     raise CompleteSplatError(f"{name}: not {', '.join(SPLATS)}; images need completesplat view IMAGE")
@@ -221,6 +216,7 @@ class Page:
 
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
         """Show an error in one browser or in all; log it as well if it is a fault of the program."""
+        say(self.server, "")  # what was waited for
         text = str(error)
         if not isinstance(error, CompleteSplatError):
             text = f"{type(error).__name__}: {text}"

@@ -80,7 +80,6 @@ def add_looking(gui: viser.GuiApi) -> SimpleNamespace:
 
     The handles also include `thumbnails` above all folders, filled by `thumbnail_row`, and `keys`, commands by digit.
     """
-    names = ["reference", "orbit"]
     commands = {str(i): f"Show sample {i}" for i in range(1, KEYS + 1)} | {"0": "Show all samples side by side"}
     key: Any = gui.add_command
     thumbnails = gui.add_html("", order=0.5)
@@ -91,7 +90,7 @@ def add_looking(gui: viser.GuiApi) -> SimpleNamespace:
             chosen=gui.add_dropdown("Show", ("sample 1", SIDE_BY_SIDE), hint="keys 1 to 9 choose, 0 shows all"),
             layers=[gui.add_checkbox(f"Layer {i + 1}", True, visible=False) for i in range(MOST_LAYERS)],
             depth=gui.add_checkbox("Depth as colours", False, hint="near bright, far dark"),
-            cameras={name: gui.add_checkbox(f"Cameras: {name}", False) for name in names},
+            cameras={name: gui.add_checkbox(f"Cameras: {name}", False) for name in ("reference", "orbit")},
             front=gui.add_button("Look from the front"),
         )
 
@@ -130,9 +129,8 @@ def _source(image: Pixels) -> str:
 
 def possible_steps(sampler: Sampler) -> list[int]:
     """Return the sampler's default steps and all others up to 100; those of DDIM divide the number of noise levels."""
-    numbers = range(1, min(MOST_STEPS, sampler.training_timesteps) + 1)
-    divides = isinstance(sampler.scheduler, DDIMScheduler)
-    possible = {n for n in numbers if not (divides and sampler.training_timesteps % n)}
+    levels, divides = sampler.training_timesteps, isinstance(sampler.scheduler, DDIMScheduler)
+    possible = {n for n in range(1, min(MOST_STEPS, levels) + 1) if not (divides and levels % n)}
     return sorted(possible | {sampler.steps})
 
 

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import with_screen_space_dilation
-from completesplat.export.ply import read_ply
 from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
@@ -95,7 +94,7 @@ def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
         raise CompleteSplatError(f"{path}: not the newest scenes of a run") from error
     samples = []
     for file, name, camera in described:
-        scene = read_ply(folder / Path(file).name)
+        scene = read_gaussians(folder / Path(file).name)
         samples.append(Sample(scene, _layers(scene, camera), camera, {"scene": name, "step": step}))
     return step, samples, up
 
@@ -109,8 +108,7 @@ def framing_camera(gaussians: Gaussians) -> Cameras:
     radius = distances[int(0.9 * (len(distances) - 1))].clamp(min=1e-3)
     back = 1.1 * radius / torch.tensor(FRAMING_FOV / 2).deg2rad().sin()
     eye = center - torch.tensor([0.0, 0.0, 1.0]) * back
-    intrinsics = pinhole(FRAMING_FOV, FRAMING_SIZE)
-    return Cameras(look_at(eye, center, torch.tensor(UP)), intrinsics, (FRAMING_SIZE, FRAMING_SIZE))
+    return Cameras(look_at(eye, center, torch.tensor(UP)), pinhole(FRAMING_FOV, FRAMING_SIZE), (FRAMING_SIZE,) * 2)
 
 
 def _layers(gaussians: Gaussians, reference: Cameras) -> int:
