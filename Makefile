@@ -75,8 +75,8 @@ test-browser: $(READY) ## Viewer in Chromium (apt-get install chromium); skipped
 	$(BIN)/python -m pytest -q -m browser -rs
 
 # What hypothesis finds is kept in .hypothesis/ and tried first the next time.
-fuzz: $(READY) ## Damaged files for each of seven readers, FUZZ_MINUTES=10 each
-	FUZZ_MINUTES=$(FUZZ_MINUTES) $(BIN)/python -m pytest -q -m "" -p no:logging --numprocesses auto --maxprocesses 7 tests/test_fuzzed_readers.py
+fuzz: $(READY) ## Damaged files for each of eight readers, FUZZ_MINUTES=10 each
+	FUZZ_MINUTES=$(FUZZ_MINUTES) $(BIN)/python -m pytest -q -m "" -p no:logging --numprocesses auto --maxprocesses 8 tests/test_fuzzed_readers.py
 
 check: $(READY) ## Lint, formatting and types
 	$(BIN)/ruff check
