@@ -264,7 +264,7 @@ class Page:
                 return self.tell(error, client)
             for file in files:
                 client.send_file_download(file.name, file.read_bytes())
-            say(self.server, f"saved {', '.join(file.name for file in files)} in {self.saver.folder}")
+            client.add_notification("Saved", f"{', '.join(file.name for file in files)} in {self.saver.folder}")
 
         self.worker.submit(kind, save)
 

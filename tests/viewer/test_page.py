@@ -337,6 +337,7 @@ def test_files_are_written_and_sent_to_their_browser(page, kind, count, name, tm
     press(page.saving.save, browser)
     assert page.worker.wait(LIMIT)
     assert sorted(browser.files) == [name.format(i) for i in range(count)]
+    assert browser.messages == [f"{', '.join(sorted(browser.files))} in {page.saver.folder}"]
     for file, content in browser.files.items():
         assert (page.saver.folder / file).read_bytes() == content
 
