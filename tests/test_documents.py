@@ -1,5 +1,6 @@
 """What the documents say of the repository is so: links, paths, targets of make, groups, versions, authors."""
 
+import json
 import re
 import subprocess
 import tomllib
@@ -89,7 +90,12 @@ def test_the_citation_is_the_readmes_and_the_changelog_knows_this_version():
         assert re.search(rf"{field} += {re.escape(f'{{{value}}}')}", text)
     assert citation.version == PROJECT["version"]
     assert citation.license == PROJECT["license"]
-    assert f"## [{PROJECT['version']}]" in CHANGELOG.read_text()
+    assert f"## [{PROJECT['version']}] - {citation['date-released']}" in CHANGELOG.read_text()
+    zenodo = json.loads((ROOT / ".zenodo.json").read_text())
+    same = {"title": "title", "description": "abstract", "version": "version", "license": "license"}
+    same |= {"keywords": "keywords", "creators": "authors"}
+    assert {key: zenodo[key] for key in same} == {key: citation[name] for key, name in same.items()}
+    assert zenodo["publication_date"] == str(citation["date-released"])
 
 
 def test_the_hooks_are_the_checks_of_make_and_the_workflow_runs_what_must_hold():

@@ -1,8 +1,10 @@
 """The wheel: what is in it, and that it works from an empty folder, as somebody has it who has nothing else."""
 
 import re
+import subprocess
 from email import message_from_bytes
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -62,3 +64,23 @@ def test_the_installed_wheel_predicts_sweeps_and_writes_tables_from_an_empty_fol
         assert "Table 2" in text
         assert "images, 32 pixels" in text
     assert "SWEEP/seed-1" in tables["md"]
+
+
+def test_a_commit_gives_the_same_release_in_another_folder_with_other_permissions(tmp_path):
+    """The release is of the last commit: what is not committed is in neither."""
+    releases = []
+    for name, mask in (("a", 0o022), ("b", 0o077)):
+        folder = tmp_path / name
+        for command in (["git", "clone", "--quiet", ROOT, folder], ["make", "--silent", "-C", folder, "release"]):
+            subprocess.run(command, check=True, umask=mask, stdout=subprocess.DEVNULL)
+        files = {path.name: sha256(path.read_bytes()).hexdigest() for path in (folder / "dist").iterdir()}
+        sums = files.pop("SHA256SUMS")
+        listed = [line.split() for line in (folder / "dist/SHA256SUMS").read_text().splitlines()]
+        assert files == {name: value for value, name in listed}
+        releases.append((files, sums))
+    assert releases[0] == releases[1]
+    assert sorted(name.rpartition("0.1.0")[2] for name in files) == ["-py3-none-any.whl", ".cdx.json", ".tar.gz"]
+    bill = strict_json(folder / f"dist/{next(name for name in files if name.endswith('.json'))}")
+    assert bill["bomFormat"] == "CycloneDX"
+    assert bill["metadata"]["component"]["version"] == "0.1.0"
+    assert {"lightning", "hydra-core", "numpy"} <= {component["name"] for component in bill["components"]}

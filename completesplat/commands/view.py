@@ -12,16 +12,15 @@ from omegaconf import DictConfig
 from completesplat.commands.imports import importing, postponing
 from completesplat.commands.jobs import at_work
 from completesplat.errors import CompleteSplatError
-from completesplat.files import printable
+from completesplat.files import SPLATS, printable
 from completesplat.settings.checks import REMOVE, check_parts
 from completesplat.signals import Interrupted
 from completesplat.weights import CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, check_name
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
-KINDS = {".ply": "scene", ".ckpt": "weights", ".pth": "weights"}
+KINDS = dict.fromkeys(SPLATS, "scene") | {".ckpt": "weights", ".pth": "weights"}
 PAUSE = 2.0  # seconds between two checks for new scenes of a run
 SCENE_FILES = ("sample_*.ply", "scene.ply")
-LOADING = "**Loading** what the page shows: the model, or scenes. The controls come with it."
 
 
 def run(config: DictConfig, out: Path) -> None:
@@ -45,9 +44,7 @@ def run(config: DictConfig, out: Path) -> None:
     try:
         if config.export is None:
             print(f"{server.address} (Ctrl-C ends it)", flush=True)
-        loading = server.gui.add_markdown(LOADING)
         page = make_page(server, config, out)
-        loading.remove()
         if config.export is not None:
             return export(page, Path(config.export))
         while True:
@@ -78,15 +75,18 @@ def settings_of(path: Path) -> dict[str, str]:
             return {"weights": str(folder)}
     if (path / RUN_CHECKPOINT).is_file():
         return {"weights": str(path)}
-    inner = [*path.iterdir(), *((path / SCENES).iterdir() if (path / SCENES).is_dir() else [])]
-    folders = [folder for folder in (path, *sorted(inner)) if any(any(folder.glob(name)) for name in SCENE_FILES)]
-    if len(folders) == 1 or path in folders:
-        return {"scene": str(folders[0])}
-    if folders:
-        raise CompleteSplatError(f"{path} holds {len(folders)} predictions: give one of them, {folders[0]} for example")
-    raise CompleteSplatError(
-        f"{path}: neither weights ({', '.join(WEIGHT_FILES)}, here or in weights/) nor a prediction (sample_*.ply)"
-    )
+    if scenes_in(path):
+        return {"scene": str(path)}
+    raise CompleteSplatError(f"{path}: neither weights nor scenes in it ({', '.join((*WEIGHT_FILES, *SPLATS))})")
+
+
+def scenes_in(path: Path) -> dict[str, Path]:
+    """Return a scene itself (a file, a prediction, a fitted scene), or those in a folder and its `scenes/`, by name."""
+    if path.is_file() or any(any(path.glob(name)) for name in SCENE_FILES):
+        return {path.name: path}
+    inner = [entry for folder in (path, path / SCENES) if folder.is_dir() for entry in sorted(folder.iterdir())]
+    found = [x for x in inner if x.suffix.lower() in SPLATS or any(any(x.glob(name)) for name in SCENE_FILES)]
+    return {printable(str(x.relative_to(path))): x for x in found}
 
 
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
@@ -105,11 +105,12 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
 
         check_parts(config)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = None
+    model, scenes = None, {}
     if config.watch is not None:
         samples, up = newest_scenes(Path(config.watch))
     elif config.scene is not None:
-        samples, up = read_scene(Path(config.scene))
+        scenes = scenes_in(Path(config.scene)) or {"": Path(config.scene)}  # which `read_scene` refuses
+        samples, up = read_scene(next(iter(scenes.values())))
     else:
         model = open_generator(config).to(device)
         samples, up = [], tuple(model.up.tolist())
@@ -122,11 +123,10 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     splats.show(samples)
     rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
     saver = Saver(out, splats, rasterizer, config.frames, background)
+    page = Page(server, splats, saver, scenes)
     if model is None:
-        page = Page(server, splats, saver, max(sample.layers for sample in samples))
-        page.show(samples, "" if config.watch is None else step_of(samples))
+        page.show(samples, next(iter(scenes), step_of(samples)))
         return page
-    page = Page(server, splats, saver, model.parameterization.layers)
     start = {name: config[name] for name in SLIDERS} | {"remove_background": remove}
     completion = Completion(page, model, start)
     if photograph is not None:

@@ -1,8 +1,9 @@
 """The viewer's page: its controls, its worker thread, and the files that it saves."""
 
 import logging
+import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,12 @@ from completesplat.export.formats import CONVERTED, FORMATS, write_formats
 from completesplat.export.images import to_bytes
 from completesplat.export.splat_transform import PageView, find_splat_transform
 from completesplat.export.video import orbit_views, render_views, write_video
-from completesplat.files import write_text
+from completesplat.files import SPLATS, printable, write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer
-from completesplat.viewer.access import GuardedServer, stop_server, with_head
-from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Pixels, add_looking, add_saving, thumbnail_row
-from completesplat.viewer.sample import Sample
+from completesplat.viewer.access import GuardedServer, say, stop_server, with_head
+from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Pixels, add_looking, add_opening, add_saving, thumbnail_row
+from completesplat.viewer.sample import Sample, read_scene
 from completesplat.viewer.splat_view import SplatView
 
 Job = Callable[[], None]
@@ -130,10 +131,9 @@ class Saver:
     def _video(self, sample: Sample) -> Path:
         """Write a video of a full turn around a sample."""
         path = self._next("orbit", ".mp4")
-        camera = sample.reference
-        up = camera.intrinsics.new_tensor(self.view.up.tolist())
-        scene, pivot = sample.gaussians, sample.pivot()
-        frames, _ = orbit_views(self.rasterizer(), scene, camera, pivot, self.frames, self.background, up)
+        up = sample.reference.intrinsics.new_tensor(self.view.up.tolist())
+        seen = sample.gaussians, sample.reference, sample.pivot()
+        frames, _ = orbit_views(self.rasterizer(), *seen, self.frames, self.background, up)
         write_video(path, frames)
         return path
 
@@ -143,13 +143,19 @@ class Saver:
 
 
 class Page:
-    """Controls and scene of one server, with a switch for each of `layers` layers. Its worker does the slow work."""
+    """Controls and scene of one server. Its worker does the slow work.
 
-    def __init__(self, server: GuardedServer, view: SplatView, saver: Saver, layers: int) -> None:
-        self.server, self.view, self.saver = server, view, saver
+    `scenes` are files and folders to choose from, by name. `complete` is called with an uploaded image and its name.
+    """
+
+    def __init__(self, server: GuardedServer, view: SplatView, saver: Saver, scenes: Mapping[str, Path]) -> None:
+        self.server, self.view, self.saver, self.scenes = server, view, saver, scenes
+        self.complete: Callable[[Path, str, viser.ClientHandle | None], None] | None = None
         self.worker = Worker(self.tell)
-        self.status = server.gui.add_markdown("", order=0)
-        self.looking = add_looking(server.gui, layers)
+        self.opening = add_opening(server.gui, [*scenes])
+        self.opening.upload.on_upload(self._upload)
+        self.opening.chosen.on_update(self._choose)
+        self.looking = add_looking(server.gui)
         self._connect_looking()
         self.saving = add_saving(server.gui, FORMATS)
         self.saving.save.on_click(self._save)
@@ -162,9 +168,40 @@ class Page:
         options = (*(f"sample {i + 1}" for i in range(max(1, len(samples)))), SIDE_BY_SIDE)
         if self.looking.chosen.options != options:
             self.looking.chosen.options = options
-        self.status.content = status
+        layers = max((sample.layers for sample in samples), default=0)
+        for i, box in enumerate(self.looking.layers):
+            box.visible = i < layers
+        say(self.server, status)
         if all(sample.finished for sample in samples):
             self.worker.submit("thumbnails", partial(self._draw_thumbnails, samples))
+
+    def open(self, path: Path, name: str) -> None:
+        """Show what `read_scene` reads instead of the samples, from the front."""
+        say(self.server, f"reading {name}")
+        samples, up = read_scene(path)
+        self.view.set_up(up)
+        self.show(samples, name)
+
+    def _choose(self, _: viser.GuiEvent[Any]) -> None:
+        name = self.opening.chosen.value
+        self.worker.submit("open", partial(self.open, self.scenes[name], name))
+
+    def _upload(self, event: viser.GuiEvent[Any]) -> None:
+        """Show an uploaded scene, or complete an uploaded image; its name is never used as a path."""
+        file, name = self.opening.upload.value, printable(self.opening.upload.value.name)
+        suffix = Path(name).suffix.lower()
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"upload{suffix if suffix in SPLATS else ''}"
+            path.write_bytes(file.content)
+            try:
+                if suffix in SPLATS:
+                    self.open(path, name)
+                elif self.complete is None:
+                    raise CompleteSplatError(f"{name}: not {', '.join(SPLATS)}; images need completesplat view IMAGE")
+                else:
+                    self.complete(path, name, event.client)
+            except CompleteSplatError as error:
+                self.tell(CompleteSplatError(str(error).replace(str(path), name)), event.client)
 
     def _draw_thumbnails(self, samples: Sequence[Sample]) -> None:
         """Render thumbnails in the worker's thread; a single sample needs none."""
@@ -179,6 +216,7 @@ class Page:
 
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
         """Show an error in one browser or in all; log it as well if it is a fault of the program."""
+        say(self.server, "")  # what was waited for
         text = str(error)
         if not isinstance(error, CompleteSplatError):
             text = f"{type(error).__name__}: {text}"
@@ -226,7 +264,7 @@ class Page:
                 return self.tell(error, client)
             for file in files:
                 client.send_file_download(file.name, file.read_bytes())
-            self.status.content = f"saved {', '.join(file.name for file in files)} in {self.saver.folder}"
+            client.add_notification("Saved", f"{', '.join(file.name for file in files)} in {self.saver.folder}")
 
         self.worker.submit(kind, save)
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import with_screen_space_dilation
-from completesplat.export.ply import read_ply
+from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 
@@ -61,7 +61,7 @@ class Sample:
 
 
 def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
-    """Read a `.ply`, or all samples in the folder of a prediction or fitted scene; return them and the direction up.
+    """Read a file of Gaussians, or all samples of a prediction or fitted scene; return them and the direction up.
 
     A file without `scene.json` beside it is seen by its `framing_camera`.
 
@@ -71,7 +71,7 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     files = [path] if path.is_file() else sorted([*path.glob("sample_*.ply"), *path.glob("scene.ply")])
     if not files:
         raise CompleteSplatError(f"{path}: no sample_*.ply or scene.ply in this folder")
-    scenes = [read_ply(file) for file in files]
+    scenes = [read_gaussians(file) for file in files]
     description = (path.parent if path.is_file() else path) / "scene.json"
     if not description.is_file() or not all(file.name.startswith(("sample_", "scene.")) for file in files):
         return [Sample(scene, 1, framing_camera(scene)) for scene in scenes], UP
@@ -94,7 +94,7 @@ def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
         raise CompleteSplatError(f"{path}: not the newest scenes of a run") from error
     samples = []
     for file, name, camera in described:
-        scene = read_ply(folder / Path(file).name)
+        scene = read_gaussians(folder / Path(file).name)
         samples.append(Sample(scene, _layers(scene, camera), camera, {"scene": name, "step": step}))
     return step, samples, up
 
@@ -108,8 +108,7 @@ def framing_camera(gaussians: Gaussians) -> Cameras:
     radius = distances[int(0.9 * (len(distances) - 1))].clamp(min=1e-3)
     back = 1.1 * radius / torch.tensor(FRAMING_FOV / 2).deg2rad().sin()
     eye = center - torch.tensor([0.0, 0.0, 1.0]) * back
-    intrinsics = pinhole(FRAMING_FOV, FRAMING_SIZE)
-    return Cameras(look_at(eye, center, torch.tensor(UP)), intrinsics, (FRAMING_SIZE, FRAMING_SIZE))
+    return Cameras(look_at(eye, center, torch.tensor(UP)), pinhole(FRAMING_FOV, FRAMING_SIZE), (FRAMING_SIZE,) * 2)
 
 
 def _layers(gaussians: Gaussians, reference: Cameras) -> int:

@@ -15,7 +15,7 @@ from viewer_scenes import balls
 from written_commands import ROOT
 
 from completesplat.commands.jobs import alone_in
-from completesplat.commands.view import LOADING, newest_scenes, settings_of, show_newest
+from completesplat.commands.view import newest_scenes, scenes_in, settings_of, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.training.fixed_scenes import write_newest
@@ -25,7 +25,7 @@ from completesplat.viewer.sample import UP
 def folder(path, *names: str):
     path.mkdir()
     for name in names:
-        (path / name).parent.mkdir(exist_ok=True)
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
         (path / name).write_bytes(b"")
     return path
 
@@ -39,17 +39,27 @@ def test_what_a_path_stands_for(tmp_path):
     assert settings_of(weights) == {"weights": str(weights)}
     assert settings_of(run) == {"weights": str(run / "weights")}
     assert settings_of(prediction) == {"scene": str(prediction)}
-    assert settings_of(outer) == {"scene": str(outer / "photo")}
+    assert settings_of(outer) == {"scene": str(outer)}
     assert settings_of(files / "A.PLY") == {"scene": str(files / "A.PLY")}
+    assert settings_of(files) == {"scene": str(files)}
     assert settings_of(files / "photo.jpg") == {"image": str(files / "photo.jpg")}
 
 
+def test_the_scenes_of_a_folder_can_be_chosen(tmp_path):
+    several = folder(
+        tmp_path / "s", "b/sample_00.ply", "a/scene.ply", "scenes/c/scene.ply", "A.PLY", "b.splat", "c.jpg"
+    )
+    names = ["A.PLY", "a", "b", "b.splat", "scenes/c"]
+    assert scenes_in(several) == {name: several / name for name in names}
+    assert scenes_in(several / "b") == {"b": several / "b"}  # whose files are samples of one scene
+    assert scenes_in(several / "b.splat") == {"b.splat": several / "b.splat"}
+    assert scenes_in(tmp_path / "nowhere") == {}
+
+
 def test_what_cannot_be_shown_is_refused(tmp_path):
-    folder(tmp_path / "several", "a/sample_00.ply", "b/sample_00.ply")
     for path, message in (
         ("nowhere.ply", "nowhere.ply: no such file or folder"),
-        (".", "neither weights (config.json, model.safetensors, here or in weights/) nor a prediction"),
-        ("several", "2 predictions: give one of them"),
+        (".", "neither weights nor scenes in it (config.json, model.safetensors, .ply, .splat, .spz)"),
     ):
         with pytest.raises(CompleteSplatError, match=re.escape(message)):
             settings_of(tmp_path / path)
@@ -139,7 +149,10 @@ def test_the_page_is_there_before_torch_and_says_that_it_is_loading(tmp_path):
             )
             with socket:
                 page = socket.recv(timeout=LIMIT)  # behind its size, before and after compression
-            assert LOADING.encode() in _infra.zstandard.ZstdDecompressor().decompressobj().decompress(page[16:])
+            assert (
+                b"completesplat: loading the model or scene"
+                in _infra.zstandard.ZstdDecompressor().decompressobj().decompress(page[16:])
+            )
         finally:
             process.kill()
 
