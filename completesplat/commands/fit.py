@@ -5,6 +5,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from hydra.utils import get_class
 from hydra.utils import instantiate as build
 from lightning import Trainer, seed_everything
 from lightning.pytorch.callbacks import WeightAveraging
@@ -18,10 +19,12 @@ from completesplat.commands.protocol import checkpoint_facts, protocol, write_js
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.results.runs import PLAN, read_record
 from completesplat.results.tables import evaluation_table, show
 from completesplat.settings.checks import check_image_size, check_optimizer, check_verb
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs
+from completesplat.training.per_scene import PerScene
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
 from completesplat.weights import RUN_WEIGHTS
@@ -65,6 +68,7 @@ def run(config: DictConfig, out: Path) -> None:
     """Train and test; write `metrics.csv`, checkpoints and at the end `metrics.json` into the run directory."""
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
+    refuse_without_effect(config, out)
     seed_everything(config.seed, verbose=False)
     data, module = instantiate(config)
     # A test that cannot work is refused now, not after the training.
@@ -113,6 +117,22 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
         for key in OTHER_WEIGHTS & part.keys():
             part[key] = None
     return str(path)
+
+
+def refuse_without_effect(config: DictConfig, out: Path) -> None:
+    """Raise CompleteSplatError for a setting of this run's command that its model does not use, or for no work at all.
+
+    Jobs of a sweep share their command with other models, so their settings pass.
+    """
+    stage = get_class(config.model._target_)
+    if issubclass(stage, PerScene) and stage.without_effect and not config.test:
+        raise CompleteSplatError(f"test=false: {stage.__name__} has nothing to train, it fits the test scenes; leave it out")
+    if (out.parent / PLAN).is_file():
+        return
+    for given in read_record(out).get("overrides", []):
+        name = given.lstrip("+~").partition("=")[0]
+        if name.startswith(getattr(stage, "without_effect", ())):
+            raise CompleteSplatError(f"{given}: {stage.__name__} does not use it; leave it out")
 
 
 def refuse_missing(config: DictConfig) -> None:
