@@ -87,12 +87,14 @@ def initial_gaussians(
     )
 
 
-def gaussians_at_points(points: Float[Tensor, "gaussian 3"], views: Views, opacity: float) -> RawGaussians:
-    """Return isotropic Gaussians [1 gaussian] as large as the mean distance to the three nearest points (3DGS).
-
-    Colours are means over the views [view] that contain a point, seen or hidden.
-    """
+def spacing(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Return each point's mean distance to the three nearest others, 3DGS's initial scale."""
     nearest = [torch.cdist(part, points).topk(4, largest=False).values[:, 1:] for part in points.split(500)]
+    return torch.cat(nearest).mean(-1).clamp(min=1e-6)
+
+
+def gaussians_at_points(points: Float[Tensor, "gaussian 3"], views: Views, opacity: float) -> RawGaussians:
+    """Return isotropic Gaussians [1 gaussian] of `spacing`; colours are means over the views [view] with the point."""
     pixels, depth = project(views.cameras, points.expand(len(views.images), -1, -1))
     height, width = views.cameras.image_size
     grid = 2 * pixels / pixels.new_tensor([width, height]) - 1
@@ -102,7 +104,7 @@ def gaussians_at_points(points: Float[Tensor, "gaussian 3"], views: Views, opaci
     colors = (torch.where(weights > 0, sampled, 0).sum(0) + 1e-3 * 0.5) / (weights.sum(0) + 1e-3)
     return RawGaussians(
         means=points[None],
-        log_scales=torch.cat(nearest).mean(-1).clamp(min=1e-6).log()[None, :, None].repeat(1, 1, 3),
+        log_scales=spacing(points).log()[None, :, None].repeat(1, 1, 3),
         quaternions=torch.tensor([1.0, 0, 0, 0], device=points.device).repeat(1, len(points), 1),
         logits=torch.full_like(points[None, :, 0], opacity).logit(),
         harmonics=(colors[None] - 0.5) / SH_C0,

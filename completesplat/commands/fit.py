@@ -126,7 +126,9 @@ def refuse_without_effect(config: DictConfig, out: Path) -> None:
     """
     stage = get_class(config.model._target_)
     if issubclass(stage, PerScene) and stage.without_effect and not config.test:
-        raise CompleteSplatError(f"test=false: {stage.__name__} has nothing to train, it fits the test scenes; leave it out")
+        raise CompleteSplatError(
+            f"test=false: {stage.__name__} has nothing to train, it fits the test scenes; leave it out"
+        )
     if (out.parent / PLAN).is_file():
         return
     for given in read_record(out).get("overrides", []):

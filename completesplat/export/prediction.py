@@ -167,7 +167,9 @@ def _write_sample(
     comments: Sequence[str],
 ) -> tuple[Frames, Float[Tensor, "1 height width"], dict[str, str]]:
     """Write a sample's splats and videos; return views around it, the first view's depth, and file names by purpose."""
-    files = write_scene(folder, f"sample_{index:02}", f"_{index:02}", scene, reference, rasterizer, up, wanted, comments)
+    files = write_scene(
+        folder, f"sample_{index:02}", f"_{index:02}", scene, reference, rasterizer, up, wanted, comments
+    )
     pivot = seen_center(rasterizer, scene, reference)
     views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
     return views, depths[0], files

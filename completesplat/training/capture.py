@@ -22,6 +22,7 @@ from completesplat.baselines.fitting import (
     RawGaussians,
     gaussians_at_points,
     initial_gaussians,
+    spacing,
 )
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import CompleteSplatError
@@ -115,7 +116,9 @@ class CaptureFit(Stage):
 
     def gaussians(self) -> Gaussians:
         """Return the fitted Gaussians [gaussian]."""
-        return RawGaussians(**{name: tensor[None, : int(self.count)] for name, tensor in self.raw.items()}).gaussians()[0]
+        return RawGaussians(**{name: tensor[None, : int(self.count)] for name, tensor in self.raw.items()}).gaussians()[
+            0
+        ]
 
     def sequence(self, split: str) -> PosedSequence:
         """Return the frames of a split of the capture; raise CompleteSplatError unless there is exactly one capture."""
@@ -149,6 +152,7 @@ class CaptureFit(Stage):
         scene = stack([self.data.store("train").scene(sequence, 0, range(1, len(sequence.frames)))]).to(self.device)
         views, most = self.in_world(scene, "train"), min(settings.initial, settings.most)
         raw = initial_gaussians(views, scene.depth_range, most, settings.opacity, generator)
+        raw = replace(raw, log_scales=spacing(raw.means[0]).log()[None, :, None].repeat(1, 1, 3))
         if sequence.points is not None:
             points = sequence.points[torch.randperm(len(sequence.points), generator=generator)[:most]]
             raw = gaussians_at_points(points.to(self.device), views[0], settings.opacity)
@@ -168,7 +172,7 @@ class CaptureFit(Stage):
         within = settings.refine_from * total <= step < settings.refine_until * total
         if within and step % settings.refine_every == 0:
             grown = min(settings.most, int(count * (1 + settings.growth)))
-            changed = relocate(self.raw, count, max(count, grown))
+            changed = relocate(dict(self.raw.items()), count, max(count, grown))
             for state in optimizer.state.values():
                 for key in ("exp_avg", "exp_avg_sq"):
                     state[key][changed] = 0
@@ -178,7 +182,11 @@ class CaptureFit(Stage):
         views, gaussians, settings = self.in_world(scenes, "train"), self.gaussians(), self.fitting
         images = self.render(gaussians[None], views.cameras)
         total, terms = self.loss(Prediction(images, gaussians[None], None), views, self.global_step)
-        total = total + settings.opacity_weight * gaussians.opacities.mean() + settings.scale_weight * gaussians.scales.mean()
+        total = (
+            total
+            + settings.opacity_weight * gaussians.opacities.mean()
+            + settings.scale_weight * gaussians.scales.mean()
+        )
         logged = {f"train/{name}": value for name, value in terms.items()}
         logged |= {"train/loss": total.detach(), "train/gaussians": self.count.float()}
         self.log_step(logged, batch_size=len(scenes.names))

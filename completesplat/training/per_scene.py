@@ -46,7 +46,14 @@ class PerScene(Stage):
 
     upper_bound = True
     fitted_to = "each scene's test views, the ones that it is scored on"
-    without_effect = ("optimizer", "schedule", "trainer.max_", "trainer.val_check_interval", "ckpt_path", "data.targets")
+    without_effect = (
+        "optimizer",
+        "schedule",
+        "trainer.max_",
+        "trainer.val_check_interval",
+        "ckpt_path",
+        "data.targets",
+    )
 
     def __init__(
         self,

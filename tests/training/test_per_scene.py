@@ -40,3 +40,16 @@ def test_fit_goes_straight_to_the_test(command, toy_root, tmp_path):
     assert metrics["steps"] == 0
     assert 0 < metrics["test"]["model"]["full"]["novel"]["psnr"] < 100
     assert 0 < metrics["test"]["model"]["empty_pixels"] <= 1
+
+
+@pytest.mark.parametrize(
+    ("setting", "reason"),
+    [
+        ("test=false", "test=false: PerScene has nothing to train, it fits the test scenes; leave it out"),
+        ("optimizer.lr=1", "optimizer.lr=1: PerScene does not use it; leave it out"),
+    ],
+)
+def test_a_fit_that_would_do_nothing_is_refused(command, toy_root, setting, reason):
+    refused = command("fit", "experiment=toy_var", "model=per_scene", f"data.root={toy_root}", setting)
+    assert (refused.status, refused.err.count("\n")) == (2, 1), refused.err
+    assert reason in refused.err
