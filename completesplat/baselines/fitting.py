@@ -89,7 +89,7 @@ def initial_gaussians(
 
 def spacing(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Return each point's mean distance to the three nearest others, 3DGS's initial scale."""
-    nearest = [torch.cdist(part, points).topk(4, largest=False).values[:, 1:] for part in points.split(500)]
+    nearest = [torch.cdist(part, points).topk(4, largest=False).values[:, 1:] for part in torch.split(points, 500)]
     return torch.cat(nearest).mean(-1).clamp(min=1e-6)
 
 

@@ -42,8 +42,6 @@ from completesplat.training.stage import Renders, Stage
 
 logger = logging.getLogger(__name__)
 
-CHANGED_SCENES = ("color_jitter", "box_masks", "horizontal_flip")
-
 
 @dataclass(frozen=True)
 class CaptureSettings:
@@ -62,15 +60,15 @@ class CaptureSettings:
     initial: Positive = 20_000
     most: Positive = 50_000
     opacity: Share = 0.1
-    refine_every: Positive = 100
-    refine_from: Share = 0.1
+    refine_every: Positive = 50
+    refine_from: Share = 0.05
     refine_until: Share = 0.8
     growth: Annotated[float, Range(0, 1)] = 0.05
     noise: Annotated[float, Range(0)] = 1.0
     opacity_weight: Annotated[float, Range(0)] = 0.01
     scale_weight: Annotated[float, Range(0)] = 0.01
-    position_rate: float = 5.0
-    other_rates: float = 2.0
+    position_rate: Annotated[float, Range(1e-3)] = 10.0
+    other_rates: Annotated[float, Range(0)] = 4.0
 
 
 class CaptureFit(Stage):
@@ -86,7 +84,7 @@ class CaptureFit(Stage):
         formats, videos, frames: as in `Wanted`, without `ply`. A format that needs a missing program is left out.
     """
 
-    without_effect = ("optimizer", "schedule", "data.targets", "data.spread_targets")
+    without_effect = ("optimizer", "schedule")
 
     def __init__(
         self,
@@ -108,17 +106,10 @@ class CaptureFit(Stage):
         self.count: Tensor
         self.register_buffer("count", torch.tensor(0))
 
-    @property
-    def fitted_to(self) -> str:
-        """Return what the Gaussians were fitted to, for tables."""
-        training, held_out = (len(self.sequence(split).frames) for split in ("train", "test"))
-        return f"the {training} training frames of the capture, and scored on the {held_out} held-out ones"
-
     def gaussians(self) -> Gaussians:
         """Return the fitted Gaussians [gaussian]."""
-        return RawGaussians(**{name: tensor[None, : int(self.count)] for name, tensor in self.raw.items()}).gaussians()[
-            0
-        ]
+        used = {name: tensor[None, : int(self.count)] for name, tensor in self.raw.items()}
+        return RawGaussians(**used).gaussians()[0]
 
     def sequence(self, split: str) -> PosedSequence:
         """Return the frames of a split of the capture; raise CompleteSplatError unless there is exactly one capture."""
@@ -143,7 +134,7 @@ class CaptureFit(Stage):
     @torch.no_grad()
     def on_fit_start(self) -> None:
         """Place the first Gaussians, unless a run is continued."""
-        if changed := [key for key in CHANGED_SCENES if getattr(self.data, key, None)]:
+        if changed := [key for key, value in self.data.augment.keywords.items() if value]:
             raise CompleteSplatError(f"data.{changed[0]}: model=capture fits the photos as they are; leave it out")
         sequence = self.sequence("train")
         if self.count:
@@ -166,27 +157,24 @@ class CaptureFit(Stage):
         step, total, settings = self.global_step, self.trainer.estimated_stepping_batches, self.fitting
         if step == 0:
             return
-        optimizer = self.optimizers(use_pl_optimizer=False)
+        (optimizer,) = self.trainer.optimizers
         count, rate = int(self.count), optimizer.param_groups[0]["lr"] / settings.position_rate
         self.raw["means"][:count] += settings.noise * position_noise(self.gaussians(), rate)
         within = settings.refine_from * total <= step < settings.refine_until * total
         if within and step % settings.refine_every == 0:
-            grown = min(settings.most, int(count * (1 + settings.growth)))
-            changed = relocate(dict(self.raw.items()), count, max(count, grown))
+            grown = max(count, min(settings.most, int(count * (1 + settings.growth))))
+            changed = relocate(dict(self.raw.items()), count, grown)
             for state in optimizer.state.values():
                 for key in ("exp_avg", "exp_avg_sq"):
                     state[key][changed] = 0
-            self.count.fill_(max(count, grown))
+            self.count.fill_(grown if len(changed) else count)
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
-        views, gaussians, settings = self.in_world(scenes, "train"), self.gaussians(), self.fitting
+        gaussians, views, settings = self.gaussians(), self.in_world(scenes, "train"), self.fitting
         images = self.render(gaussians[None], views.cameras)
         total, terms = self.loss(Prediction(images, gaussians[None], None), views, self.global_step)
-        total = (
-            total
-            + settings.opacity_weight * gaussians.opacities.mean()
-            + settings.scale_weight * gaussians.scales.mean()
-        )
+        total = total + settings.opacity_weight * gaussians.opacities.mean()
+        total = total + settings.scale_weight * gaussians.scales.mean()
         logged = {f"train/{name}": value for name, value in terms.items()}
         logged |= {"train/loss": total.detach(), "train/gaussians": self.count.float()}
         self.log_step(logged, batch_size=len(scenes.names))
@@ -211,6 +199,12 @@ class CaptureFit(Stage):
         """Return the mean direction up of the held-out photos, in the first one's frame."""
         poses = self.sequence("test").cameras.world_to_camera.float()
         return normalize(poses[0, :3, :3] @ -poses[:, 1, :3].mean(0), dim=-1)
+
+    def on_test_start(self) -> None:
+        """Note for tables what the Gaussians were fitted to."""
+        training, held_out = (len(self.sequence(split).frames) for split in ("train", "test"))
+        self.fitted_to = f"the {training} training frames of the capture, and scored on the {held_out} held-out ones"
+        super().on_test_start()
 
     def scene_scored(self, name: str, gaussians: Gaussians, cameras: Cameras, images: Renders, truth: Views) -> None:
         """Write the scene, the held-out frames beside their renders, videos, and a page if Node.js is installed."""

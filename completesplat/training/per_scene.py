@@ -46,14 +46,7 @@ class PerScene(Stage):
 
     upper_bound = True
     fitted_to = "each scene's test views, the ones that it is scored on"
-    without_effect = (
-        "optimizer",
-        "schedule",
-        "trainer.max_",
-        "trainer.val_check_interval",
-        "ckpt_path",
-        "data.targets",
-    )
+    without_effect: tuple[str, ...] = ("optimizer", "schedule", "trainer.max_", "trainer.val_check")
 
     def __init__(
         self,

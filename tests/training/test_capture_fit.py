@@ -56,7 +56,7 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
     assert {"scene.ply", "sheet.png", "orbit.mp4", "scene.json"} < files
     metrics = strict_json(tmp_path / "run/metrics.json")
     assert metrics["test"]["protocol"]["fitted_to"] == fitted
-    assert metrics["train/gaussians"] == int(int(200 * 1.05) * 1.05)  # It grew at steps 2 and 4, and ended at 6.4.
+    assert metrics["train/gaussians"] == int(int(int(200 * 1.05) * 1.05) * 1.05)  # at steps 2, 4 and 6
     one, other = (torch.load(tmp_path / run / "checkpoints/last.ckpt", weights_only=True) for run in ("run", "parts"))
     assert all(tensor.equal(other["state_dict"][name]) for name, tensor in one["state_dict"].items())
     # Seen from a held-out camera of transforms.json itself, the file shows what was scored.
