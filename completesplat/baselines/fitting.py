@@ -87,24 +87,20 @@ def initial_gaussians(
     )
 
 
-def spacing(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Return each point's mean distance to the three nearest others, 3DGS's initial scale."""
-    nearest = [torch.cdist(part, points).topk(4, largest=False).values[:, 1:] for part in torch.split(points, 500)]
-    return torch.cat(nearest).mean(-1).clamp(min=1e-6)
-
-
 def gaussians_at_points(points: Float[Tensor, "gaussian 3"], views: Views, opacity: float) -> RawGaussians:
-    """Return isotropic Gaussians [1 gaussian] of `spacing`; colours are means over the views [view] with the point."""
+    """Return Gaussians [1 gaussian] as large as the mean distance to the three nearest points (3DGS).
+
+    Colours are means over the views [view] that contain the point, whether it is seen or hidden there.
+    """
+    nearest = [torch.cdist(part, points).topk(4, largest=False).values[:, 1:] for part in torch.split(points, 500)]
     pixels, depth = project(views.cameras, points.expand(len(views.images), -1, -1))
-    height, width = views.cameras.image_size
-    grid = 2 * pixels / pixels.new_tensor([width, height]) - 1
-    inside = (depth > 0) & (grid.abs() < 1).all(-1)
+    grid = 2 * pixels / pixels.new_tensor(views.cameras.image_size[::-1]) - 1
+    inside = ((depth > 0) & (grid.abs() < 1).all(-1))[..., None]
     sampled = torch.nn.functional.grid_sample(views.images, grid[:, None], align_corners=False)[:, :, 0].mT
-    weights = inside[..., None].float()
-    colors = (torch.where(weights > 0, sampled, 0).sum(0) + 1e-3 * 0.5) / (weights.sum(0) + 1e-3)
+    colors = (sampled.where(inside, 0).sum(0) + 1e-3 * 0.5) / (inside.sum(0) + 1e-3)
     return RawGaussians(
         means=points[None],
-        log_scales=spacing(points).log()[None, :, None].repeat(1, 1, 3),
+        log_scales=torch.cat(nearest).mean(-1).clamp(min=1e-6).log()[None, :, None].repeat(1, 1, 3),
         quaternions=torch.tensor([1.0, 0, 0, 0], device=points.device).repeat(1, len(points), 1),
         logits=torch.full_like(points[None, :, 0], opacity).logit(),
         harmonics=(colors[None] - 0.5) / SH_C0,

@@ -24,7 +24,6 @@ from completesplat.results.tables import evaluation_table, show
 from completesplat.settings.checks import check_image_size, check_optimizer, check_verb
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs
-from completesplat.training.per_scene import PerScene
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
 from completesplat.weights import RUN_WEIGHTS
@@ -120,21 +119,14 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
 
 
 def refuse_without_effect(config: DictConfig, out: Path) -> None:
-    """Raise CompleteSplatError for a setting of this run's command that its model does not use, or for no work at all.
-
-    Jobs of a sweep share their command with other models, so their settings pass.
-    """
-    stage = get_class(config.model._target_)
-    if issubclass(stage, PerScene) and stage.without_effect and not config.test:
-        raise CompleteSplatError(
-            f"test=false: {stage.__name__} has nothing to train, it fits the test scenes; leave it out"
-        )
-    if (out.parent / PLAN).is_file():
-        return
-    for given in read_record(out).get("overrides", []):
-        name = given.lstrip("+~").partition("=")[0]
-        if name.startswith(getattr(stage, "without_effect", ())):
-            raise CompleteSplatError(f"{given}: {stage.__name__} does not use it; leave it out")
+    """Raise CompleteSplatError for a setting of a command, not of a sweep, that its model does not use."""
+    stage, given = get_class(config.model._target_), read_record(out).get("overrides", [])
+    unused: tuple[str, ...] = getattr(stage, "without_effect", ())
+    # Models that use no steps of the trainer only fit the scenes of a test.
+    unused += ("test=false",) if "trainer.max_" in unused else ()
+    for setting in [] if (out.parent / PLAN).is_file() else given:
+        if setting.lstrip("+~").startswith(unused):
+            raise CompleteSplatError(f"{setting}: {stage.__name__} does nothing with it; leave it out")
 
 
 def refuse_missing(config: DictConfig) -> None:

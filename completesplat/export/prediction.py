@@ -98,7 +98,8 @@ def write_prediction(
     files: dict[str, str] = {}
     for i, scene in enumerate(scenes):
         comments = [*(f"{name} {value}" for name, value in settings.items()), f"sample {i}"]
-        around, depth, written = _write_sample(folder, i, scene, reference, rasterizer, up, wanted, comments)
+        names = f"sample_{i:02}", f"_{i:02}"
+        around, depth, written = write_scene(folder, *names, scene, reference, rasterizer, up, wanted, comments)
         views.append(around)
         depths.append(depth)
         files |= written
@@ -156,25 +157,6 @@ def write_fitted_scene(
     write_scene_json(folder / "scene.json", reference, settings, seed, files)
 
 
-def _write_sample(
-    folder: Path,
-    index: int,
-    scene: Gaussians,
-    reference: Cameras,
-    rasterizer: Rasterizer,
-    up: Float[Tensor, "3"],
-    wanted: Wanted,
-    comments: Sequence[str],
-) -> tuple[Frames, Float[Tensor, "1 height width"], dict[str, str]]:
-    """Write a sample's splats and videos; return views around it, the first view's depth, and file names by purpose."""
-    files = write_scene(
-        folder, f"sample_{index:02}", f"_{index:02}", scene, reference, rasterizer, up, wanted, comments
-    )
-    pivot = seen_center(rasterizer, scene, reference)
-    views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
-    return views, depths[0], files
-
-
 def write_scene(
     folder: Path,
     name: str,
@@ -185,8 +167,12 @@ def write_scene(
     up: Float[Tensor, "3"],
     wanted: Wanted,
     comments: Sequence[str],
-) -> dict[str, str]:
-    """Write a scene's splats (`NAME.ply`, ...) and videos (`orbitSUFFIX.mp4`, ...); return file names by purpose."""
+) -> tuple[Frames, Float[Tensor, "1 height width"], dict[str, str]]:
+    """Write a scene's splats (`NAME.ply`, ...) and videos (`orbitSUFFIX.mp4`, ...).
+
+    Returns:
+        Views around the scene, the first view's depth, and file names by purpose.
+    """
     pivot = seen_center(rasterizer, scene, reference)
     view = PageView(reference, pivot, up, wanted.background)
     stored = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
@@ -196,7 +182,8 @@ def write_scene(
         cameras = PATHS[kind](reference, pivot, up, wanted.frames)
         frames, _ = render_views(rasterizer, scene, cameras, wanted.background)
         write_video(folder / f"{kind}{suffix}.mp4", frames)
-    return files
+    views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
+    return views, depths[0], files
 
 
 @torch.no_grad()

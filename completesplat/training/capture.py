@@ -22,7 +22,6 @@ from completesplat.baselines.fitting import (
     RawGaussians,
     gaussians_at_points,
     initial_gaussians,
-    spacing,
 )
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import CompleteSplatError
@@ -40,6 +39,8 @@ from completesplat.tensors import stack
 from completesplat.training.optimization import constant
 from completesplat.training.stage import Renders, Stage
 
+REFINED_SHARE = 0.8  # of the run, in which Gaussians move and are added (25,000 of 30,000 steps in 3DGS-MCMC)
+
 logger = logging.getLogger(__name__)
 
 
@@ -48,11 +49,9 @@ class CaptureSettings:
     """Settings of the Gaussians of a capture.
 
     Attributes:
-        initial, most: numbers of Gaussians at the start, and at most. Of more points, `initial` random ones are used.
+        initial, most: numbers of Gaussians at the start (at most as many as there are points) and at the end.
         opacity: initial opacity of all Gaussians.
-        refine_every: steps between relocations of dead Gaussians, each of which adds the share `growth` of new ones.
-        refine_from, refine_until: shares of the run between which this happens.
-        noise: factor on the noise of transparent Gaussians' positions.
+        refine_every: steps between relocations of dead Gaussians, which add the share `growth` of new ones.
         opacity_weight, scale_weight: weights of mean opacity and mean scale in the loss.
         position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
     """
@@ -61,10 +60,7 @@ class CaptureSettings:
     most: Positive = 50_000
     opacity: Share = 0.1
     refine_every: Positive = 50
-    refine_from: Share = 0.05
-    refine_until: Share = 0.8
     growth: Annotated[float, Range(0, 1)] = 0.05
-    noise: Annotated[float, Range(0)] = 1.0
     opacity_weight: Annotated[float, Range(0)] = 0.01
     scale_weight: Annotated[float, Range(0)] = 0.01
     position_rate: Annotated[float, Range(1e-3)] = 10.0
@@ -142,14 +138,13 @@ class CaptureFit(Stage):
         generator, settings = torch.Generator().manual_seed(0), self.fitting
         scene = stack([self.data.store("train").scene(sequence, 0, range(1, len(sequence.frames)))]).to(self.device)
         views, most = self.in_world(scene, "train"), min(settings.initial, settings.most)
-        raw = initial_gaussians(views, scene.depth_range, most, settings.opacity, generator)
-        raw = replace(raw, log_scales=spacing(raw.means[0]).log()[None, :, None].repeat(1, 1, 3))
-        if sequence.points is not None:
-            points = sequence.points[torch.randperm(len(sequence.points), generator=generator)[:most]]
-            raw = gaussians_at_points(points.to(self.device), views[0], settings.opacity)
-        self.count.fill_(raw.means.shape[1])
-        for name, tensor in vars(raw).items():
-            self.raw[name][: int(self.count)] = tensor[0]
+        if sequence.points is None:
+            points = initial_gaussians(views, scene.depth_range, most, settings.opacity, generator).means[0]
+        else:
+            points = sequence.points[torch.randperm(len(sequence.points), generator=generator)[:most]].to(self.device)
+        for name, tensor in vars(gaussians_at_points(points, views[0], settings.opacity)).items():
+            self.raw[name][: len(points)] = tensor[0]
+        self.count.fill_(len(points))
 
     @torch.no_grad()
     def on_train_batch_start(self, batch: SceneBatch, index: int) -> None:
@@ -159,9 +154,8 @@ class CaptureFit(Stage):
             return
         (optimizer,) = self.trainer.optimizers
         count, rate = int(self.count), optimizer.param_groups[0]["lr"] / settings.position_rate
-        self.raw["means"][:count] += settings.noise * position_noise(self.gaussians(), rate)
-        within = settings.refine_from * total <= step < settings.refine_until * total
-        if within and step % settings.refine_every == 0:
+        self.raw["means"][:count] += position_noise(self.gaussians(), rate)
+        if step % settings.refine_every == 0 and step < REFINED_SHARE * total:
             grown = max(count, min(settings.most, int(count * (1 + settings.growth))))
             changed = relocate(dict(self.raw.items()), count, grown)
             for state in optimizer.state.values():
@@ -212,7 +206,7 @@ class CaptureFit(Stage):
             return
         sequence, scene, wanted = self.sequence("test"), self.gaussians().detach(), self.wanted
         poses = cameras.world_to_camera @ sequence.cameras.world_to_camera[0].to(cameras.world_to_camera)
-        placed, up = replace(cameras, world_to_camera=poses), self.up @ poses[0, :3, :3].cpu()
+        placed, up = replace(cameras, world_to_camera=poses), self.up.to(poses) @ poses[0, :3, :3]
         try:
             needed = set(wanted.formats) & set(CONVERTED)
             wanted = replace(wanted, converter=find_splat_transform() if needed else None)
@@ -220,8 +214,8 @@ class CaptureFit(Stage):
             logger.warning("left out: %s", error)
             wanted = replace(wanted, formats=[kind for kind in wanted.formats if kind not in CONVERTED])
         make_folder(self.folder)
-        around = scene.to("cpu"), placed[0].to("cpu"), self.rasterizer, up, wanted, [f"scene {name}"]
-        files = write_scene(self.folder, "scene", "", *around)
+        around = scene, placed[0], self.rasterizer, up, wanted, [f"scene {name}"]
+        *_, files = write_scene(self.folder, "scene", "", *around)
         title = f"{name}: held-out photos, Gaussians fitted to the {len(self.sequence('train').frames)} others"
         seed = self.evaluation.scene_seed(name)
         write_fitted_scene(

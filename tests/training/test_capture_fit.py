@@ -16,7 +16,7 @@ from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.training.capture import CaptureFit
 
 FRAMES, STEPS = 9, 8
-FITTING = {"initial": 200, "most": 260, "refine_every": 2, "refine_from": 0}
+FITTING = {"initial": 200, "most": 260, "refine_every": 2}
 QUICK = ["experiment=capture", "data.root=capture", "data.image_size=12", f"trainer.max_steps={STEPS}"]
 QUICK += [
     "trainer.accelerator=cpu",
@@ -73,7 +73,7 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ("optimizer.lr=1", "optimizer.lr=1: CaptureFit does not use it; leave it out"),
+        ("optimizer.lr=1", "optimizer.lr=1: CaptureFit does nothing with it; leave it out"),
         ("data.horizontal_flip=true", "data.horizontal_flip: model=capture fits the photos as they are"),
         ("data.root=.", "has 2 sequences; model=capture fits one capture"),
     ],

@@ -46,8 +46,8 @@ def test_fit_goes_straight_to_the_test(command, toy_root, tmp_path):
 @pytest.mark.parametrize(
     ("setting", "reason"),
     [
-        ("test=false", "test=false: PerScene has nothing to train, it fits the test scenes; leave it out"),
-        ("optimizer.lr=1", "optimizer.lr=1: PerScene does not use it; leave it out"),
+        ("test=false", "test=false: PerScene does nothing with it; leave it out"),
+        ("optimizer.lr=1", "optimizer.lr=1: PerScene does nothing with it; leave it out"),
     ],
 )
 def test_a_fit_that_would_do_nothing_is_refused(command, toy_root, setting, reason):
