@@ -1,7 +1,7 @@
 """Optimisation of 3D Gaussians for single scenes from posed views (Kerbl et al. 2023, "3D Gaussian Splatting").
 
-There is no densification and no pruning, so the number of Gaussians stays constant. They start from random pixels at
-random depths instead of a structure-from-motion cloud, because a data set may lack one.
+`fit_gaussians` has no densification and no pruning, so its number of Gaussians stays constant (`densification` has
+both). They start from random pixels at random depths, or from points, where a data set has them.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import pixel_centers, unproject
+from completesplat.geometry.cameras import pixel_centers, project, unproject
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
@@ -84,6 +84,26 @@ def initial_gaussians(
         quaternions=torch.tensor([1.0, 0, 0, 0], device=device).repeat(batch, count, 1),
         logits=torch.full_like(depth, opacity).logit(),
         harmonics=(views.images.flatten(-2)[scene, view, :, pixel] - 0.5) / SH_C0,
+    )
+
+
+def gaussians_at_points(points: Float[Tensor, "gaussian 3"], views: Views, opacity: float) -> RawGaussians:
+    """Return Gaussians [1 gaussian] as large as the mean distance to the three nearest points (3DGS).
+
+    Colours are means over the views [view] that contain the point, whether it is seen or hidden there.
+    """
+    nearest = [torch.cdist(part, points).topk(4, largest=False).values[:, 1:] for part in torch.split(points, 500)]
+    pixels, depth = project(views.cameras, points.expand(len(views.images), -1, -1))
+    grid = 2 * pixels / pixels.new_tensor(views.cameras.image_size[::-1]) - 1
+    inside = ((depth > 0) & (grid.abs() < 1).all(-1))[..., None]
+    sampled = torch.nn.functional.grid_sample(views.images, grid[:, None], align_corners=False)[:, :, 0].mT
+    colors = (sampled.where(inside, 0).sum(0) + 1e-3 * 0.5) / (inside.sum(0) + 1e-3)
+    return RawGaussians(
+        means=points[None],
+        log_scales=torch.cat(nearest).mean(-1).clamp(min=1e-6).log()[None, :, None].repeat(1, 1, 3),
+        quaternions=torch.tensor([1.0, 0, 0, 0], device=points.device).repeat(1, len(points), 1),
+        logits=torch.full_like(points[None, :, 0], opacity).logit(),
+        harmonics=(colors[None] - 0.5) / SH_C0,
     )
 
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +31,12 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.geometry.trajectories import PATHS
+from completesplat.metrics.images import psnr
 from completesplat.rasterizers import Rasterizer
 
 DIRECTIONS = 8
 CONVENTIONS = {
-    "axes": "OpenCV: +x right, +y down, +z forward, seen from the reference camera",
+    "axes": "cameras have OpenCV's: +x right, +y down, +z forward; world_to_camera says where the world's are",
     "world_to_camera": "4 x 4, rows first; maps homogeneous world points (as columns) to camera points",
     "intrinsics": "3 x 3, rows first, in pixels; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)",
     "image_size": "(height, width) in pixels",
@@ -97,7 +98,8 @@ def write_prediction(
     files: dict[str, str] = {}
     for i, scene in enumerate(scenes):
         comments = [*(f"{name} {value}" for name, value in settings.items()), f"sample {i}"]
-        around, depth, written = _write_sample(folder, i, scene, reference, rasterizer, up, wanted, comments)
+        names = f"sample_{i:02}", f"_{i:02}"
+        around, depth, written = write_scene(folder, *names, scene, reference, rasterizer, up, wanted, comments)
         views.append(around)
         depths.append(depth)
         files |= written
@@ -116,32 +118,49 @@ def write_prediction(
 
 
 def write_fitted_scene(
-    folder: Path, name: str, scene: Gaussians, cameras: Cameras, images: Frames, truth: Frames, seed: int
+    folder: Path,
+    name: str,
+    title: str,
+    scene: Gaussians,
+    cameras: Cameras,
+    images: Frames,
+    truth: Frames,
+    seed: int,
+    scale: float = 1.0,
+    more: Mapping[str, str] | None = None,
 ) -> None:
-    """Write `scene.ply`, `sheet.png` (true and rendered images of at most 8 views) and `scene.json`.
+    """Write `scene.ply`, `sheet.png` (true and rendered images of at most 8 views, with PSNR) and `scene.json`.
 
     Args:
-        scene: in the frame of the first camera, whose image also defines the direction up.
+        title: heading of the sheet; says what the scene was fitted to.
+        scene: in the world of the cameras.
         images, truth: rendered and true images of the cameras.
+        scale: units of the world in one unit of the files.
+        more: other files of the scene by purpose, for `scene.json`.
 
     Raises:
         CompleteSplatError: no Gaussian of the scene can be stored.
     """
     make_folder(folder.parent)
     make_folder(folder)
-    stored = with_screen_space_dilation(cleaned(scene, name), cameras[0])
+    enlarged = with_screen_space_dilation(cleaned(scene, name), cameras[0])
+    stored = replace(enlarged, means=enlarged.means / scale, scales=enlarged.scales / scale)
     write_ply(folder / "scene.ply", stored, [f"scene {name}"])
     indices = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
     rows = [strip(truth[indices].clamp(0, 1), "true"), strip(images[indices].clamp(0, 1), "fitted")]
-    write_png(folder / "sheet.png", image_sheet([f"view {i}" for i in indices], rows, name))
-    files = {"scene": "scene.ply", "sheet": "sheet.png"}
+    scores = psnr(images[indices].clamp(0, 1), truth[indices]).tolist()
+    headings = [f"view {i}: {score:.2f} dB" for i, score in zip(indices, scores, strict=True)]
+    write_png(folder / "sheet.png", image_sheet(headings, rows, title))
+    reference = cameras[0].scale_world(torch.tensor(1 / scale).to(cameras.intrinsics))
     settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True}
-    write_scene_json(folder / "scene.json", cameras[0], settings, seed, files)
+    files = {"scene": "scene.ply", "sheet": "sheet.png", **(more or {})}
+    write_scene_json(folder / "scene.json", reference, settings, seed, files)
 
 
-def _write_sample(
+def write_scene(
     folder: Path,
-    index: int,
+    name: str,
+    suffix: str,
     scene: Gaussians,
     reference: Cameras,
     rasterizer: Rasterizer,
@@ -149,16 +168,20 @@ def _write_sample(
     wanted: Wanted,
     comments: Sequence[str],
 ) -> tuple[Frames, Float[Tensor, "1 height width"], dict[str, str]]:
-    """Write a sample's splats and videos; return views around it, the first view's depth, and file names by purpose."""
+    """Write a scene's splats (`NAME.ply`, ...) and videos (`orbitSUFFIX.mp4`, ...).
+
+    Returns:
+        Views around the scene, the first view's depth, and file names by purpose.
+    """
     pivot = seen_center(rasterizer, scene, reference)
     view = PageView(reference, pivot, up, wanted.background)
     stored = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
-    files = write_formats(folder, f"sample_{index:02}", stored, wanted.formats, view, wanted.converter, comments)
+    files = write_formats(folder, name, stored, wanted.formats, view, wanted.converter, comments)
     for kind in wanted.videos:
-        files[f"{kind}_{index:02}"] = f"{kind}_{index:02}.mp4"
+        files[f"{kind}{suffix}"] = f"{kind}{suffix}.mp4"
         cameras = PATHS[kind](reference, pivot, up, wanted.frames)
         frames, _ = render_views(rasterizer, scene, cameras, wanted.background)
-        write_video(folder / f"{kind}_{index:02}.mp4", frames)
+        write_video(folder / f"{kind}{suffix}.mp4", frames)
     views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
     return views, depths[0], files
 

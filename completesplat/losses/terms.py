@@ -15,6 +15,13 @@ class MeanSquaredError:
         return nn.functional.mse_loss(prediction.images, truth.images)
 
 
+class MeanAbsoluteError:
+    """Mean over all pixels, channels and views (3DGS's loss, first term)."""
+
+    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        return nn.functional.l1_loss(prediction.images, truth.images)
+
+
 class StructuralDissimilarity:
     """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term; the paper may mean half of it)."""
 

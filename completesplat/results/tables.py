@@ -194,7 +194,8 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
         columns.append((f"{LABELS[region]}\n{view}\n{METRICS[kind]}", name, FORMATS[kind]))
     first = records[0]
     result = table(f"{first['scenes']} scenes, {first['views']} novel views", columns, records)
-    return replace(result, remarks=[SSIM_NOTE])
+    fitted = [f"{name}: fitted to {entry['fitted_to']}." for name, entry in results.items() if entry.get("fitted_to")]
+    return replace(result, remarks=[*fitted, SSIM_NOTE])
 
 
 def show(*tables: Table, width: int = 120) -> None:

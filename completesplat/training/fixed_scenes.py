@@ -202,6 +202,8 @@ def layer_figures(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, float]:
     layer whose opacity goes to zero is dead: it adds no hidden surfaces.
     """
     size, on_object = scenes.reference.images.shape[-2:], scenes.reference.masks[:, 0]
+    if gaussians.count % size.numel():
+        return {}  # no layers, but Gaussians that were fitted to a capture
     layers = gaussians.map(lambda tensor: tensor.view(len(tensor), -1, *size, *tensor.shape[2:]))  # by pixels
     figures = {}
     for layer in range(layers.opacities.shape[1]):

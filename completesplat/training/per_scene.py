@@ -45,6 +45,8 @@ class PerScene(Stage):
     """
 
     upper_bound = True
+    fitted_to = "each scene's test views, the ones that it is scored on"
+    without_effect: tuple[str, ...] = ("optimizer", "schedule", "trainer.max_", "trainer.val_check")
 
     def __init__(
         self,
@@ -64,7 +66,8 @@ class PerScene(Stage):
             return
         folder, seed = self.scenes_folder / safe_name(name), self.evaluation.scene_seed(name)
         try:
-            write_fitted_scene(folder, name, gaussians[0], cameras, images[0], truth.images, seed)
+            title = f"{name}: fitted to these views"
+            write_fitted_scene(folder, name, title, gaussians[0], cameras, images[0], truth.images, seed)
         except CompleteSplatError as error:
             logger.warning("%s: %s", folder, error)
 
@@ -183,6 +186,8 @@ class PreoptimizedVAE(Preoptimized):
         opacity_weight, kl_weight: weights in the loss.
         **preoptimized: see `Preoptimized`.
     """
+
+    without_effect = ()
 
     def __init__(
         self,

@@ -78,6 +78,12 @@ class Stage(LightningModule):
     upper_bound = False
     """Whether the model has seen the views that it is scored on."""
 
+    fitted_to: str | None = None
+    """What Gaussians are fitted to, if scenes are fitted rather than predicted; for tables."""
+
+    without_effect: tuple[str, ...] = ()
+    """Beginnings of the names of settings that this model does not use, which are refused where a user gives them."""
+
     draws_samples = False
     """Whether the model has several answers for one image."""
 
@@ -260,7 +266,7 @@ class Stage(LightningModule):
         # The first duration includes work that is done once.
         seconds = {name: statistics.median(values[1:] or values) for name, values in self.seconds.items()}
         results = self.evaluation.results()
-        results["model"] |= {"upper_bound": self.upper_bound, "seconds": seconds}
+        results["model"] |= {"upper_bound": self.upper_bound, "fitted_to": self.fitted_to, "seconds": seconds}
         return results
 
     def predict_step(self, scenes: SceneBatch, index: int) -> Gaussians:

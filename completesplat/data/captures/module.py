@@ -3,11 +3,13 @@
 import hashlib
 import shlex
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import torch
 
 from completesplat.data.captures.capture import Capture, CapturedFrame
 from completesplat.data.captures.colmap import read_colmap
@@ -16,6 +18,7 @@ from completesplat.data.images.crop import cut_square
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.placement import (
+    OBJECT_HALF_SIZE,
     ObjectFraming,
     from_cameras,
     from_points,
@@ -106,7 +109,11 @@ class CaptureSource(SequenceSource):
             placement = from_points(near, upright_axes(cameras), "the point cloud")
         numbers = self._members(len(capture.frames))
         read = partial(_read, name, [capture.frames[number] for number in numbers], self.framing.image_size)
-        return placed_sequence(name, numbers, [cameras[number] for number in numbers], placement, self.framing, read)
+        scale = OBJECT_HALF_SIZE / placement.half_size
+        points = None if capture.points is None else torch.from_numpy(scale * capture.points).float()
+        selected = [cameras[number] for number in numbers]
+        sequence = placed_sequence(name, numbers, selected, placement, self.framing, read)
+        return replace(sequence, points=points, scale=scale)
 
 
 def _read(name: str, frames: list[CapturedFrame], size: int, index: int) -> MaskedImage:

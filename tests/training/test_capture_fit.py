@@ -1,0 +1,100 @@
+"""Gaussians of a capture: fitted to the training frames alone, written in the capture's axes, continued bit by bit."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from support import strict_json, write_capture
+
+from completesplat.data.captures.capture import CapturedFrame
+from completesplat.data.captures.module import CaptureDataModule
+from completesplat.data.captures.transforms_json import read_transforms
+from completesplat.export.ply import read_ply
+from completesplat.geometry.cameras import crop_resize
+from completesplat.rasterizers import RenderingConstants
+from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.training.capture import CaptureFit
+
+FRAMES, STEPS = 9, 8
+FITTING = {"initial": 200, "most": 260, "refine_every": 2}
+QUICK = ["experiment=capture", "data.root=capture", "data.image_size=12", f"trainer.max_steps={STEPS}"]
+QUICK += [
+    "trainer.accelerator=cpu",
+    "trainer.val_check_interval=100",
+    "rasterizer=reference",
+    "callbacks.progress=null",
+]
+QUICK += [*(f"model.fitting.{key}={value}" for key, value in FITTING.items()), "model.formats=[]", "model.frames=2"]
+QUICK += ["callbacks.checkpoint.every_n_train_steps=4"]
+
+
+@pytest.fixture
+def capture(tmp_path):
+    write_capture(tmp_path / "capture", FRAMES)
+    return tmp_path / "capture"
+
+
+def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, capture, tmp_path, monkeypatch):
+    read, original, step = [], CapturedFrame.read, CaptureFit.training_step
+    monkeypatch.setattr(CapturedFrame, "read", lambda self: read.append(self.number) or original(self))
+
+    def interrupted_step(self, *inputs):
+        if self.global_step == 6:
+            raise KeyboardInterrupt
+        return step(self, *inputs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CaptureFit, "training_step", interrupted_step)
+        assert command("fit", *QUICK, "out=parts").status != 0
+    assert set(read) == set(range(FRAMES)) - {0, 4, 8}  # At least two of nine are held out, so every fourth is.
+    assert command("fit", *QUICK, "ckpt_path=last", "out=parts").status == 0
+    finished = command("fit", *QUICK, "out=run")
+    assert finished.status == 0, finished.err
+    fitted = "the 6 training frames of the capture, and scored on the 3 held-out ones"
+    assert f"fitted to {fitted}" in finished.out
+    files = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"scene.ply", "sheet.png", "orbit.mp4", "scene.json"} < files
+    metrics = strict_json(tmp_path / "run/metrics.json")
+    assert metrics["test"]["protocol"]["fitted_to"] == fitted
+    assert metrics["train/gaussians"] == int(int(int(200 * 1.05) * 1.05) * 1.05)  # at steps 2, 4 and 6
+    one, other = (torch.load(tmp_path / run / "checkpoints/last.ckpt", weights_only=True) for run in ("run", "parts"))
+    assert all(tensor.equal(other["state_dict"][name]) for name, tensor in one["state_dict"].items())
+    # Seen from a held-out camera of transforms.json itself, the file shows what was scored.
+    frame = read_transforms(capture / "transforms.json").frames[0]
+    camera = crop_resize(frame.camera(), 2, 0, 12, 12).to(torch.float32)
+    rasterizer = ReferenceRasterizer(RenderingConstants(blur=0))
+    render = rasterizer(read_ply(tmp_path / "run/scene.ply")[None], camera[None][None]).over(0.5)[0, 0]
+    truth = torch.from_numpy(np.array(frame.read()[0])).movedim(-1, 0)[:, :, 2:14] / 255
+    score = -10 * (render.clamp(0, 1) - truth).square().mean().log10()
+    assert score.item() == pytest.approx(metrics["test"]["model"]["full"]["reference"]["psnr"], abs=0.5)
+    Image.open(tmp_path / "run/sheet.png").verify()
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ("optimizer.lr=1", "optimizer.lr=1: CaptureFit does nothing with it; leave it out"),
+        ("data.horizontal_flip=true", "data.horizontal_flip: model=capture fits the photos as they are"),
+        ("data.root=.", "has 2 sequences; model=capture fits one capture"),
+    ],
+)
+def test_settings_without_effect_and_several_captures_are_refused(command, capture, tmp_path, change, reason):
+    write_capture(tmp_path / "other", FRAMES)
+    refused = command("fit", *QUICK, change)
+    assert (refused.status, refused.err.count("\n")) == (2, 1), refused.err
+    assert reason in refused.err
+
+
+def test_points_of_a_reconstruction_are_in_the_cameras_units(tmp_path):
+    write_capture(tmp_path / "capture", FRAMES)
+    points = [[0.5, 0.25, -0.125], [0, -0.5, 0], [1, 0, 0], [-1, 0, 0.5]]
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    (tmp_path / "capture/points.ply").write_text(header + "".join("{} {} {}\n".format(*point) for point in points))
+    path = tmp_path / "capture/transforms.json"
+    path.write_text(path.read_text().replace('{"camera', '{"ply_file_path": "points.ply", "camera'))
+    sequence = CaptureDataModule(str(tmp_path / "capture"), image_size=12).source("train").read("capture")
+    frame = read_transforms(path).frames[1].camera()
+    torch.testing.assert_close(sequence.points / sequence.scale, torch.tensor(points))
+    torch.testing.assert_close(sequence.cameras[0].centers / sequence.scale, frame.centers)
