@@ -24,6 +24,7 @@ from completesplat.data.images.photograph import Photograph, outside_of_box, out
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
+from completesplat.export.mesh import check_available
 from completesplat.export.prediction import Wanted, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.files import folder_names, printable, safe_name
@@ -88,11 +89,13 @@ def wanted_files(config: DictConfig) -> Wanted:
     """Return the outputs to write for each image.
 
     Raises:
-        CompleteSplatError: no such format or camera path, no format at all, or no converter for one that needs it.
+        CompleteSplatError: no such format or camera path, no format at all, or no program for one that needs it.
     """
     formats = _chosen("formats", config.formats, FORMATS)
     if not formats:
         raise CompleteSplatError(f"formats=[]: choose from {', '.join(FORMATS)}")
+    if "mesh" in formats:
+        check_available()
     return Wanted(
         formats=formats,
         videos=_chosen("video", config.video, PATHS),

@@ -153,7 +153,9 @@ def _write_sample(
     pivot = seen_center(rasterizer, scene, reference)
     view = PageView(reference, pivot, up, wanted.background)
     stored = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
-    files = write_formats(folder, f"sample_{index:02}", stored, wanted.formats, view, wanted.converter, comments)
+    files = write_formats(
+        folder, f"sample_{index:02}", stored, wanted.formats, view, wanted.converter, comments, rasterizer
+    )
     for kind in wanted.videos:
         files[f"{kind}_{index:02}"] = f"{kind}_{index:02}.mp4"
         cameras = PATHS[kind](reference, pivot, up, wanted.frames)
