@@ -40,6 +40,12 @@ FAR = 1.5
 """Ratio of tan(fov / 2), photo to training, from which a warning is given."""
 UNLIKE = 2.0
 """Distance from the training images (`distance_to_training`) from which a warning is given."""
+# The network has 56.4 million numbers in float32; its authors' checkpoint may hold more.
+ELSEWHERE = (
+    "; for an object try weights=splatter_image:objaverse background=remove (MIT, downloads at least 226 MB) or"
+    " github.com/VAST-AI-Research/TripoSplat (MIT), for a scene github.com/apple/ml-sharp (weights for research only);"
+    " view and test scenes= read the PLY files of both projects"
+)
 
 log = logging.getLogger(__name__)
 
@@ -246,13 +252,13 @@ def remarks(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]
 
 
 def nearer_weights(photograph: Photograph, distance: float) -> str:
-    """Name the shipped weights whose training images are nearer to a photo; return "" if there are none."""
+    """Name the shipped weights whose training images are nearer to a photo, and `ELSEWHERE` if these are far, too."""
     nearest = ""
     for name, folder in shipped().items():
         other = distance_to_training(photograph, json.loads(read_small(folder / CONFIG_FILE)))
         if other is not None and other < distance:
             nearest, distance = f"; weights={name} were trained on images that are nearer ({other:.1f})", other
-    return nearest
+    return nearest + (ELSEWHERE if distance > UNLIKE else "")
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:
