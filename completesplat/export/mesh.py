@@ -97,12 +97,12 @@ def looked_up(points: Points, cameras: Cameras, maps: Maps) -> Iterator[tuple[Te
 
 def distances(points: Points, cameras: Cameras, depths: Maps, truncation: float) -> Float[Tensor, " point"]:
     """Return mean signed distances to the surfaces in units of the truncation, from -1 (inside, unseen) to 1."""
-    total, count = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
+    total, weights = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
     for (depth,), ahead in looked_up(points, cameras, depths):
         distance = ((torch.where(depth > 0, depth, torch.inf) - ahead) / truncation).clamp(max=1)
-        total += torch.where(distance > -1, distance, 0)
-        count += distance > -1
-    return torch.where(count > 0, total / count.clamp(min=1), -1)
+        weight = (1 + distance).clamp(0, 1)  # behind a surface, less is known
+        total, weights = total + weight * distance.clamp(min=-1), weights + weight
+    return torch.where(weights > 0, total / weights.clamp(min=1e-6), -1)
 
 
 def surface_of(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Faces, Points]:
