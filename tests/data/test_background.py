@@ -89,7 +89,7 @@ def test_without_rembg_grabcut_keeps_the_largest_piece_that_differs_from_the_bor
     assert not alpha[speck].any()
     assert "removed by GrabCut" in caplog.text
     assert "rembg is better" in caplog.text
-    thin = Image.new("RGB", (3000, 8), "red")  # of which grabCut would see nothing
+    thin = Image.new("RGB", (3000, 8), "red")
     with pytest.raises(ImageError, match="no object is found"):
         without_background(thin)
 

@@ -92,6 +92,14 @@ def test_each_side_of_a_cube_has_its_colour_on_the_right_side(tmp_path):
         assert ((result.vertex_normals[inner] @ outward) > 0.5).all()
 
 
+def test_what_no_view_sees_is_inside_and_what_lies_before_surfaces_or_emptiness_outside():
+    cameras = mesh.cameras_around(torch.zeros(3), 1.0, 0.5)  # at a distance of sqrt(5)
+    center, ahead, depths = torch.zeros(1, 3), 5**0.5, torch.ones(20, 1, 96, 96)
+    for depth, expected in ((ahead - 0.21, -1.0), (ahead - 0.1, -0.5), (ahead, 0), (ahead + 0.1, 0.5), (9, 1), (0, 1)):
+        result = mesh.distances(center, cameras, depths * depth, 0.2)
+        torch.testing.assert_close(result, torch.tensor([float(expected)]), rtol=0, atol=1e-4)
+
+
 def test_every_field_gives_a_closed_surface():
     field = np.random.default_rng(0).standard_normal((12, 12, 12)).astype(np.float32)
     corners, faces, _ = mesh.surface_of(field)

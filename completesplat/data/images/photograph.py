@@ -240,10 +240,10 @@ def by_grabcut(image: Image.Image) -> Image.Image:
         raise CompleteSplatError(f"background=remove needs rembg or OpenCV: {extras}") from error
     width, height = (max(SMALLEST_SIDE, round(side * GRABCUT_SIDE / max(image.size))) for side in image.size)
     small, labels = np.array(image.resize((width, height))), np.zeros((height, width), np.uint8)
-    x, y = (max(1, side // 30) for side in (width, height))
+    x, y = width // 30, height // 30  # at least one of them is above 0
     models = np.zeros((2, 1, 65))
     cv2.setRNGSeed(0)
-    cv2.grabCut(small, labels, (x, y, width - 2 * x, height - 2 * y), *models, 5, cv2.GC_INIT_WITH_RECT)
+    cv2.grabCut(small, labels, (x, y, width - 2 * x, height - 2 * y), models[0], models[1], 5, cv2.GC_INIT_WITH_RECT)
     _, pieces, statistics, _ = cv2.connectedComponentsWithStats(labels & 1)
     sizes = [0, *statistics[1:, cv2.CC_STAT_AREA]]  # the first piece is the background
     mask = (pieces == np.argmax(sizes)) & (labels & 1 > 0)
