@@ -24,6 +24,7 @@ from completesplat.data.images.photograph import Photograph, outside_of_box, out
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
+from completesplat.export.mesh import check_available
 from completesplat.export.prediction import Wanted, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.files import folder_names, printable, safe_name
@@ -39,6 +40,12 @@ FAR = 1.5
 """Ratio of tan(fov / 2), photo to training, from which a warning is given."""
 UNLIKE = 2.0
 """Distance from the training images (`distance_to_training`) from which a warning is given."""
+# The network has 56.4 million numbers in float32; its authors' checkpoint may hold more.
+ELSEWHERE = (
+    "; for an object try weights=splatter_image:objaverse background=remove (MIT, downloads at least 226 MB) or"
+    " github.com/VAST-AI-Research/TripoSplat (MIT), for a scene github.com/apple/ml-sharp (weights for research only);"
+    " view and test scenes= read the PLY files of both projects"
+)
 
 log = logging.getLogger(__name__)
 
@@ -88,11 +95,13 @@ def wanted_files(config: DictConfig) -> Wanted:
     """Return the outputs to write for each image.
 
     Raises:
-        CompleteSplatError: no such format or camera path, no format at all, or no converter for one that needs it.
+        CompleteSplatError: no such format or camera path, no format at all, or no program for one that needs it.
     """
     formats = _chosen("formats", config.formats, FORMATS)
     if not formats:
         raise CompleteSplatError(f"formats=[]: choose from {', '.join(FORMATS)}")
+    if "mesh" in formats:
+        check_available()
     return Wanted(
         formats=formats,
         videos=_chosen("video", config.video, PATHS),
@@ -243,13 +252,13 @@ def remarks(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]
 
 
 def nearer_weights(photograph: Photograph, distance: float) -> str:
-    """Name the shipped weights whose training images are nearer to a photo; return "" if there are none."""
+    """Name the shipped weights whose training images are nearer to a photo, and `ELSEWHERE` if these are far, too."""
     nearest = ""
     for name, folder in shipped().items():
         other = distance_to_training(photograph, json.loads(read_small(folder / CONFIG_FILE)))
         if other is not None and other < distance:
             nearest, distance = f"; weights={name} were trained on images that are nearer ({other:.1f})", other
-    return nearest
+    return nearest + (ELSEWHERE if distance > UNLIKE else "")
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:

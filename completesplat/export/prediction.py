@@ -176,7 +176,7 @@ def write_scene(
     pivot = seen_center(rasterizer, scene, reference)
     view = PageView(reference, pivot, up, wanted.background)
     stored = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
-    files = write_formats(folder, name, stored, wanted.formats, view, wanted.converter, comments)
+    files = write_formats(folder, name, stored, wanted.formats, view, wanted.converter, comments, rasterizer)
     for kind in wanted.videos:
         files[f"{kind}{suffix}"] = f"{kind}{suffix}.mp4"
         cameras = PATHS[kind](reference, pivot, up, wanted.frames)

@@ -12,7 +12,7 @@ import torch
 import viser
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import CONVERTED, FORMATS, write_formats
+from completesplat.export.formats import CONVERTED, FORMATS, suffix, write_formats
 from completesplat.export.images import to_bytes
 from completesplat.export.splat_transform import PageView, find_splat_transform
 from completesplat.export.video import orbit_views, render_views, write_video
@@ -86,7 +86,7 @@ class Worker:
 class Saver:
     """Writer of numbered files in a folder; nothing is overwritten.
 
-    `make_rasterizer` is called for the first video or thumbnail. Videos have `frames` frames and a grey background.
+    `make_rasterizer` is called for the first rendering. Videos have `frames` frames and a grey background.
     """
 
     def __init__(
@@ -121,11 +121,13 @@ class Saver:
 
     def _scene(self, kind: str, sample: Sample) -> Path:
         """Write all layers of a sample, in its reference camera's frame."""
-        path = self._next("sample", f".{kind}")
+        path = self._next("sample", suffix(kind))
         comments = [f"{name} {value}" for name, value in sample.settings.items()]
         converter = self._converter() if kind in CONVERTED else None
         front = PageView(sample.reference, sample.pivot(), torch.tensor(self.view.up), self.background)
-        write_formats(self.folder, path.stem, sample.for_viewers(), [kind], front, converter, comments)
+        rasterizer = self.rasterizer() if kind == "mesh" else None
+        name = path.name.removesuffix(suffix(kind))
+        write_formats(self.folder, name, sample.for_viewers(), [kind], front, converter, comments, rasterizer)
         return path
 
     def _video(self, sample: Sample) -> Path:

@@ -174,9 +174,15 @@ def test_shipped_weights_that_are_nearer_to_a_photo_are_named(tiny_weights, tmp_
     assert unlike.endswith("; weights=blues were trained on images that are nearer (0.0)")
     assert remarks(red, model, whole=True) == []
     monkeypatch.setattr("completesplat.commands.predict.shipped", lambda: {"reds": folders["reds"]})
-    assert remarks(blue, model, whole=True)[0].endswith(
-        "expect little of it in the scenes; weights=reds were trained on images that are nearer (4.8)"
-    )
+    (unlike,) = remarks(blue, model, whole=True)
+    near, elsewhere = unlike.partition("expect little of it in the scenes; ")[2].split("; ", 1)
+    assert near == "weights=reds were trained on images that are nearer (4.8)"  # but not near
+    for name in (
+        "weights=splatter_image:objaverse background=remove (MIT, ",
+        "TripoSplat",
+        "github.com/apple/ml-sharp",
+    ):
+        assert name in elsewhere
 
 
 def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
@@ -244,9 +250,11 @@ def test_a_converter_that_is_missing_is_told_before_the_model_is_loaded(predict,
     assert finished.err.startswith("error: formats spz, sog and html need Node.js")
 
 
-def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_path):
+def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "skimage", None)
     for setting, message in (
-        ("formats=[ply,obj]", "formats=obj: choose from ply, splat, glb, spz, sog, html"),
+        ("formats=[ply,obj]", "formats=obj: choose from ply, splat, glb, mesh, spz, sog, html"),
+        ("formats=mesh", 'formats=mesh needs scikit-image: pip install "completesplat[mesh]"'),
         ("video=zoom", "video=zoom: choose from orbit, swipe, wobble"),
         ("mask=x.png", "mask=FILE belongs to one image"),
     ):

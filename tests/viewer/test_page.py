@@ -18,6 +18,7 @@ from viewer_scenes import balls_sample
 from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.formats import write_splat
 from completesplat.export.images import to_bytes
+from completesplat.export.mesh import Mesh
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -362,6 +363,17 @@ def test_files_have_the_screen_space_dilation_once_and_videos_none(page, monkeyp
     assert torch.allclose(read_ply(ply).scales, wide.scales, rtol=1e-5)
     assert torch.equal(read_ply(ply).means, sample.gaussians.means)
     assert torch.equal(drawn[0].scales, sample.gaussians.scales)
+
+
+def test_a_mesh_is_saved_beside_the_splats(page, monkeypatch):
+    corners = torch.cat([torch.zeros(1, 3), torch.eye(3)])
+    tetrahedron = Mesh(corners, np.array([[0, 2, 1], [0, 3, 2], [0, 1, 3], [1, 2, 3]]), corners, 0.1)
+    drawn = []
+    monkeypatch.setattr("completesplat.export.formats.mesh_of", lambda *given: drawn.append(given) or tetrahedron)
+    paths = [page.saver.save(kind, [balls_sample()])[0] for kind in ("mesh", "ply", "mesh")]
+    assert [path.name for path in paths] == ["sample_00_mesh.glb", "sample_00.ply", "sample_01_mesh.glb"]
+    assert all(path.is_file() for path in paths)
+    assert drawn[0][0] is page.saver.rasterizer()
 
 
 def test_a_taken_port_leads_to_the_next_one(server):
