@@ -53,7 +53,7 @@ def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> 
     video, path = source.is_file(), source.resolve()
     capture = out / (path.stem if video else path.name)
     if capture.exists():
-        raise DataError("exists already: use it without cameras=colmap, or choose another out=DIR", str(capture))
+        raise DataError("exists already: import it without cameras=colmap, or choose another out=DIR", str(capture))
     with atomic_folder(capture) as unfinished:
         (images := unfinished / "images").mkdir()
         if video:
