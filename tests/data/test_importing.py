@@ -1,6 +1,7 @@
 """Import of captures: cameras by COLMAP against those that the photos were drawn with, and what is refused."""
 
 import logging
+import subprocess
 import sys
 from pathlib import Path
 
@@ -147,7 +148,7 @@ def test_what_makes_no_capture_is_one_line_and_leaves_nothing(tmp_path, monkeypa
     assert line("typo") == "typo: no such file or folder"
     assert not list(Path("out").iterdir())
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    assert line("blank") == 'cameras=colmap: needs pip install "completesplat[colmap]"'
+    assert line("blank").endswith('cameras=colmap need pycolmap: pip install "completesplat[colmap]"')
 
 
 def test_a_capture_stays_where_it_is_and_the_last_line_goes_on(command, tmp_path):
@@ -160,3 +161,15 @@ def test_a_capture_stays_where_it_is_and_the_last_line_goes_on(command, tmp_path
     assert "fox: 18 images with cameras, of which 3 are held out" in finished.out
     last = [str(tmp_path / "out"), "go on with: completesplat fit experiment=capture data.root=fox"]
     assert finished.out.splitlines()[-2:] == last
+
+
+@pytest.mark.processes
+def test_pycolmap_leaves_the_signal_that_ends_a_program_to_the_program():
+    lines = [
+        "import os, signal, sys",
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(9))",
+        "from completesplat.data.captures.capture import import_pycolmap",
+        "import_pycolmap()",
+        "os.kill(os.getpid(), signal.SIGTERM)",
+    ]
+    assert subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True).returncode == 9

@@ -12,11 +12,11 @@ from typing import Literal
 from PIL import Image, ImageOps
 from rich.progress import Progress, track
 
-from completesplat.data.captures.capture import FEWEST_FRAMES
+from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.images.files import FORMATS, check_sums, opened, refused_as_bad, save_image, stored_size
 from completesplat.data.validation import refused_to
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import DataError
 from completesplat.files import atomic_folder, folder_names
 from completesplat.settings.schema import Positive
 
@@ -48,15 +48,12 @@ def import_capture(
 
 def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> Path:
     """Write and return `out`/NAME, whole or not at all, and name the images that have no pose."""
-    try:
-        import pycolmap
-    except ImportError:
-        raise CompleteSplatError('cameras=colmap: needs pip install "completesplat[colmap]"') from None
+    pycolmap = import_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     video, path = source.is_file(), source.resolve()
     capture = out / (path.stem if video else path.name)
     if capture.exists():
-        raise DataError("exists already: use it without cameras=colmap, or choose another out=DIR", str(capture))
+        raise DataError("exists already: import it without cameras=colmap, or choose another out=DIR", str(capture))
     with atomic_folder(capture) as unfinished:
         (images := unfinished / "images").mkdir()
         if video:
@@ -111,8 +108,7 @@ def image_pairs(images: int, sequential: bool) -> list[tuple[int, int]]:
 
 def _find_cameras(folder: Path, names: list[str], sequential: bool, max_image_size: int) -> set[str]:
     """Write COLMAP's largest model as `folder`/sparse/0; return its images. Images of one size share a lens."""
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     images, database, pairs, at_a_time = folder / "images", folder / "db", folder / "pairs", os.cpu_count() or 1
     pycolmap.Database.open(database).close()
     sizes = {stored_size(images / name, name) for name in names}
