@@ -5,7 +5,7 @@ A comment above a key or behind its value explains the key; the first comment of
 
 import re
 import runpy
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from difflib import get_close_matches
 from importlib.util import find_spec
 from itertools import takewhile
@@ -20,6 +20,8 @@ PACKAGE = "# @package "
 TASKS = ("data", "bench", "report")
 """Verbs with several tasks: `data toy` is short for `data data_task=toy`."""
 LEAST_LIKE = 0.7
+REFERRING = re.compile(r"\._\w+_=|=\$\{\w+\}$")
+"""A `_target_` and the like, or a reference to a part, which help texts leave out."""
 
 
 class Setting(NamedTuple):
@@ -150,6 +152,27 @@ def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
     settings = [*own_settings(with_bases("", verb), without)]
     settings += [] if task is None else own_settings(with_bases(f"{verb}_task", task), without)
     return list({setting.key: setting for setting in settings}.values())
+
+
+def search(verb: str, task: str | None, words: Sequence[str]) -> list[tuple[str, str, Setting]]:
+    """Return settings of a verb and all its parts with all the words in the name, or behind those, in the comment.
+
+    Words begin where a name's part or a word does; `_` also stands for a space. Each setting comes once, with its part
+    and the first option that has it, the default one before others; both are empty for the verb's own settings.
+    """
+    settings = [("", "", setting) for setting in settings_of_verb(verb, task)]
+    for group, place, default, _ in choices_of_verb(verb, task):
+        for option in sorted(options(group), key=lambda name: name != default):
+            if with_bases(group, option).package != "_global_":  # else it sets what others define
+                inner = settings_of_option(group, option, None if place == group else place)
+                settings += [(place, option, setting) for setting in inner]
+    once = {entry[2].key: entry for entry in settings[::-1] if not REFERRING.search(f"{entry[2].key}={entry[2].value}")}
+    patterns = [re.compile(rf"(?<![^\W_]){re.escape(word).replace('_', '[_ ]')}", re.IGNORECASE) for word in words]
+    named, explained = (
+        [entry for entry in [*once.values()][::-1] if all(pattern.search(text(entry[2])) for pattern in patterns)]
+        for text in (lambda setting: setting.key, lambda setting: f"{setting.key}: {setting.comment}")
+    )
+    return named + [entry for entry in explained if entry not in named]
 
 
 def with_bases(group: str, option: str) -> ConfFile:
