@@ -98,11 +98,9 @@ def latents(
     from completesplat.opening import config_of_run
     from completesplat.training.encoding import encode_training_set
     from completesplat.training.stopping import stopped_together
-    from completesplat.weights import checkpoint_of
     from completesplat.weights.checkpoint_reading import load_part
 
-    ckpt = checkpoint_of(ckpt)
-    run_config = config_of_run(ckpt, list(overrides), trust)
+    run_config = config_of_run(Path(ckpt), list(overrides), trust)
     autoreconstructor = instantiate(run_config.model.get("model"), _convert_="all")
     if not isinstance(autoreconstructor, VariationalAutoReconstructor):
         raise WeightsError(f"{ckpt}: not of stage 1, which trains an autoreconstructor (model=var)")

@@ -24,7 +24,7 @@ from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
-from completesplat.weights import RUN_WEIGHTS, checkpoint_of
+from completesplat.weights import RUN_WEIGHTS
 from completesplat.weights.checkpoint_reading import check_whole
 
 logger = logging.getLogger(__name__)
@@ -106,10 +106,9 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
     path = newest_whole(out / LAST) if config.ckpt_path == "last" else config.ckpt_path
     if path is None:
         return None
-    path = checkpoint_of(path)
-    if not path.is_file():
+    if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
-    check_whole(path)  # now, because data may be made first
+    check_whole(Path(path))  # now, because data may be made first
     for part in (config.autoreconstructor, config.conditioning, config.model):
         for key in OTHER_WEIGHTS & part.keys():
             part[key] = None

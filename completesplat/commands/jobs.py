@@ -40,12 +40,9 @@ MAY_CHANGE = (
     *("ckpt_path", "data.allow_changed", "optimized_metric"),
     *("trainer.devices", "trainer.num_nodes", "trainer.strategy"),
 )
-"""Settings that may differ when a run continues, with all settings below them."""
+"""Settings that may differ when a run continues, with all settings below them; also its end (`ENDS`)."""
 ENDS = ("trainer.max_steps", "trainer.max_epochs", "trainer.max_time")
-"""Settings of the end of a run, which may move."""
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
-
-logger = logging.getLogger(__name__)
 
 
 def one_of_several() -> bool:
@@ -120,15 +117,14 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     OmegaConf.set_struct(config, False)
     config.out = str(out)
     resolved = resolved_settings(config)
-    task = list(hydra_config.overrides.task)
-    if is_finished(out, resolved, task):
+    if is_finished(out, resolved, hydra_config.overrides.task):
         print(f"{out}: finished before, not repeated")
         return optimized(config.get("optimized_metric"), out)
     first = is_first()
     try:
         with ended_by_signals():
             if first:
-                _record(out, [f"completesplat {verb}", *given], task, resolved)
+                _record(out, [f"completesplat {verb}", *given], list(hydra_config.overrides.task), resolved)
                 with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
                     OmegaConf.save(resolved, temporary)
             for key in ("checkpoint", "autoreconstructor_checkpoint"):
@@ -187,9 +183,7 @@ def start(verb: str, config: DictConfig, out: Path) -> None:
 
 
 def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str] = ()) -> bool:
-    """Return whether a job's directory holds its results, for jobs that can continue a run (`ckpt_path`).
-
-    A run whose end has moved is not finished. `overrides` are the job's, for the command in a refusal.
+    """Return whether a job's directory holds its results up to its end, for jobs that can continue (`ckpt_path`).
 
     Raises:
         CompleteSplatError: the directory holds a run that would be lost, or that had other settings.
@@ -200,23 +194,18 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
     if config["ckpt_path"] != "last":
         raise CompleteSplatError(f"{out} holds a run: continue it with ckpt_path=last, or choose another out=DIR")
     different = _differences(OmegaConf.to_container(OmegaConf.load(out / CONFIG)), config)
-    if others := {key for key in different if not _among((*MAY_CHANGE, *ENDS), key)}:
+    if others := {key for key in different if not key.startswith((*MAY_CHANGE, *ENDS))}:
         first = min(others, key=lambda key: (key.count("."), key))  # `model` repeats settings from outside it
         same = [argument for argument in overrides if not argument.startswith(("out=", "ckpt_path="))]
         again = shlex.join(["completesplat", "fit", *same, f"ckpt_path={out / LAST}", "out=MORE"])
         advice = f"train on in another folder: {again}" if (out / LAST).is_file() else "choose another out=DIR"
         raise CompleteSplatError(f"{out} holds a run with another {first}: {advice}")
-    if not (out / METRICS).is_file() or not any(_among(ENDS, key) for key in different):
-        return (out / METRICS).is_file()
-    done, end = json.loads((out / METRICS).read_text())["steps"], _ends(config)["trainer.max_steps"]
-    if isinstance(end, int) and 0 <= end <= done:
-        raise CompleteSplatError(f"trainer.max_steps={end}: {out} has {done} steps already; give more of them")
+    finished, end = (out / METRICS).is_file(), _ends(config)["trainer.max_steps"]
+    if not finished or not any(key.startswith(ENDS) for key in different):
+        return finished
+    if 0 <= end <= (steps := json.loads((out / METRICS).read_text())["steps"]):
+        raise CompleteSplatError(f"trainer.max_steps={end}: {out} has {steps} steps already; give more of them")
     return False
-
-
-def _among(settings: Sequence[str], key: str) -> bool:
-    """Whether a key is one of the settings, or lies below one."""
-    return f"{key}.".startswith(tuple(f"{name}." for name in settings))
 
 
 def _differences(first: object, second: object, key: str = "") -> set[str]:
@@ -228,32 +217,23 @@ def _differences(first: object, second: object, key: str = "") -> set[str]:
 
 
 def _record(out: Path, command: list[str], overrides: list[str], config: Mapping[str, object]) -> None:
-    """Write `run.json`: version, command and overrides, the times of the start and of continuations, and earlier ends.
-
-    If the end of a finished run has moved, its `metrics.json` becomes `metrics_N_steps.json`.
-    """
-    path = out / RECORD
-    now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-    record = {"version": __version__, "commit": git_commit(), "command": command, "overrides": overrides}
-    record |= {"started": now}
+    """Write `run.json` with times, command and earlier ends; results at one become `metrics_N_steps.json`."""
+    path, now = out / RECORD, time.strftime("%Y-%m-%dT%H:%M:%S%z")
+    record: dict[str, Any] = {"version": __version__, "commit": git_commit(), "command": command}
+    record |= {"overrides": overrides, "started": now}
     if path.is_file() and (out / LAST).is_file():
         earlier = json.loads(path.read_text())
         record |= {"started": earlier["started"], "continued": [*earlier.get("continued", []), now]}
-        ends, after = earlier.get("earlier_ends", []), _ends(config)
-        if "ckpt_path" in config and (before := _ends(OmegaConf.load(out / CONFIG))) != after:
-            ends = [*ends, {"until": now, "command": earlier["command"], **before}]
-            logger.info("%s: goes on to %s; the end was %s", out, after, before)
-            if (out / METRICS).is_file():
-                steps = json.loads((out / METRICS).read_text())["steps"]
-                (out / METRICS).rename(out / f"metrics_{steps}_steps.json")
-        record |= {"earlier_ends": ends}
+        record |= {"earlier_ends": earlier.get("earlier_ends", [])}
+        if "ckpt_path" in config and (before := _ends(OmegaConf.load(out / CONFIG))) != _ends(config):
+            record["earlier_ends"] += [{"until": now, "command": earlier["command"], **before}]
+            if (results := out / METRICS).is_file():
+                results.rename(out / f"metrics_{json.loads(results.read_text())['steps']}_steps.json")
     write_json(path, record)
 
 
-def _ends(config: object) -> dict[str, object]:
-    """Return the settings of a run's end."""
-    whole: Any = OmegaConf.create(config)
-    return {key: OmegaConf.select(whole, key) for key in ENDS}
+def _ends(config: object) -> dict[str, Any]:
+    return {key: OmegaConf.select(OmegaConf.create(config), key) for key in ENDS}  # type: ignore[call-overload]
 
 
 @contextmanager

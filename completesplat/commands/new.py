@@ -27,9 +27,8 @@ def run(config: DictConfig) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, text)
         print(path)
-    if find_spec("pytest") is None:
-        print("next:", shlex.join([sys.executable, "-m", "pip", "install", "pytest"]))
-    print("next:", shlex.join([sys.executable, "-m", "pytest", f"test_{kind}_{name}.py"]))
+    needed = "" if find_spec("pytest") else " (needs pip install pytest)"
+    print(f"next: {shlex.quote(sys.executable)} -m pytest test_{kind}_{name}.py{needed}")
 
 
 def new_files(kind: str, name: str) -> dict[Path, str]:

@@ -4,7 +4,6 @@ import json
 import logging
 import math
 import os
-import re
 import sys
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -37,7 +36,6 @@ from completesplat.settings.checks import REMOVE
 from completesplat.weights import CONFIG_FILE, read_small, shipped
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
-PATTERN = re.compile(r"[*?]|\[.*\]")
 FAR = 1.5
 """Ratio of tan(fov / 2), photo to training, from which a warning is given."""
 UNLIKE = 2.0
@@ -59,9 +57,7 @@ def run(config: DictConfig, out: Path) -> None:
 
 
 def find_images(image: object) -> list[Path]:
-    """Return the files of `image=FILE`, `image=FOLDER`, `image=PATTERN` or a list; of the last two the images, sorted.
-
-    A missing file is refused if there is no other, or else when it is read.
+    """Return the files of `image=FILE`, or the images, sorted, of `image=FOLDER` or `image=PATTERN`, or of a list.
 
     Raises:
         CompleteSplatError: no file exists, a folder or pattern has no image, the list is empty, or an entry is no name.
@@ -72,15 +68,15 @@ def find_images(image: object) -> list[Path]:
     if any(entry == "" or isinstance(entry, bool) or not isinstance(entry, str | int) for entry in entries):
         raise CompleteSplatError(f"image={image}: give an image, a folder, or a list of them")
     images = [path for entry in entries for path in _images_of(Path(str(entry)))]
-    if not any(os.path.lexists(path) for path in images):
-        raise CompleteSplatError(f"{printable(', '.join(map(str, images)))}: no such file")
+    if not any(map(os.path.lexists, images)):
+        raise CompleteSplatError(f"{printable(str(images[0])[:300])}: no such file")
     return images
 
 
 def _images_of(path: Path) -> list[Path]:
     # `os.path`, because the methods of `Path` raise an error if a name is too long.
     folder = os.path.isdir(path)
-    if not folder and (os.path.lexists(path) or not PATTERN.search(str(path))):
+    if not folder and (os.path.lexists(path) or not set("*?[") & set(str(path))):
         return [path]
     try:
         files = path.iterdir() if folder else map(Path, glob(str(path), recursive=True))

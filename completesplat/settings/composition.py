@@ -100,28 +100,23 @@ def _misspelt(error: Exception, verb: str, arguments: Sequence[str]) -> str | No
         config = _composed(verb, settings)
     except Exception:  # another argument is wrong, too
         config = _composed(verb)
-    task = next((text.partition("=")[2] for text in settings if text.startswith(f"{verb}_task=")), None)
-    nearest = _nearest(verb, task, key, [name for name in _keys(config) if not name.startswith("task.")])
-    parent = OmegaConf.select(config, key.rpartition(".")[0] or "out", throw_on_resolution_failure=False)
-    if isinstance(parent, DictConfig):  # a collection of parts, or the arguments of one
-        names, _ = part_arguments(parent)
-        if key.rpartition(".")[2] in names or not (nearest or "_target_" in parent):
-            nearest = f"; +{key}=VALUE adds it"
+    nearest = _nearest(verb, key, [name for name in _keys(config) if not name.startswith("task.")])
+    above, _, last = key.rpartition(".")
+    parent = OmegaConf.select(config, above, throw_on_resolution_failure=False) if above else None
+    if isinstance(parent, DictConfig) and (last in part_arguments(parent)[0] or not (nearest or "_target_" in parent)):
+        nearest = f"; +{key}=VALUE adds it"
     hint = f"; completesplat {verb} --help shows those that there are, --help WORD searches them"
     return f"no setting {key!r} of completesplat {verb}{nearest or hint}"
 
 
-def _nearest(verb: str, task: str | None, key: str, names: Sequence[str]) -> str:
-    """Return an ending for a message about an unknown key: settings of its last name, near it, or found by `search`."""
-
-    def last(name: str) -> str:
-        return name.rpartition(".")[2]
-
-    known = sorted({last(name) for name in names})
-    close = [last(key)] if last(key) in known else get_close_matches(last(key), known, cutoff=LEAST_LIKE)
-    likely = [name for near in close for name in names if last(name) == near]
-    likely = likely or [setting.key for _, _, setting in search(verb, task, [last(key)]) if setting.key in names]
-    likely = [name for name in likely if name.startswith(f"{key.partition('.')[0]}.")] or likely
+def _nearest(verb: str, key: str, names: Sequence[str]) -> str:
+    """Return an ending for a message about an unknown key: settings near its last name, or that `search` finds."""
+    top, last, lasts = key.partition(".")[0], key.rpartition(".")[2], {name: name.rpartition(".")[2] for name in names}
+    known = set(lasts.values())
+    close = [last] if last in known else get_close_matches(last, known, cutoff=LEAST_LIKE)
+    likely = [name for near in close for name in names if lasts[name] == near]
+    likely = likely or [setting.key for setting, _, _ in search(verb, None, [last]) if setting.key in lasts]
+    likely = [name for name in likely if name.startswith(f"{top}.")] or likely
     nearest = get_close_matches(key, likely, cutoff=LEAST_LIKE) or likely[:3]
     return f"; did you mean {' or '.join(nearest)}?" if nearest else ""
 

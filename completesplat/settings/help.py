@@ -38,12 +38,10 @@ ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {6,}\S.*)*)", re.MULTILINE)
 
 
 def page(verb: str, arguments: Sequence[str]) -> str:
-    """Return the help text of a verb, of one of its tasks (`data toy --help`) or groups (`fit --help data`).
-
-    Other words are searched for in the names and comments of all settings (`fit --help lr`).
+    """Return the help text of a verb, a task (`data toy --help`), a group (`fit --help data`), or of words to search.
 
     Raises:
-        CompleteSplatError: nothing has the words.
+        CompleteSplatError: no setting has the words in its name or comment.
     """
     words = [argument for argument in arguments if argument not in FLAGS and not argument.startswith("-")]
     task = None
@@ -56,7 +54,7 @@ def page(verb: str, arguments: Sequence[str]) -> str:
         if group in groups and group != "hydra":
             return part_page(verb, groups[group], option or groups[group].option)
     if wanted := [word for word in words if "=" not in word]:
-        return search_page(verb, task, wanted, groups)
+        return search_page(verb, task, wanted)
     header = str(OmegaConf.load(conf_folder() / f"{verb}.yaml").hydra.help.header).strip()
     return "\n\n".join([header, *_body(verb, task)])
 
@@ -74,27 +72,19 @@ def _body(verb: str, task: str | None) -> Iterator[str]:
         keys = [entry.place if entry.option == "null" else f"{entry.place}={entry.option}" for entry in choices]
         rows = [(key, _about(choice, about)) for key, choice in zip(keys, choices, strict=True)]
         yield _table(f"Parts (group=option chooses; completesplat {command} --help GROUP shows one):", rows)
-    yield f"completesplat {command} --help WORD lists the settings with a word in their names or comments."
-    yield "A sweep over values: -m key=a,b. Lists and values with spaces want the shell's quotes: 'key=[a,b]'."
+    yield f"A setting by its name or comment: completesplat {command} --help WORD. A sweep over values: -m key=a,b."
+    yield "Lists and values with spaces want the shell's quotes: 'key=[a,b]'."
 
 
-def search_page(verb: str, task: str | None, words: Sequence[str], groups: Iterable[str]) -> str:
-    """Return the settings that have all the words in their names or comments, as `search` orders them.
-
-    Raises:
-        CompleteSplatError: there are none; the message names the nearest settings, groups and tasks.
-    """
-    places, own = {choice.place: choice for choice in choices_of_verb(verb, task)}, _hints(verb, task)
-    rows = []
-    for place, option, setting in search(verb, task, words):
-        key, text = _line(setting, own.get(setting.key), {}, verb)
-        if place:
-            group = places[place].group
-            key, text = _part_line(setting, settings_of_option(group, option, None if place == group else place))
-        rows.append((key, f"{text} ({place}={option})" if place and option != places[place].option else text))
+def search_page(verb: str, task: str | None, words: Sequence[str]) -> str:
+    """Return the help text of the settings that `search` finds; raise CompleteSplatError if there are none."""
+    own, rows = _hints(verb, task), []
+    for setting, part, option in search(verb, task, words):
+        key, text = _part_line(setting, part) if part else _line(setting, own.get(setting.key), {}, verb)
+        rows.append((key, text + option))
     if not rows:
-        leaves = {setting.key.rpartition(".")[2] for _, _, setting in search(verb, task, [])}
-        known = {*groups, *leaves, *(options(f"{verb}_task") if verb in TASKS else [])}
+        known = {setting.key.rpartition(".")[2] for setting, _, _ in search(verb, task, [])}
+        known |= {choice.place for choice in choices_of_verb(verb, task)} | set(options(f"{verb}_task"))
         raise CompleteSplatError(f"nothing to say on {' '.join(words)!r}{did_you_mean(words[0], sorted(known))}")
     return _table(f"Settings of completesplat {verb} on {' '.join(words)} (key=value):", rows)
 

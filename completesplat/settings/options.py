@@ -20,8 +20,7 @@ PACKAGE = "# @package "
 TASKS = ("data", "bench", "report")
 """Verbs with several tasks: `data toy` is short for `data data_task=toy`."""
 LEAST_LIKE = 0.7
-REFERRING = re.compile(r"\._\w+_=|=\$\{\w+\}$")
-"""A `_target_` and the like, or a reference to a part, which help texts leave out."""
+REFERRING = re.compile(r"\._\w+_=|=\$\{\w+\}$")  # `_target_` and the like, or a reference to a part
 
 
 class Setting(NamedTuple):
@@ -154,24 +153,22 @@ def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
     return list({setting.key: setting for setting in settings}.values())
 
 
-def search(verb: str, task: str | None, words: Sequence[str]) -> list[tuple[str, str, Setting]]:
-    """Return settings of a verb and all its parts with all the words in the name, or behind those, in the comment.
+def search(verb: str, task: str | None, words: Sequence[str]) -> list[tuple[Setting, list[Setting], str]]:
+    """Return settings with all the words, those with the words in their names first, each with its part's settings.
 
-    Words begin where a name's part or a word does; `_` also stands for a space. Each setting comes once, with its part
-    and the first option that has it, the default one before others; both are empty for the verb's own settings.
+    Words begin where a name's part or a word does; `_` also stands for a space. Each setting comes once, from the verb
+    or from a part's first option that has it, which ends the entry unless it is the part's default.
     """
-    settings = [("", "", setting) for setting in settings_of_verb(verb, task)]
+    entries = [(setting, list[Setting](), "") for setting in settings_of_verb(verb, task)]
     for group, place, default, _ in choices_of_verb(verb, task):
         for option in sorted(options(group), key=lambda name: name != default):
             if with_bases(group, option).package != "_global_":  # else it sets what others define
-                inner = settings_of_option(group, option, None if place == group else place)
-                settings += [(place, option, setting) for setting in inner]
-    once = {entry[2].key: entry for entry in settings[::-1] if not REFERRING.search(f"{entry[2].key}={entry[2].value}")}
+                part = settings_of_option(group, option, None if place == group else place)
+                entries += [(setting, part, "" if option == default else f" ({place}={option})") for setting in part]
+    once = {entry[0].key: entry for entry in entries[::-1] if not REFERRING.search(f"{entry[0].key}={entry[0].value}")}
     patterns = [re.compile(rf"(?<![^\W_]){re.escape(word).replace('_', '[_ ]')}", re.IGNORECASE) for word in words]
-    named, explained = (
-        [entry for entry in [*once.values()][::-1] if all(pattern.search(text(entry[2])) for pattern in patterns)]
-        for text in (lambda setting: setting.key, lambda setting: f"{setting.key}: {setting.comment}")
-    )
+    texts = [(entry[0].key, f"{entry[0].key}: {entry[0].comment}", entry) for entry in reversed(once.values())]
+    named, explained = ([text[2] for text in texts if all(x.search(text[i]) for x in patterns)] for i in (0, 1))
     return named + [entry for entry in explained if entry not in named]
 
 

@@ -56,10 +56,8 @@ class Schedule(LambdaLR):
     """Learning-rate schedule that takes only its step from a checkpoint; rates and end are those of the config."""
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go to the step of a state, and set the optimizer's learning rates there (call after loading its state)."""
         super().load_state_dict(state_dict | {"base_lrs": self.base_lrs})
-        factors = [factor(self.last_epoch) for factor in self.lr_lambdas]
-        self._last_lr = [rate * factor for rate, factor in zip(self.base_lrs, factors, strict=True)]
+        self._last_lr = [rate * at(self.last_epoch) for rate, at in zip(self.base_lrs, self.lr_lambdas, strict=True)]
         for group, rate in zip(self.optimizer.param_groups, self._last_lr, strict=True):
             group["lr"] = rate
 

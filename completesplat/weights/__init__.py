@@ -29,11 +29,6 @@ def shipped() -> dict[str, Path]:
     return {path.parent.name: path.parent for path in sorted(SHIPPED.glob(f"*/{WEIGHTS_FILE}"))}
 
 
-def checkpoint_of(path: Path | str) -> Path:
-    """Return the newest checkpoint of a run's folder; a path that is no folder stays as it is."""
-    return Path(path, RUN_CHECKPOINT) if os.path.isdir(path) else Path(path)
-
-
 def check_name(name: str) -> None:
     """Raise WeightsError for a name that is no file or folder here, no shipped weights, and no id for the hub."""
     # `Path.exists` raises if a name is too long.
