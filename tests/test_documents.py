@@ -98,6 +98,16 @@ def test_the_citation_is_the_readmes_and_the_changelog_knows_this_version():
     assert zenodo["publication_date"] == str(citation["date-released"])
 
 
+def test_colab_opens_the_first_notebook_of_the_repository_and_installs_it():
+    """The address is a setting; a test of the wheel sees that the badge is not in it."""
+    repository = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["completesplat"]["repository"]
+    notebook = ROOT / "notebooks/0_quickstart.ipynb"
+    for path in (README, notebook):
+        (opened,) = re.findall(r"\]\(https://colab\.research\.google\.com/github/([^)]*)\)", path.read_text())
+        assert opened == f"{repository}/blob/main/{notebook.relative_to(ROOT).as_posix()}"
+    assert re.findall(r"git\+https://github\.com/([\w./-]+)", notebook.read_text()) == [repository]
+
+
 def test_the_hooks_are_the_checks_of_make_and_the_workflow_runs_what_must_hold():
     hooks = [hook for repo in OmegaConf.load(ROOT / ".pre-commit-config.yaml").repos for hook in repo.hooks]
     recipe = subprocess.run(["make", "--dry-run", "check"], cwd=ROOT, capture_output=True, text=True, check=True).stdout

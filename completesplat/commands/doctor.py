@@ -80,15 +80,16 @@ def required_packages(requirements: Iterable[Requirement]) -> Iterator[Finding]:
 
 
 def check_extras(requirements: Iterable[str] | None = None) -> Iterator[Finding]:
-    """Yield the packages of each extra; one that is not installed is no error."""
+    """Yield the packages of each extra, as `EXTRA: PACKAGE`; one that is not installed is no error."""
     lines = requires("completesplat") or () if requirements is None else requirements
     for requirement in map(Requirement, lines):
         for extra, purpose in EXTRAS.items():
             if requirement.marker is not None and requirement.marker.evaluate({"extra": extra}):
+                name = f"{extra}: {requirement.name}"
                 try:
-                    yield Finding(requirement.name, "yes", f"{version(requirement.name)}: {purpose}")
+                    yield Finding(name, "yes", f"{version(requirement.name)}: {purpose}")
                 except PackageNotFoundError:
-                    yield Finding(requirement.name, "no", f'{purpose}: `pip install "completesplat[{extra}]"`')
+                    yield Finding(name, "no", f'{purpose}: `pip install "completesplat[{extra}]"`')
 
 
 def check_imports() -> Iterator[Finding]:

@@ -8,11 +8,12 @@ import platform
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
@@ -39,7 +40,8 @@ MAY_CHANGE = (
     *("ckpt_path", "data.allow_changed", "optimized_metric"),
     *("trainer.devices", "trainer.num_nodes", "trainer.strategy"),
 )
-"""Settings that may differ when a run continues; of the last one, also all settings below it."""
+"""Settings that may differ when a run continues, with all settings below them; also its end (`ENDS`)."""
+ENDS = ("trainer.max_steps", "trainer.max_epochs", "trainer.max_time")
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
 
 
@@ -115,16 +117,16 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     OmegaConf.set_struct(config, False)
     config.out = str(out)
     resolved = resolved_settings(config)
-    if is_finished(out, resolved):
+    if is_finished(out, resolved, hydra_config.overrides.task):
         print(f"{out}: finished before, not repeated")
         return optimized(config.get("optimized_metric"), out)
     first = is_first()
     try:
         with ended_by_signals():
             if first:
+                _record(out, [f"completesplat {verb}", *given], list(hydra_config.overrides.task), resolved)
                 with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
                     OmegaConf.save(resolved, temporary)
-                _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
             for key in ("checkpoint", "autoreconstructor_checkpoint"):
                 # The path may refer to the job's choices (`hydra:runtime.choices`), which `start` cannot resolve.
                 if (path := OmegaConf.select(config, f"model.{key}")) is not None:
@@ -180,8 +182,8 @@ def start(verb: str, config: DictConfig, out: Path) -> object:
     return run()
 
 
-def is_finished(out: Path, config: Mapping[str, object]) -> bool:
-    """Return whether a job's directory holds its results, for jobs that can continue a run (`ckpt_path`).
+def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str] = ()) -> bool:
+    """Return whether a job's directory holds its results up to its end, for jobs that can continue (`ckpt_path`).
 
     Raises:
         CompleteSplatError: the directory holds a run that would be lost, or that had other settings.
@@ -192,11 +194,18 @@ def is_finished(out: Path, config: Mapping[str, object]) -> bool:
     if config["ckpt_path"] != "last":
         raise CompleteSplatError(f"{out} holds a run: continue it with ckpt_path=last, or choose another out=DIR")
     different = _differences(OmegaConf.to_container(OmegaConf.load(out / CONFIG)), config)
-    different = {key for key in different if key not in MAY_CHANGE and not key.startswith(f"{MAY_CHANGE[-1]}.")}
-    if different:
-        first = min(different, key=lambda key: (key.count("."), key))  # `model` repeats settings from outside it
-        raise CompleteSplatError(f"{out} holds a run with another {first}: choose another out=DIR")
-    return (out / METRICS).is_file()
+    if others := {key for key in different if not key.startswith((*MAY_CHANGE, *ENDS))}:
+        first = min(others, key=lambda key: (key.count("."), key))  # `model` repeats settings from outside it
+        same = [argument for argument in overrides if not argument.startswith(("out=", "ckpt_path="))]
+        again = shlex.join(["completesplat", "fit", *same, f"ckpt_path={out / LAST}", "out=MORE"])
+        advice = f"train on in another folder: {again}" if (out / LAST).is_file() else "choose another out=DIR"
+        raise CompleteSplatError(f"{out} holds a run with another {first}: {advice}")
+    finished, end = (out / METRICS).is_file(), _ends(config)["trainer.max_steps"]
+    if not finished or not any(key.startswith(ENDS) for key in different):
+        return finished
+    if 0 <= end <= (steps := json.loads((out / METRICS).read_text())["steps"]):
+        raise CompleteSplatError(f"trainer.max_steps={end}: {out} has {steps} steps already; give more of them")
+    return False
 
 
 def _differences(first: object, second: object, key: str = "") -> set[str]:
@@ -207,15 +216,24 @@ def _differences(first: object, second: object, key: str = "") -> set[str]:
     return {name for place, part in parts for name in _differences(first.get(part), second.get(part), place)}
 
 
-def _record(path: Path, command: list[str], overrides: list[str]) -> None:
-    """Write `run.json`: version, command and overrides, and the times of the start and of continuations."""
-    now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-    record = {"version": __version__, "commit": git_commit(), "command": command, "overrides": overrides}
-    record |= {"started": now}
-    if path.is_file() and (path.parent / LAST).is_file():
+def _record(out: Path, command: list[str], overrides: list[str], config: Mapping[str, object]) -> None:
+    """Write `run.json` with times, command and earlier ends; results at one become `metrics_N_steps.json`."""
+    path, now = out / RECORD, time.strftime("%Y-%m-%dT%H:%M:%S%z")
+    record: dict[str, Any] = {"version": __version__, "commit": git_commit(), "command": command}
+    record |= {"overrides": overrides, "started": now}
+    if path.is_file() and (out / LAST).is_file():
         earlier = json.loads(path.read_text())
         record |= {"started": earlier["started"], "continued": [*earlier.get("continued", []), now]}
+        record |= {"earlier_ends": earlier.get("earlier_ends", [])}
+        if "ckpt_path" in config and (before := _ends(OmegaConf.load(out / CONFIG))) != _ends(config):
+            record["earlier_ends"] += [{"until": now, "command": earlier["command"], **before}]
+            if (results := out / METRICS).is_file():
+                results.rename(out / f"metrics_{json.loads(results.read_text())['steps']}_steps.json")
     write_json(path, record)
+
+
+def _ends(config: object) -> dict[str, Any]:
+    return {key: OmegaConf.select(OmegaConf.create(config), key) for key in ENDS}  # type: ignore[call-overload]
 
 
 @contextmanager

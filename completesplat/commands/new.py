@@ -2,6 +2,8 @@
 
 import keyword
 import re
+import shlex
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,15 +19,16 @@ FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)
 """Line of a template that names the file which follows."""
 
 
-def run(config: DictConfig, out: Path) -> None:
-    """Write the part's files into the working folder; print their names and the next command."""
+def run(config: DictConfig) -> None:
+    """Write the part's files into the working folder; print their names and the commands that test them."""
     kind, name = str(config.kind), str(config.name)
     files = new_files(kind, name)
     for path, text in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, text)
         print(path)
-    print(f"next: python -m pytest test_{kind}_{name}.py")
+    needed = "" if find_spec("pytest") else " (needs pip install pytest)"
+    print(f"next: {shlex.quote(sys.executable)} -m pytest test_{kind}_{name}.py{needed}")
 
 
 def new_files(kind: str, name: str) -> dict[Path, str]:

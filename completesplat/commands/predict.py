@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from glob import glob
 from pathlib import Path
 
 import numba.np.arraymath  # else the first kernel imports it, and scipy with it  # noqa: F401
@@ -63,31 +64,34 @@ def run(config: DictConfig, out: Path) -> None:
 
 
 def find_images(image: object) -> list[Path]:
-    """Return the files of `image=FILE`, `image=FOLDER` or a list of both; of a folder its images, by suffix, sorted.
-
-    Files that are named one by one are not checked here, even missing ones, because reading them reports the fault.
+    """Return the files of `image=FILE`, or the images, sorted, of `image=FOLDER` or `image=PATTERN`, or of a list.
 
     Raises:
-        CompleteSplatError: a folder has no image or cannot be read, the list is empty, or an entry is no name.
+        CompleteSplatError: no file exists, a folder or pattern has no image, the list is empty, or an entry is no name.
     """
     entries = image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
     if not entries:
         raise CompleteSplatError("image=[]: name at least one image")
     if any(entry == "" or isinstance(entry, bool) or not isinstance(entry, str | int) for entry in entries):
         raise CompleteSplatError(f"image={image}: give an image, a folder, or a list of them")
-    return [path for entry in entries for path in _images_of(Path(str(entry)))]
+    images = [path for entry in entries for path in _images_of(Path(str(entry)))]
+    if not any(map(os.path.lexists, images)):
+        raise CompleteSplatError(f"{printable(str(images[0])[:300])}: no such file")
+    return images
 
 
 def _images_of(path: Path) -> list[Path]:
     # `os.path`, because the methods of `Path` raise an error if a name is too long.
-    if not os.path.isdir(path):
+    folder = os.path.isdir(path)
+    if not folder and (os.path.lexists(path) or not set("*?[") & set(str(path))):
         return [path]
     try:
-        images = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
+        files = path.iterdir() if folder else map(Path, glob(str(path), recursive=True))
+        images = sorted(file for file in files if file.suffix.lower() in SUFFIXES and file.is_file())
     except OSError as error:
         raise CompleteSplatError(f"{path}: {error.strerror}") from error
     if not images:
-        raise CompleteSplatError(f"{path}: no image in this folder ({', '.join(SUFFIXES)})")
+        raise CompleteSplatError(f"{path}: no image {'in this folder' if folder else 'fits'} ({', '.join(SUFFIXES)})")
     return images
 
 
@@ -95,16 +99,16 @@ def wanted_files(config: DictConfig) -> Wanted:
     """Return the outputs to write for each image.
 
     Raises:
-        CompleteSplatError: no such format or camera path, no format at all, or no program for one that needs it.
+        CompleteSplatError: no such format or camera path, neither of them, or no program for one that needs it.
     """
-    formats = _chosen("formats", config.formats, FORMATS)
-    if not formats:
-        raise CompleteSplatError(f"formats=[]: choose from {', '.join(FORMATS)}")
+    formats, videos = _chosen("formats", config.formats, FORMATS), _chosen("video", config.video, PATHS)
+    if not formats and not videos:
+        raise CompleteSplatError(f"formats=[] video=[]: choose a format ({', '.join(FORMATS)}) or a video")
     if "mesh" in formats:
         check_available()
     return Wanted(
         formats=formats,
-        videos=_chosen("video", config.video, PATHS),
+        videos=videos,
         frames=config.frames,
         background=Wanted.background if config.background == REMOVE else config.background,
         maps=config.maps,

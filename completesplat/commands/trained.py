@@ -14,7 +14,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.generator import CompleteSplat
 from completesplat.opening import config_of_run, locate
 from completesplat.scene_model import SceneModel
-from completesplat.weights import sha256_of, shipped
+from completesplat.weights import RUN_CHECKPOINT, sha256_of, shipped
 from completesplat.weights.checkpoint_reading import load_part
 
 if TYPE_CHECKING:
@@ -45,6 +45,10 @@ class Trained:
     rasterizer: Mapping[str, object] | None = None
     sampler: Mapping[str, object] | None = None
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.ckpt is not None and Path(self.ckpt).is_dir():
+            object.__setattr__(self, "ckpt", str(Path(self.ckpt, RUN_CHECKPOINT)))
 
     @cached_property
     def model(self) -> SceneModel:

@@ -5,7 +5,7 @@ A comment above a key or behind its value explains the key; the first comment of
 
 import re
 import runpy
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from difflib import get_close_matches
 from importlib.util import find_spec
 from itertools import takewhile
@@ -20,6 +20,7 @@ PACKAGE = "# @package "
 TASKS = ("data", "bench", "report")
 """Verbs with several tasks: `data toy` is short for `data data_task=toy`."""
 LEAST_LIKE = 0.7
+REFERRING = re.compile(r"\._\w+_=|=\$\{\w+\}$")  # `_target_` and the like, or a reference to a part
 
 
 class Setting(NamedTuple):
@@ -150,6 +151,25 @@ def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
     settings = [*own_settings(with_bases("", verb), without)]
     settings += [] if task is None else own_settings(with_bases(f"{verb}_task", task), without)
     return list({setting.key: setting for setting in settings}.values())
+
+
+def search(verb: str, task: str | None, words: Sequence[str]) -> list[tuple[Setting, list[Setting], str]]:
+    """Return settings with all the words, those with the words in their names first, each with its part's settings.
+
+    Words begin where a name's part or a word does; `_` also stands for a space. Each setting comes once, from the verb
+    or from a part's first option that has it, which ends the entry unless it is the part's default.
+    """
+    entries = [(setting, list[Setting](), "") for setting in settings_of_verb(verb, task)]
+    for group, place, default, _ in choices_of_verb(verb, task):
+        for option in sorted(options(group), key=lambda name: name != default):
+            if with_bases(group, option).package != "_global_":  # else it sets what others define
+                part = settings_of_option(group, option, None if place == group else place)
+                entries += [(setting, part, "" if option == default else f" ({place}={option})") for setting in part]
+    once = {entry[0].key: entry for entry in entries[::-1] if not REFERRING.search(f"{entry[0].key}={entry[0].value}")}
+    patterns = [re.compile(rf"(?<![^\W_]){re.escape(word).replace('_', '[_ ]')}", re.IGNORECASE) for word in words]
+    texts = [(entry[0].key, f"{entry[0].key}: {entry[0].comment}", entry) for entry in reversed(once.values())]
+    named, explained = ([text[2] for text in texts if all(x.search(text[i]) for x in patterns)] for i in (0, 1))
+    return named + [entry for entry in explained if entry not in named]
 
 
 def with_bases(group: str, option: str) -> ConfFile:

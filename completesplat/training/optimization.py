@@ -52,6 +52,16 @@ def _orthogonal(group: Mapping[str, Any], updates: Sequence[Tensor]) -> list[Ten
     return [zero_power_via_gram_newton_schulz(x.flatten(1), **settings, reset_steps=()) for x in updates]
 
 
+class Schedule(LambdaLR):
+    """Learning-rate schedule that takes only its step from a checkpoint; rates and end are those of the config."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict | {"base_lrs": self.base_lrs})
+        self._last_lr = [rate * at(self.last_epoch) for rate, at in zip(self.base_lrs, self.lr_lambdas, strict=True)]
+        for group, rate in zip(self.optimizer.param_groups, self._last_lr, strict=True):
+            group["lr"] = rate
+
+
 def exponential(
     optimizer: Optimizer, total_steps: float, warmup_steps: Natural = 100, final_ratio: Share = 0.01
 ) -> LambdaLR:
@@ -72,7 +82,7 @@ def cosine(
 
 def constant(optimizer: Optimizer, total_steps: float) -> LambdaLR:
     """Keep the optimizer's learning rate throughout, as in the paper's first stage."""
-    return LambdaLR(optimizer, lambda step: 1.0)
+    return Schedule(optimizer, lambda step: 1.0)
 
 
 def _after_warmup(
@@ -85,4 +95,4 @@ def _after_warmup(
             return (step + 1) / warmup_steps
         return decay(min(1.0, (step - warmup_steps) / max(1, total_steps - warmup_steps)))
 
-    return LambdaLR(optimizer, factor)
+    return Schedule(optimizer, factor)

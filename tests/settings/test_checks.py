@@ -73,8 +73,14 @@ def test_a_wrong_value_is_reported_under_the_setting_that_the_user_gave():
         ("fit experiment=toy_minis_var data.scene=3", r"no setting 'data.scene' .* did you mean data.scenes"),
         (
             "fit xyzzy=1",
-            r"no setting 'xyzzy' of completesplat fit; completesplat fit --help shows those that there are",
+            r"no setting 'xyzzy' of completesplat fit; completesplat fit --help shows those that there are, .*them\n$",
         ),
+        ("fit max_steps=3", r"no setting 'max_steps' of completesplat fit; did you mean trainer.max_steps\?\n"),
+        ("fit optimizer.learning_rate=3", r"no setting .*; did you mean optimizer.lr\?\n"),
+        ("fit model=per_scene model.steps=3", r"no setting .*; did you mean model.fitting.steps\?\n"),
+        ("fit data.foo=3", r"no setting 'data.foo' of completesplat fit; completesplat fit --help shows .* them\n"),
+        ("fit trainer.max_epochs=3", r"no setting .*; \+trainer.max_epochs=VALUE adds it\n"),
+        ("fit loss.terms.mine=null", r"no setting .*; \+loss.terms.mine=VALUE adds it\n"),
         ("fit experiment=toy_vr", r"no experiment 'toy_vr': there are co3d_small_diffusion, .*; did you mean toy_var"),
         ("fit ablation=no_skip", r"no ablation 'no_skip': there are full, .*; did you mean no_skips"),
         ("fit -m loss=stge1,stage2", r"no loss 'stge1': there are perceptual, stage1, stage2; did you mean stage1"),
@@ -83,7 +89,7 @@ def test_a_wrong_value_is_reported_under_the_setting_that_the_user_gave():
         ("data chck", r"no task of completesplat data 'chck': there are check, .*; did you mean check\?"),
         ("predict sampels=1", r"no setting 'sampels' of completesplat predict; did you mean samples\?"),
         ("predcit a.png", r"no verb 'predcit': there are data, .*; did you mean predict\?"),
-        ("predict image=a.png weights=toy_object", r"toy_object: no such folder.*toy_objects"),
+        (f"predict image={__file__} weights=toy_object", r"toy_object: no such folder.*toy_objects"),
     ],
 )
 def test_the_nearest_name_is_suggested_for_a_mistyped_one(command, typed, message):

@@ -35,6 +35,27 @@ def test_cosine_ends_at_the_final_ratio_and_constant_stays():
     assert set(factors(constant, 5, total_steps=3)) == {1.0}
 
 
+def test_a_schedule_goes_on_with_the_end_and_the_rate_of_its_config():
+    """A training of 100 steps at rate 1 goes on to step 200 at rate 2: it has the rates that it had from the start."""
+
+    def begun(rate, total):
+        optimizer = torch.optim.Adam([torch.zeros(1, requires_grad=True)], lr=rate)
+        return optimizer, cosine(optimizer, total, warmup_steps=10, final_ratio=0.1)
+
+    (optimizer, schedule), (longer, other) = begun(1.0, 100), begun(2.0, 200)
+    for _ in range(100):
+        optimizer.step()
+        schedule.step()
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(0.1)
+    longer.load_state_dict(optimizer.state_dict())
+    other.load_state_dict(schedule.state_dict())
+    expected = [2 * rate for rate in factors(cosine, 201, total_steps=200, warmup_steps=10, final_ratio=0.1)]
+    for step in range(100, 201):
+        assert longer.param_groups[0]["lr"] == other.get_last_lr()[0] == pytest.approx(expected[step])
+        longer.step()
+        other.step()
+
+
 def test_muon_steps_equally_far_in_all_directions_of_a_kernel_and_adam_moves_the_rest():
     kernel, bias = torch.zeros(4, 2, 3, 3, requires_grad=True), torch.zeros(4, requires_grad=True)
     optimizer = muon([kernel, bias], lr=0.5, adam_lr=0.01)
