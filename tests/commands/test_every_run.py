@@ -119,7 +119,7 @@ def test_a_run_of_fitted_scenes_leaves_them_and_says_so_when_a_photograph_is_giv
     assert 0 < read_ply(folder / "scene.ply").count <= 300
     Image.open(folder / "sheet.png").verify()
     assert strict_json(folder / "scene.json")["settings"]["scene"] in folder.name
-    assert settings_of(run) == {"scene": str(folder)}
+    assert settings_of(run) == {"scene": str(run)}
     refused = command("predict", f"image={pipeline.photograph()}", f"weights={run}", f"out={tmp_path / 'out'}")
     assert (refused.status, refused.err.count("\n")) == (2, 1)
     assert "PerScene" in refused.err

@@ -69,7 +69,7 @@ def test_a_part_shows_its_settings_with_the_docstring_of_its_class():
 def test_unknown_parts_are_answered_with_the_nearest():
     with pytest.raises(CompleteSplatError, match=r"no data 'toy_object': there are .*; did you mean toy_objects"):
         page("fit", ["data=toy_object"])
-    with pytest.raises(CompleteSplatError, match=r"nothing to say on 'modle'; did you mean model"):
+    with pytest.raises(CompleteSplatError, match=r"nothing to say on 'modle'; did you mean mode or model"):
         page("fit", ["modle"])
     with pytest.raises(CompleteSplatError, match=r"nothing to say on 'batchsize'; did you mean batch_size"):
         page("fit", ["batchsize"])
