@@ -61,7 +61,7 @@ def test_help_shows_all_verbs_and_the_settings_of_each(command):
 def test_bench_alone_lists_what_it_can_time_and_times_nothing(command, tmp_path):
     listed = command("bench")
     assert (listed.status, list(tmp_path.iterdir())) == (0, [])
-    assert all(f"\n  {task} " in listed.out for task in ("paper", "rasterizers", "startup"))
+    assert all(f"\n  {task} " in listed.out for task in ("paper", "rasterizers"))
 
 
 @pytest.mark.parametrize(
