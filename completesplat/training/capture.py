@@ -188,12 +188,6 @@ class CaptureFit(Stage):
         """Return the fitted Gaussians in the frame of each scene's reference, a held-out frame."""
         return stack([self.gaussians().transform(pose) for pose in self.reference_poses(scenes, "test")]).detach()
 
-    @property
-    def up(self) -> Float[Tensor, "3"]:
-        """Return the mean direction up of the held-out photos, in the first one's frame."""
-        poses = self.sequence("test").cameras.world_to_camera.float()
-        return normalize(poses[0, :3, :3] @ -poses[:, 1, :3].mean(0), dim=-1)
-
     def on_test_start(self) -> None:
         """Note for tables what the Gaussians were fitted to."""
         training, held_out = (len(self.sequence(split).frames) for split in ("train", "test"))
@@ -206,7 +200,7 @@ class CaptureFit(Stage):
             return
         sequence, scene, wanted = self.sequence("test"), self.gaussians().detach(), self.wanted
         poses = cameras.world_to_camera @ sequence.cameras.world_to_camera[0].to(cameras.world_to_camera)
-        placed, up = replace(cameras, world_to_camera=poses), self.up.to(poses) @ poses[0, :3, :3]
+        placed, up = replace(cameras, world_to_camera=poses), normalize(-poses[:, 1, :3].mean(0), dim=-1)
         try:
             needed = set(wanted.formats) & set(CONVERTED)
             wanted = replace(wanted, converter=find_splat_transform() if needed else None)
