@@ -43,12 +43,9 @@ class SampleRenderer:
 
     def render(self, scene: SceneBatch, **settings: Any) -> Rendering:
         """Render colour, depth and opacity [sample view] of one scene (a batch of one); settings are `generate`'s."""
-        return self.rasterize(self.generate(scene, **settings), scene)
-
-    def generate(self, scene: SceneBatch, **settings: Any) -> Gaussians:
-        """Draw samples of one scene; a `seed` in the settings replaces the renderer's."""
         inputs = scene.reference.images, scene.reference.cameras, scene.depth_range
-        return self.model.generate(*inputs, **{"samples": self.samples, "seed": self.seed, **settings})
+        gaussians = self.model.generate(*inputs, **{"samples": self.samples, "seed": self.seed, **settings})
+        return self.rasterize(gaussians, scene)
 
     @torch.no_grad()
     def rasterize(self, gaussians: Gaussians, scene: SceneBatch) -> Rendering:
