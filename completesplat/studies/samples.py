@@ -41,15 +41,11 @@ class SampleRenderer:
         """Composite a rendering over the background and clip it to [0, 1]."""
         return rendering.over(self.background).clamp(0, 1)
 
+    @torch.no_grad()
     def render(self, scene: SceneBatch, **settings: Any) -> Rendering:
         """Render colour, depth and opacity [sample view] of one scene (a batch of one); settings are `generate`'s."""
         inputs = scene.reference.images, scene.reference.cameras, scene.depth_range
         gaussians = self.model.generate(*inputs, **{"samples": self.samples, "seed": self.seed, **settings})
-        return self.rasterize(gaussians, scene)
-
-    @torch.no_grad()
-    def rasterize(self, gaussians: Gaussians, scene: SceneBatch) -> Rendering:
-        """Render the samples of one scene in the reference view and all targets."""
         cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(len(gaussians.means), *tensor.shape[1:]))
         return self.rasterizer(gaussians, cameras)
 
