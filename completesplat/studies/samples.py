@@ -12,7 +12,6 @@ from torch import Tensor
 
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import DataError
-from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.images import PSNR_LIMIT
