@@ -114,8 +114,12 @@ def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
 def fixed_scenes(batches: Iterable[SceneBatch], count: int, views: int = 1) -> list[SceneBatch]:
     """Return the first `count` scenes of the batches, each with `views` of its targets."""
     scenes = (batch[index] for batch in batches for index in range(len(batch.names)))
-    chosen = [(scene, len(scene.targets.images), min(views, len(scene.targets.images))) for scene in islice(scenes, count)]
-    return [replace(scene, targets=scene.targets[[i * n // k for i in range(k)]]) for scene, n, k in chosen]
+    return [replace(scene, targets=scene.targets[_spread(scene, views)]) for scene in islice(scenes, count)]
+
+
+def _spread(scene: SceneBatch, views: int) -> list[int]:
+    targets = len(scene.targets.images)
+    return [i * targets // views for i in range(views)] if targets > views else list(range(targets))
 
 
 class FixedScenes(DrawsFixedScenes):
