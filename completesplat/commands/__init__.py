@@ -24,7 +24,6 @@ from completesplat.settings.options import conf_folder
 from completesplat.signals import end_with, ended_by_signals
 
 CALLED = re.compile(r"Error in call to target '(?:torch|lightning|diffusers|torchmetrics)\.")
-LIGHTNINGS = "MisconfigurationException"
 UNHELPFUL_WARNINGS = (
     ".*does not have many workers.*",
     ".*but have no `val_dataloader`.*",
@@ -122,7 +121,7 @@ def _of_a_part(error: InstantiationException) -> str | None:
     cause = error.__cause__
     if cause is not None and isinstance(cause.__cause__, ModuleNotFoundError):
         return str(cause)
-    refused = isinstance(cause, ValueError | TypeError) or type(cause).__name__ == LIGHTNINGS
+    refused = isinstance(cause, ValueError | TypeError) or type(cause).__name__ == "MisconfigurationException"
     if CALLED.match(str(error)) is None or not refused:
         return None
     return f"{str(error).rpartition('full_key: ')[2].strip()}: {cause}"

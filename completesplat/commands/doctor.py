@@ -34,8 +34,7 @@ EXTRAS = {
     "perceptual": "to train on perceptual features without a download",
 }
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
-LEAST_SPACE = 100_000_000
-"""Bytes that the files of a few predictions take."""
+LEAST_SPACE = 100_000_000  # bytes that the files of a few predictions take
 
 
 class Finding(NamedTuple):

@@ -15,8 +15,7 @@ from completesplat.settings.options import conf_folder
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
 KINDS = ("loss", "rasterizer", "dataset", "ablation", "experiment")
-FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)
-"""Line of a template that names the file which follows."""
+FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)  # line of a template that names the file which follows
 
 
 def run(config: DictConfig) -> None:
@@ -32,11 +31,7 @@ def run(config: DictConfig) -> None:
 
 
 def new_files(kind: str, name: str) -> dict[Path, str]:
-    """Return the contents of a new part's files, by their paths in the working folder.
-
-    Raises:
-        CompleteSplatError: there is no such kind, the name is not a Python name or is taken, or a file exists.
-    """
+    """Return a new part's files by path; raise CompleteSplatError if kind or name is unfit, or a file exists."""
     if kind not in KINDS:
         raise CompleteSplatError(f"kind={kind}: choose one of {', '.join(KINDS)}")
     if not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):

@@ -77,11 +77,7 @@ def plan_table(plans: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def plan_of(config: DictConfig) -> dict[str, Any]:
-    """Return the figures of a training, with `assumptions` and `remarks`.
-
-    Raises:
-        CompleteSplatError: a setting does not fit, the GPU is unknown, or nothing says how long the training is.
-    """
+    """Return a training's figures, `assumptions` and `remarks`; raise CompleteSplatError if a setting does not fit."""
     check_image_size(config)
     check_optimizer(config.optimizer)
     if config.gpu != HERE and config.gpu not in config.gpus:

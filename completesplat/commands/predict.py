@@ -37,10 +37,8 @@ from completesplat.settings.checks import REMOVE
 from completesplat.weights import CONFIG_FILE, read_small, shipped
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
-FAR = 1.5
-"""Ratio of tan(fov / 2), photo to training, from which a warning is given."""
-UNLIKE = 2.0
-"""Distance from the training images (`distance_to_training`) from which a warning is given."""
+FAR = 1.5  # ratio of tan(fov / 2), photo to training, from which a warning is given
+UNLIKE = 2.0  # distance from the training images (`distance_to_training`) from which a warning is given
 # The network has 56.4 million numbers in float32; its authors' checkpoint may hold more.
 ELSEWHERE = (
     "; for an object try weights=splatter_image:objaverse background=remove (MIT, downloads at least 226 MB) or"
@@ -96,11 +94,7 @@ def _images_of(path: Path) -> list[Path]:
 
 
 def wanted_files(config: DictConfig) -> Wanted:
-    """Return the outputs to write for each image.
-
-    Raises:
-        CompleteSplatError: no such format or camera path, neither of them, or no program for one that needs it.
-    """
+    """Return the outputs for each image; raise CompleteSplatError for unknown formats, paths, or a missing program."""
     formats, videos = _chosen("formats", config.formats, FORMATS), _chosen("video", config.video, PATHS)
     if not formats and not videos:
         raise CompleteSplatError(f"formats=[] video=[]: choose a format ({', '.join(FORMATS)}) or a video")
@@ -134,12 +128,10 @@ def predict_images(config: DictConfig, model: SceneModel, images: Sequence[Path]
         DiskError: the disk is full; the remaining images are not predicted.
     """
     console, failed = Console(), []
-    if (config.mask is not None or config.box is not None) and not model.knows_hidden:
-        log.warning(
-            "%s: these weights were not trained with parts of the image hidden (data.box_masks, conf/experiment/"
-            "*_masked.yaml): hidden parts may come out black or grey",
-            "mask" if config.mask is not None else "box",
-        )
+    hiding = [name for name in ("mask", "box") if config[name] is not None]
+    if hiding and not model.architecture.get("training", {}).get("box_masks"):
+        text = "these weights were not trained with parts of the image hidden (data.box_masks, conf/experiment/"
+        log.warning("%s: %s*_masked.yaml): hidden parts may come out black or grey", hiding[0], text)
     rasterizer = instantiate(config.rasterizer, _convert_="all")
     folders = folder_names(image.stem for image in images)
     with Progress(console=console, disable=not console.is_terminal) as bar:
@@ -284,12 +276,7 @@ def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str
 
 
 def visible_part(config: DictConfig, image: Path, size: int) -> Float[Tensor, "1 size size"] | None:
-    """Return 0 where `mask` or `box` hides the photo and 1 elsewhere; None without them.
-
-    Raises:
-        ImageError: the mask is not a readable image.
-        CompleteSplatError: mask and box at once, an impossible box, or a mask that hides nothing.
-    """
+    """Return 0 where `mask` or `box` hides the photo, else 1; None without them. Raise CompleteSplatError for both."""
     if config.mask is not None and config.box is not None:
         raise CompleteSplatError("give mask=FILE or box=[x0,y0,x1,y1], not both")
     if config.mask is not None:

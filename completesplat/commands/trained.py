@@ -93,12 +93,7 @@ class Trained:
         return self.open_module(configuration), instantiate(configuration.data, _convert_="all")
 
     def open_module(self, configuration: Any) -> "Stage":
-        """Return the stage of the config, with its weights and, if given, another sampler.
-
-        Raises:
-            WeightsError: the weights do not fit.
-            CompleteSplatError: a sampler is given for a model that draws no samples.
-        """
+        """Return the stage with its weights and sampler (if given); raise CompleteSplatError if one does not fit."""
         stage: Stage = self._stage() if self.ckpt is None else instantiate(configuration.model, _convert_="all")
         if self.ckpt is not None:
             load_part(stage, self.ckpt, prefix="")

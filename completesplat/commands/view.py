@@ -21,6 +21,7 @@ WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 KINDS = dict.fromkeys(SPLATS, "scene") | {".ckpt": "weights", ".pth": "weights"}
 PAUSE = 2.0  # seconds between two checks for new scenes of a run
 SCENE_FILES = ("sample_*.ply", "scene.ply")
+AT_STEP = "step {} of the training"
 
 
 def run(config: DictConfig, out: Path) -> None:
@@ -59,11 +60,7 @@ def run(config: DictConfig, out: Path) -> None:
 
 
 def settings_of(path: Path) -> dict[str, str]:
-    """Return the setting that a path stands for: `scene`, `image`, `weights`, or `watch` for a run in training.
-
-    Raises:
-        CompleteSplatError: the path is none of these.
-    """
+    """Return the setting (`scene`, `image`, `weights`, `watch`) for a path; raise CompleteSplatError if none fits."""
     if path.is_file():
         return {KINDS.get(path.suffix.lower(), "image"): str(path)}
     if not path.is_dir():
@@ -105,12 +102,13 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
 
         check_parts(config)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    model, scenes = None, {}
+    model, scenes, status = None, {}, ""
     if config.watch is not None:
-        samples, up = newest_scenes(Path(config.watch))
+        status, samples, up = newest_scenes(Path(config.watch))
     elif config.scene is not None:
         scenes = scenes_in(Path(config.scene)) or {"": Path(config.scene)}  # which `read_scene` refuses
-        samples, up = read_scene(next(iter(scenes.values())))
+        status, path = next(iter(scenes.items()))
+        samples, up = read_scene(path)
     else:
         model = open_generator(config).to(device)
         samples, up = [], tuple(model.up.tolist())
@@ -125,7 +123,7 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     saver = Saver(out, splats, rasterizer, config.frames, background)
     page = Page(server, splats, saver, scenes)
     if model is None:
-        page.show(samples, next(iter(scenes), step_of(samples)))
+        page.show(samples, status)
         return page
     start = {name: config[name] for name in SLIDERS} | {"remove_background": remove}
     completion = Completion(page, model, start)
@@ -134,8 +132,8 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     return page
 
 
-def newest_scenes(run: Path) -> tuple[Sequence[Any], Sequence[float]]:
-    """Return the newest fixed scenes of a run and the up direction; wait until there are scenes.
+def newest_scenes(run: Path) -> tuple[str, Sequence[Any], Sequence[float]]:
+    """Return a note on the step of the newest fixed scenes of a run, them and the up direction; wait until some exist.
 
     Raises:
         CompleteSplatError: the folder is no run of `fit` that draws fixed scenes, or they cannot be read.
@@ -149,14 +147,8 @@ def newest_scenes(run: Path) -> tuple[Sequence[Any], Sequence[float]]:
         print(f"{run}: no scenes yet; waiting for them (every callbacks.images.every_n_steps steps)", flush=True)
     while not (folder / NEWEST_FILE).is_file():
         time.sleep(PAUSE)
-    _, samples, up = read_newest(folder)
-    return samples, up
-
-
-def step_of(samples: Sequence[Any]) -> str:
-    """Return the page's note on the training step of a run's scenes; an empty one for other scenes."""
-    steps = [sample.settings["step"] for sample in samples if "step" in sample.settings]
-    return f"step {steps[0]} of the training" if steps else ""
+    step, samples, up = read_newest(folder)
+    return AT_STEP.format(step), samples, up
 
 
 def show_newest(page: Any, run: Path) -> None:
@@ -169,15 +161,11 @@ def show_newest(page: Any, run: Path) -> None:
     except CompleteSplatError:
         return  # the scenes are just being written, or were removed: the page stays as it is
     if steps != {step} and samples:
-        page.show(samples, step_of(samples))
+        page.show(samples, AT_STEP.format(step))
 
 
 def export(page: Any, path: Path) -> None:
-    """Write the page to a file when its work is done.
-
-    Raises:
-        CompleteSplatError: the page shows no scene.
-    """
+    """Write the page to a file when its work is done; raise CompleteSplatError if the page shows no scene."""
     from completesplat.viewer.page import write_page
 
     page.worker.wait()

@@ -93,7 +93,7 @@ def write_formats(
         elif kind == "html":
             write_page(target, clipped, view, converter)
         else:
-            stored = clipped.keep(~transparent(clipped)) if kind == "spz" else clipped
+            stored = clipped[~transparent(clipped)] if kind == "spz" else clipped
             if not stored.count:
                 raise CompleteSplatError(f"{target}: all {clipped.count} Gaussians are transparent")
             with tempfile.TemporaryDirectory() as temporary:

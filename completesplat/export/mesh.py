@@ -56,7 +56,7 @@ def mesh_of(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras, pivot:
     tangent = reference.image_size[1] / 2 / reference.intrinsics[0, 0].item()
     radius = REACH * tangent * arm.norm().item()
     center = pivot + torch.nn.functional.normalize(arm, dim=-1) * radius / 3  # the pivot lies on the object's front
-    scene = scene.keep((scene.means - center).norm(dim=-1) < radius)
+    scene = scene[(scene.means - center).norm(dim=-1) < radius]
     cameras = cameras_around(center, radius, tangent)
     views = [rasterizer(scene[None], cameras[i : i + 1][None])[0, 0] for i in range(VIEWS)]
     maps = torch.stack([torch.cat([surface_depth(view), view.color / view.alpha.clamp(min=1e-10)]) for view in views])

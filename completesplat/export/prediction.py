@@ -25,12 +25,12 @@ from completesplat.export.images import (
 )
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform
-from completesplat.export.video import Frames, orbit_views, render_views, write_video
+from completesplat.export.video import Frames, render_views, write_video
 from completesplat.files import make_folder, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.surfaces import normals_from_depth
-from completesplat.geometry.trajectories import PATHS
+from completesplat.geometry.trajectories import PATHS, orbit
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers import Rasterizer
 
@@ -182,7 +182,8 @@ def write_scene(
         cameras = PATHS[kind](reference, pivot, up, wanted.frames)
         frames, _ = render_views(rasterizer, scene, cameras, wanted.background)
         write_video(folder / f"{kind}{suffix}.mp4", frames)
-    views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
+    around = orbit(reference, pivot, up, DIRECTIONS)
+    views, depths = render_views(rasterizer, scene, around, wanted.background)
     return views, depths[0], files
 
 

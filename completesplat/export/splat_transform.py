@@ -39,11 +39,7 @@ class SplatTransform:
     program: str
 
     def convert(self, source: Path, target: Path, options: Sequence[str] = ()) -> None:
-        """Write `target` in the format of its suffix, whole or not at all.
-
-        Raises:
-            CompleteSplatError: the program fails, writes nothing, or takes more than ten minutes.
-        """
+        """Write `target` in its suffix's format, whole or not at all; raise CompleteSplatError if the program fails."""
         with atomic_path(target) as temporary:
             _run([self.program, "--quiet", "--overwrite", *options, str(source), str(temporary)])
             if not temporary.is_file():

@@ -90,11 +90,7 @@ def search_page(verb: str, task: str | None, words: Sequence[str]) -> str:
 
 
 def part_page(verb: str, choice: Choice, option: str) -> str:
-    """Return the help text of one option of a group.
-
-    Raises:
-        CompleteSplatError: the group has no option of this name.
-    """
+    """Return the help text of one option of a group; raise CompleteSplatError if the group has no such option."""
     known = options(choice.group)
     if option == "null":
         message = f"{choice.place}: {_about(choice, about_groups())}"

@@ -17,8 +17,7 @@ import yaml
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 NAMED = re.compile(r"^\| (`[^|]*`) \| ([^|]*) \|$", re.MULTILINE)
 PACKAGE = "# @package "
-TASKS = ("data", "bench", "report")
-"""Verbs with several tasks: `data toy` is short for `data data_task=toy`."""
+TASKS = ("data", "bench", "report")  # verbs with several tasks: `data toy` is short for `data data_task=toy`
 LEAST_LIKE = 0.7
 REFERRING = re.compile(r"\._\w+_=|=\$\{\w+\}$")  # `_target_` and the like, or a reference to a part
 
@@ -79,11 +78,7 @@ def about_groups() -> dict[str, str]:
 
 
 def read(name: str) -> ConfFile:
-    """Read a file of `conf/` by its name without suffix: `fit`, `data/toy_objects`.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-    """
+    """Read a file of `conf/` by its name without suffix (`data/toy_objects`); raise FileNotFoundError if missing."""
     for folder in folders():
         if (folder / f"{name}.yaml").is_file():
             return parse((folder / f"{name}.yaml").read_text(encoding="utf-8"))

@@ -156,7 +156,7 @@ def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBat
     entries = []
     for index, name in enumerate(scenes.names):
         scene, camera = gaussians[index].to("cpu", torch.float32), scenes.reference.cameras[index].to("cpu")
-        selected = scene.keep(storable(scene))
+        selected = scene[storable(scene)]
         if selected.count:
             file = f"scene_{index}.ply"
             write_ply(folder / file, with_screen_space_dilation(selected, camera), [f"scene {name}", f"step {step}"])

@@ -15,9 +15,10 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED, FORMATS, suffix, write_formats
 from completesplat.export.images import to_bytes
 from completesplat.export.splat_transform import PageView, find_splat_transform
-from completesplat.export.video import orbit_views, render_views, write_video
+from completesplat.export.video import render_views, write_video
 from completesplat.files import SPLATS, printable, write_text
 from completesplat.geometry.cameras import Cameras
+from completesplat.geometry.trajectories import orbit
 from completesplat.rasterizers import Rasterizer
 from completesplat.viewer.access import GuardedServer, say, stop_server, with_head
 from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Pixels, add_looking, add_opening, add_saving, thumbnail_row
@@ -43,8 +44,7 @@ class Worker:
         self._waiting: dict[str, Job] = {}
         self._changed = threading.Condition()
         self._busy = self._closed = False
-        self._thread = threading.Thread(target=self._run, name="completesplat-viewer", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._run, name="completesplat-viewer", daemon=True).start()
 
     def submit(self, kind: str, job: Job) -> None:
         """Add a job after the waiting ones, or replace the waiting job of the same kind."""
@@ -97,11 +97,7 @@ class Saver:
         self._converter = cache(find_splat_transform)
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
-        """Write samples in one of the formats or as videos; the kind `html` saves the current page.
-
-        Raises:
-            CompleteSplatError: there are no samples, or `write_formats` fails.
-        """
+        """Write samples in a format, as videos, or the page (`html`); raise CompleteSplatError if there are none."""
         if not samples:
             raise CompleteSplatError("there is nothing to save yet: draw samples first")
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -134,8 +130,8 @@ class Saver:
         """Write a video of a full turn around a sample."""
         path = self._next("orbit", ".mp4")
         up = sample.reference.intrinsics.new_tensor(self.view.up.tolist())
-        seen = sample.gaussians, sample.reference, sample.pivot()
-        frames, _ = orbit_views(self.rasterizer(), *seen, self.frames, self.background, up)
+        cameras = orbit(sample.reference, sample.pivot(), up, self.frames)
+        frames, _ = render_views(self.rasterizer(), sample.gaussians, cameras, self.background)
         write_video(path, frames)
         return path
 

@@ -47,7 +47,7 @@ class Sample:
 
     def pivot(self) -> Float[Tensor, "3"]:
         """Return the point on the optical axis at the median depth, by opacity, of the image's central ninth."""
-        finite = self.gaussians.keep(self.gaussians.finite())
+        finite = self.gaussians[self.gaussians.finite()]
         pixels, depths = project(self.reference, finite.means)
         height, width = self.reference.image_size
         offset = pixels / torch.tensor([width, height], device=pixels.device) - 0.5
@@ -75,8 +75,13 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     description = (path.parent if path.is_file() else path) / "scene.json"
     if not description.is_file() or not all(file.name.startswith(("sample_", "scene.")) for file in files):
         return [Sample(scene, 1, framing_camera(scene)) for scene in scenes], UP
-    reference, settings = _read_description(description)
-    return [Sample(scene, _layers(scene, reference), reference, settings) for scene in scenes], _up(settings)
+    try:
+        data = json.loads(description.read_text(encoding="utf-8"))
+        reference, settings = _camera(data["reference_camera"]), dict(data["settings"])
+        up = _up(settings)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CompleteSplatError(f"{description}: not the description of a prediction") from error
+    return [Sample(scene, _layers(scene, reference), reference, settings) for scene in scenes], up
 
 
 def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
@@ -128,13 +133,3 @@ def _camera(plain: Mapping[str, Any]) -> Cameras:
     if (pose.shape, intrinsics.shape) != ((4, 4), (3, 3)):
         raise ValueError("matrices of other sizes")
     return Cameras(pose, intrinsics, (int(height), int(width)))
-
-
-def _read_description(path: Path) -> tuple[Cameras, dict[str, Any]]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        camera, settings = _camera(data["reference_camera"]), dict(data["settings"])
-        _up(settings)
-        return camera, settings
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CompleteSplatError(f"{path}: not the description of a prediction") from error

@@ -64,7 +64,7 @@ class Arrangement:
         if len(self.pivots) == 1:
             return part
         reach = (part.means - self.pivots[index].to(part.means)).norm(dim=-1) + 2 * part.scales.amax(-1)
-        return part.keep(reach <= self.spacing / 2)
+        return part[reach <= self.spacing / 2]
 
     def looks_like(self, other: "Arrangement") -> bool:
         """Return whether a camera placed for `other` may stay: equal number of samples, nearly equal camera."""
@@ -227,7 +227,7 @@ def to_splats(gaussians: Gaussians) -> tuple[dict[str, Any], float]:
     viser stores covariances as float16, which ends at 65504 and has few digits below 6e-5. In this unit, the largest
     covariance is just below that end, and thin Gaussians keep their shape.
     """
-    finite = gaussians.keep(gaussians.finite()).detach().to("cpu")
+    finite = gaussians[gaussians.finite()].detach().to("cpu")
     largest = finite.scales.max().item() if finite.count else 1.0
     scale = max(largest, 1e-12) / math.sqrt(LARGEST_COVARIANCE)
     unit = replace(finite, means=finite.means / scale, scales=finite.scales / scale)

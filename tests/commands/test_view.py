@@ -94,7 +94,7 @@ def test_a_run_is_watched_while_a_process_is_at_work_in_it(tmp_path):
 
 def test_what_a_run_writes_is_shown_when_it_is_new(tmp_path, capsys):
     run, shown = run_in_training(tmp_path / "run"), []
-    view = SimpleNamespace(samples=newest_scenes(run)[0])
+    view = SimpleNamespace(samples=newest_scenes(run)[1])
     page = SimpleNamespace(
         view=view, show=lambda samples, message: (shown.append(message), setattr(view, "samples", samples))
     )
@@ -114,7 +114,7 @@ def test_what_a_run_writes_is_shown_when_it_is_new(tmp_path, capsys):
 def test_a_run_without_scenes_is_waited_for(tmp_path, capsys, monkeypatch):
     (tmp_path / "run/images").mkdir(parents=True)
     monkeypatch.setattr("completesplat.commands.view.time.sleep", lambda _: run_in_training(tmp_path / "run"))
-    samples, up = newest_scenes(tmp_path / "run")
+    _, samples, up = newest_scenes(tmp_path / "run")
     assert (len(samples), up) == (2, UP)
     assert "no scenes yet; waiting" in capsys.readouterr().out
 
