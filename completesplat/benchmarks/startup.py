@@ -94,10 +94,8 @@ def _run(arguments: Sequence[str], first_line: bool = False) -> str:
     Raises:
         CompleteSplatError: the process fails.
     """
-    environment, pipe = {**os.environ, **SETTINGS, "PYTHONPATH": str(Path(__file__).parents[2])}, subprocess.PIPE
-    with subprocess.Popen(
-        [sys.executable, *arguments], env=environment, stdout=pipe, stderr=pipe, text=True
-    ) as process:
+    variables, pipe = {**os.environ, **SETTINGS, "PYTHONPATH": str(Path(__file__).parents[2])}, subprocess.PIPE
+    with subprocess.Popen([sys.executable, *arguments], env=variables, stdout=pipe, stderr=pipe, text=True) as process:
         line = process.stdout.readline() if first_line and process.stdout is not None else ""
         if line:
             process.kill()

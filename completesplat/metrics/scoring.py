@@ -214,9 +214,7 @@ def proper_scores(images: Samples, truth: Views) -> tuple[Scores, dict[str, list
     return scores, ranks
 
 
-def novel_values(
-    images: Samples, truth: Views
-) -> dict[str, tuple[Float[Tensor, "sample value"], Float[Tensor, " value"]]]:
+def novel_values(images: Samples, truth: Views) -> dict[str, tuple[Float[Tensor, "sample n"], Float[Tensor, " n"]]]:
     """Return the values of the samples and the true values by region; the first view of `truth` is the reference.
 
     Regions are all pixels (`full`) and, if true depth is known, those that the reference view does not show (`hidden`).

@@ -3,8 +3,8 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -25,9 +25,6 @@ from completesplat.data.images.files import (
 from completesplat.data.validation import BadAnnotation, BadCamera, TooFewFrames, at, require_file
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.geometry.cameras import Cameras
-
-if TYPE_CHECKING:
-    from pycolmap import Camera
 
 FEWEST_FRAMES = 6
 # Limits for an undistorted image's area and sides, relative to the distorted image's. Wrong coefficients exceed them.
@@ -148,10 +145,8 @@ def undistorted_lens(lens: Lens) -> Lens:
     """
     if not any(lens.distortion):
         return lens
-    camera, (height, width) = _distorted(lens), lens.image_size
-    from pycolmap import UndistortCameraOptions, undistort_camera
-
-    pinhole = undistort_camera(UndistortCameraOptions(), camera)
+    pycolmap, camera = _distorted(lens)
+    pinhole, (height, width) = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera), lens.image_size
     size = pinhole.height, pinhole.width
     sides = size[0] / height, size[1] / width
     if sides[0] * sides[1] < SMALLEST_AREA or max(sides) >= LARGEST_SIDE:
@@ -164,18 +159,21 @@ def undistort(image: Image.Image, lens: Lens) -> Image.Image:
     """Return the image of `undistorted_lens`, resampled bilinearly."""
     if not any(lens.distortion):
         return image
-    camera = _distorted(lens)
-    from pycolmap import Bitmap, UndistortCameraOptions, undistort_image
-
-    bitmap = Bitmap.from_array(np.array(image))
-    return Image.fromarray(undistort_image(UndistortCameraOptions(), bitmap, camera)[0].to_array())
+    pycolmap, camera = _distorted(lens)
+    bitmap, options = pycolmap.Bitmap.from_array(np.array(image)), pycolmap.UndistortCameraOptions()
+    return Image.fromarray(pycolmap.undistort_image(options, bitmap, camera)[0].to_array())
 
 
-def _distorted(lens: Lens) -> "Camera":
-    try:
-        from pycolmap import Camera
-    except ImportError:
-        message = "images of a lens with distortion need pycolmap: pip install completesplat[colmap]"
-        raise CompleteSplatError(message) from None
+def _distorted(lens: Lens) -> tuple[Any, Any]:
+    """Return pycolmap and its camera."""
     (height, width), params = lens.image_size, [*lens.focal, *lens.center, *lens.distortion, 0.0, 0.0, 0.0]
-    return Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+    pycolmap = import_pycolmap("images of a lens with distortion")
+    return pycolmap, pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+
+
+def import_pycolmap(what: str) -> Any:
+    """Return the optional module pycolmap, or raise CompleteSplatError for what needs it."""
+    try:
+        return import_module("pycolmap")
+    except ImportError:
+        raise CompleteSplatError(f'{what}: needs pip install "completesplat[colmap]"') from None

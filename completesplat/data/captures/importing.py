@@ -12,11 +12,11 @@ from typing import Literal
 from PIL import Image, ImageOps
 from rich.progress import Progress, track
 
-from completesplat.data.captures.capture import FEWEST_FRAMES
+from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.images.files import FORMATS, check_sums, opened, refused_as_bad, save_image, stored_size
 from completesplat.data.validation import refused_to
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import DataError
 from completesplat.files import atomic_folder, folder_names
 from completesplat.settings.schema import Positive
 
@@ -48,10 +48,7 @@ def import_capture(
 
 def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> Path:
     """Write and return `out`/NAME, whole or not at all, and name the images that have no pose."""
-    try:
-        import pycolmap
-    except ImportError:
-        raise CompleteSplatError('cameras=colmap: needs pip install "completesplat[colmap]"') from None
+    pycolmap = import_pycolmap("cameras=colmap")
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     video, path = source.is_file(), source.resolve()
     capture = out / (path.stem if video else path.name)
