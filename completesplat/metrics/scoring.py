@@ -231,9 +231,7 @@ def _region(images: Tensor, truth: Views, region: str) -> Tensor:
     return object_only(images, truth.masks) if region == "object" else images
 
 
-def depth_errors(
-    predicted: Depths, true: Depths, valid: Bool[Tensor, "image 1 height width"]
-) -> list[dict[str, float] | None]:
+def depth_errors(predicted: Depths, true: Depths, valid: Bool[Tensor, "image 1 _ _"]) -> list[dict[str, float] | None]:
     """Return each image's errors over valid pixels with finite, positive true depth, without aligning the scale.
 
     `abs_rel`: mean of |predicted - true| / true; `rmse`: in the depth's unit; `delta1`: share of pixels where

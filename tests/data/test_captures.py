@@ -448,5 +448,5 @@ def test_pycolmap_is_needed_for_distorted_lenses_only(monkeypatch, tmp_path):
     write_transforms(tmp_path / "barrel", **BARREL)
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     CaptureDataModule(str(tmp_path / "plain")).source("train").read("plain").read(0)
-    with pytest.raises(CompleteSplatError, match=r"pip install completesplat\[colmap\]"):
+    with pytest.raises(CompleteSplatError, match=r"completesplat\[colmap\]"):
         CaptureDataModule(str(tmp_path / "barrel")).source("train").read("barrel")
