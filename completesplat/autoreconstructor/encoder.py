@@ -31,9 +31,7 @@ def zeroed(layer: nn.Module) -> nn.Module:
     return layer
 
 
-def vae_encoder(
-    inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, norm_groups: int
-) -> vae.Encoder:
+def vae_encoder(inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, groups: int) -> vae.Encoder:
     """Build the network of Stable Diffusion's VAE encoder; the resolution halves between levels."""
     return vae.Encoder(
         in_channels=inputs,
@@ -41,7 +39,7 @@ def vae_encoder(
         down_block_types=("DownEncoderBlock2D",) * len(channels),
         block_out_channels=tuple(channels),
         layers_per_block=layers_per_block,
-        norm_num_groups=norm_groups,
+        norm_num_groups=groups,
         double_z=False,
     )
 

@@ -69,9 +69,7 @@ def occupied(image: SplatterImage) -> Bool[Tensor, "batch layer height width"]:
     return image.split()["opacity"].squeeze(2) > EMPTY_LOGIT
 
 
-def _places(
-    gaussians: Gaussians, cameras: Cameras, layers: int
-) -> tuple[Int64[Tensor, " place"], Int64[Tensor, " place"]]:
+def _places(gaussians: Gaussians, cameras: Cameras, layers: int) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"]]:
     """Return the selected Gaussians and their places: indices into [batch gaussian] and [batch layer height width]."""
     height, width = cameras.image_size
     # The Gaussians are in the camera's frame, so its pose in the world does not matter.

@@ -4,7 +4,6 @@ import gc
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -53,8 +52,7 @@ PAPERS_WORK = {"image_size": 128, "batch": 32, "samples": 20, "steps": 50}
 PAPERS_CHANNELS = {"encoder": [128, 256, 512, 512], "denoiser": [320, 640, 1280, 1280]}
 
 
-@dataclass(frozen=True)
-class Way:
+class Way(NamedTuple):
     """Precision of the networks and mode of `torch.compile`; None does not compile them."""
 
     name: str

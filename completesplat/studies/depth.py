@@ -82,11 +82,9 @@ def strips(renderer: SampleRenderer, scenes: Scenes, skip_weight: float, guidanc
     return rows
 
 
-def color_deviation(
-    deviation: Float[Tensor, "view 1 height width"],
-) -> tuple[Float[Tensor, "view 3 height width"], float]:
+def color_deviation(maps: Float[Tensor, "view 1 height width"]) -> tuple[Float[Tensor, "view 3 height width"], float]:
     """Return colours (dark for 0, grey for NaN, one scale for all views) and the scale's end, the 98 % quantile."""
-    known = deviation.isfinite()
-    end = deviation[known].quantile(0.98).item() if known.any() else 0.0
-    colors = ramp(torch.where(known, deviation, 0) / max(end, 1e-12))
+    known = maps.isfinite()
+    end = maps[known].quantile(0.98).item() if known.any() else 0.0
+    colors = ramp(torch.where(known, maps, 0) / max(end, 1e-12))
     return torch.where(known, colors, NOTHING), end

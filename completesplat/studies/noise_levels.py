@@ -69,9 +69,8 @@ def rows(model: CompleteSplat, scenes: Sequence[SceneBatch], draws: int, seed: i
 
 def standardised(model: CompleteSplat, versions: SceneBatch) -> Posterior:
     """Return the posteriors [mode] of a scene in all its modes, given all views, in the denoiser's units."""
-    posterior, _ = model.autoreconstructor.posterior(
-        versions.reference.images, versions.all_views(), versions.depth_range
-    )
+    images, views = versions.reference.images, versions.all_views()
+    posterior, _ = model.autoreconstructor.posterior(images, views, versions.depth_range)
     return Posterior(model.standardised(posterior.mean), posterior.log_variance - 2 * model.latent_std.log())
 
 

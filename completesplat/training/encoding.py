@@ -60,11 +60,9 @@ def fingerprint(module: nn.Module) -> str:
     return digest.hexdigest()
 
 
-def fingerprints(
-    autoreconstructor: VariationalAutoReconstructor, conditioning: nn.Module | None
-) -> tuple[str, str | None]:
+def fingerprints(model: VariationalAutoReconstructor, conditioning: nn.Module | None) -> tuple[str, str | None]:
     """Return the fingerprint of all weights that latents depend on, and that of a frozen conditioning, else None."""
-    encoder, views = autoreconstructor.encoder, autoreconstructor.view_encoder
+    encoder, views = model.encoder, model.view_encoder
     latents = fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
     return latents, fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
 

@@ -225,9 +225,7 @@ def gaussian_figures(gaussians: Gaussians) -> dict[str, float]:
         "depth": gaussians.means[..., 2],
     }
     values = {name: tensor.float().flatten().cpu().numpy() for name, tensor in tensors.items()}
-    return {
-        f"gaussians/{name}_p{p}": float(np.percentile(array, p)) for name, array in values.items() for p in PERCENTILES
-    }
+    return {f"gaussians/{name}_p{p}": float(np.percentile(x, p)) for name, x in values.items() for p in PERCENTILES}
 
 
 class Samples(DrawsFixedScenes):

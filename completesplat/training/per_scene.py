@@ -211,7 +211,7 @@ class PreoptimizedVAE(Preoptimized):
         data = self.data
         if data.latent_cache is not None:
             raise CompleteSplatError("data.latent_cache is for model=latent_diffusion: set it to null")
-        terms = {name: term.weight for name, term in self.loss.terms.items()}
+        terms = {name: term["weight"] for name, term in self.loss.terms.items()}
         settings = f"{self.fitting} {terms} {self.background} {data.image_size}"
         stores = [data.store("val"), data.store("train")]
         self._stored = FittedScenes(self.folder, stores, super().fitted, settings)

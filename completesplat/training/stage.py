@@ -148,9 +148,7 @@ class Stage(LightningModule):
         path = Path(checkpoint_path)
         config = read_checkpoint(path).get("hyper_parameters")
         if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
-            raise WeightsError(
-                f"{path}: holds no config; train with `fit`, or with what completesplat.instantiate gives"
-            )
+            raise WeightsError(f"{path}: has no config; train with `fit`, or with what completesplat.instantiate gives")
         check_names(config, path, path.resolve().parent.parent, trust)
         module = instantiate(without_training(OmegaConf.create(config)).model, _convert_="all")
         if not isinstance(module, cls):
@@ -295,9 +293,7 @@ class Stage(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def upsampled(
-    images: Float[Tensor, "sample view 3 _ _"], size: tuple[int, int]
-) -> Float[Tensor, "sample view 3 height width"]:
+def upsampled(images: Float[Tensor, "batch view 3 _ _"], size: tuple[int, int]) -> Renders:
     """Resize images to the size (height, width) of true images (paper, Table 3: "by upsampling")."""
     if images.shape[-2:] == size:
         return images

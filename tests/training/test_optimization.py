@@ -22,7 +22,7 @@ def factors(schedule, steps: int, **settings) -> list[float]:
 
 
 def test_exponential_is_a_straight_line_in_the_logarithm_after_the_warm_up():
-    values = factors(exponential, 1201, total_steps=1100, warmup_steps=100, final_ratio=0.01)
+    values = factors(exponential, 1201, steps=1100, warmup_steps=100, final_ratio=0.01)
     assert values[:100] == pytest.approx([(i + 1) / 100 for i in range(100)])
     assert values[600] == pytest.approx(0.1)
     assert values[350] == pytest.approx(math.exp(math.log(0.01) / 4))
@@ -30,9 +30,9 @@ def test_exponential_is_a_straight_line_in_the_logarithm_after_the_warm_up():
 
 
 def test_cosine_ends_at_the_final_ratio_and_constant_stays():
-    values = factors(cosine, 301, total_steps=200, warmup_steps=0, final_ratio=0.1)
+    values = factors(cosine, 301, steps=200, warmup_steps=0, final_ratio=0.1)
     assert (values[0], values[100], values[200], values[300]) == pytest.approx((1.0, 0.55, 0.1, 0.1))
-    assert set(factors(constant, 5, total_steps=3)) == {1.0}
+    assert set(factors(constant, 5, steps=3)) == {1.0}
 
 
 def test_a_schedule_goes_on_with_the_end_and_the_rate_of_its_config():
