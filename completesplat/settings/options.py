@@ -162,9 +162,8 @@ def search(verb: str, task: str | None, words: Sequence[str]) -> list[tuple[Sett
                 entries += [(setting, part, "" if option == default else f" ({place}={option})") for setting in part]
     once = {entry[0].key: entry for entry in entries[::-1] if not REFERRING.search(f"{entry[0].key}={entry[0].value}")}
     patterns = [re.compile(rf"(?<![^\W_]){re.escape(word).replace('_', '[_ ]')}", re.IGNORECASE) for word in words]
-    texts = [(entry[0].key, f"{entry[0].key}: {entry[0].comment}", entry) for entry in reversed(once.values())]
-    named, explained = ([text[2] for text in texts if all(x.search(text[i]) for x in patterns)] for i in (0, 1))
-    return named + [entry for entry in explained if entry not in named]
+    found = [e for e in reversed(once.values()) if all(x.search(f"{e[0].key}: {e[0].comment}") for x in patterns)]
+    return sorted(found, key=lambda entry: not all(x.search(entry[0].key) for x in patterns))
 
 
 def with_bases(group: str, option: str) -> ConfFile:
