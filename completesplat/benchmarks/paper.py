@@ -88,10 +88,7 @@ def run(
     ways = [way for way in WAYS if compile or way.compile is None]
     quieten()
     rows: list[Row] = []
-    with (
-        TemporaryDirectory(prefix="bench_paper_", dir=out) as folder,
-        Console(stderr=True).status("building") as status,
-    ):
+    with TemporaryDirectory(prefix="bench_", dir=out) as folder, Console(stderr=True).status("building") as status:
         loaded: SceneDataModule = instantiate(data, root=f"{folder}/scenes", _convert_="all")
         loaded.prepare_data()
         scenes: SceneBatch = next(iter(loaded.train_dataloader())).to(torch.device(device))

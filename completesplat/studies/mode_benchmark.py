@@ -185,8 +185,7 @@ def measure(
     """Score all predictors on all scenes; the seed of a scene is that of the scene before it plus one.
 
     Two predictors that know all modes are added: `true_sampler` draws by their probabilities, `mean_predictor` repeats
-    their mean. The other scene for a predictor is the previous one (for the first, the last). The figure shows samples
-    of `model`.
+    their mean. The other scene for a predictor is the previous one (for the first, the last). The figure shows `model`.
     """
     measured = Measured()
     for index, scene in enumerate(progress(scenes)):

@@ -20,7 +20,7 @@ from torch import nn
 from completesplat import __version__
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.data.loading.distributed import gathered, is_first, processes
+from completesplat.data.loading.distributed import gathered, processes
 from completesplat.data.loading.latent_cache import (
     CHECKSUMS,
     ArrayWriter,
@@ -145,7 +145,10 @@ def encode_training_set(
         DataError: damaged or unpacked data, too little space, another cache in the folder, or encodings not finite.
     """
     views = views if autoreconstructor.sees_views else 0
-    source = _packed(data)
+    source = data.source("train")
+    if not isinstance(source, PackedSource):
+        advice = "run `completesplat data prepare` first, then give overrides=['data.root=STORE']"
+        raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
     origin = _origin(autoreconstructor, data, conditioning, frames, views, precision)
     if (out / MANIFEST).is_file():
         if (store := LatentCache(out)).origin != origin:
@@ -162,7 +165,7 @@ def encode_training_set(
     _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
     sequences: list[CachedSequence] = []
     batches = _encoded_batches(_references(source, frames, sequences, progress), load, encode, batch_size)
-    if is_first():
+    if processes()[0] == 0:
         _write_store(out, origin, blank, batches, sequences)
     else:
         deque(batches, maxlen=0)
@@ -170,20 +173,12 @@ def encode_training_set(
     return LatentCache(out)
 
 
-def _packed(data: SceneDataModule) -> PackedSource:
-    source = data.source("train")
-    if not isinstance(source, PackedSource):
-        advice = "run `completesplat data prepare` first, then give overrides=['data.root=STORE']"
-        raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
-    return source
-
-
 def _references(
     source: PackedSource, frames: int | None, sequences: list[CachedSequence], progress: bool
 ) -> Iterator[Reference]:
     """Yield all references in the order of rows; append each sequence to `sequences` before its references."""
     rows = 0
-    for name in track(source.names, "encoding sequences", disable=not (progress and is_first())):
+    for name in track(source.names, "encoding sequences", disable=not progress or processes()[0] > 0):
         sequence = source.read(name)
         places = spread_places(len(sequence.frames), frames)
         sequences.append(CachedSequence(name, len(sequence.frames), rows, tuple(places)))

@@ -219,12 +219,8 @@ def gaussian_figures(gaussians: Gaussians) -> dict[str, float]:
 
     Keys are `gaussians/opacity_p10`, `gaussians/log10_scale_p50` and so on; depths are in scene units.
     """
-    tensors = {
-        "opacity": gaussians.opacities,
-        "log10_scale": gaussians.scales.log10(),
-        "depth": gaussians.means[..., 2],
-    }
-    values = {name: tensor.float().flatten().cpu().numpy() for name, tensor in tensors.items()}
+    parts = {"opacity": gaussians.opacities, "log10_scale": gaussians.scales.log10(), "depth": gaussians.means[..., 2]}
+    values = {name: tensor.float().flatten().cpu().numpy() for name, tensor in parts.items()}
     return {f"gaussians/{name}_p{p}": float(np.percentile(x, p)) for name, x in values.items() for p in PERCENTILES}
 
 

@@ -49,13 +49,9 @@ class PerScene(Stage):
     without_effect: tuple[str, ...] = ("optimizer", "schedule", "trainer.max_", "trainer.val_check")
 
     def __init__(
-        self,
-        loss: WeightedSum,
-        fitting: FittingSettings,
-        scenes_folder: str | None = None,
-        **rendering_and_optimization: Any,
+        self, loss: WeightedSum, fitting: FittingSettings, scenes_folder: str | None = None, **others: Any
     ) -> None:
-        super().__init__(**rendering_and_optimization)
+        super().__init__(**others)
         self.loss = loss
         self.fitting = fitting
         self.scenes_folder = None if scenes_folder is None else Path(scenes_folder)
@@ -121,8 +117,7 @@ class Preoptimized(PerScene):
 class FittedScenes:
     """Store of Gaussians that are fitted to all images of a sequence when they are first needed.
 
-    One sequence at a time is in memory: its images and masks (16 bytes a pixel) and its Gaussians. A file takes 56
-    bytes for each Gaussian, so 1,000 sequences with 4,000 Gaussians each take 224 MB.
+    One sequence at a time is in memory. A file takes 56 bytes for each Gaussian.
 
     Args:
         folder: folder of the files, which several processes may share; scenes in it are not fitted again.

@@ -138,12 +138,10 @@ class Stage(LightningModule):
         """Build the model of a checkpoint from the config in it (`hyper_parameters`), with its weights.
 
         Args:
-            trust: the checkpoint names modules of your own, and you trust its author; not needed below the working
-                folder.
+            trust: the checkpoint names your own modules, and you trust its author; not needed below the working folder.
 
         Raises:
-            WeightsError: the checkpoint is missing, damaged, without a config, names what `check_names` refuses, or is
-                of another class.
+            WeightsError: the checkpoint is missing, damaged, without a config of another class, or `check_names` fails.
         """
         path = Path(checkpoint_path)
         config = read_checkpoint(path).get("hyper_parameters")
