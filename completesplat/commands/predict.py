@@ -46,10 +46,10 @@ log = logging.getLogger(__name__)
 
 def run(config: DictConfig, out: Path) -> None:
     """Write each photo's files into `out/<its name>/`."""
+    wanted = wanted_files(config)  # before the model runs, because the converter may be missing
     images = find_images(config.image)
     if config.mask is not None and len(images) > 1:
         raise CompleteSplatError("mask=FILE belongs to one image; box=[x0,y0,x1,y1] goes for several")
-    wanted = wanted_files(config)  # before the model runs, because the converter may be missing
     if config.cameras is not None:
         predict_from_views(config, images, wanted, out)
     else:
