@@ -36,10 +36,8 @@ CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
 LAST = "checkpoints/last.ckpt"
 LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
-MAY_CHANGE = (
-    *("ckpt_path", "data.allow_changed", "optimized_metric"),
-    *("trainer.devices", "trainer.num_nodes", "trainer.strategy"),
-)
+OF_MACHINES = ("trainer.devices", "trainer.num_nodes", "trainer.strategy")
+MAY_CHANGE = ("ckpt_path", "data.allow_changed", "optimized_metric", *OF_MACHINES)
 """Settings that may differ when a run continues, with all settings below them; also its end (`ENDS`)."""
 ENDS = ("trainer.max_steps", "trainer.max_epochs", "trainer.max_time")
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")

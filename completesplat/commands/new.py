@@ -27,7 +27,7 @@ def run(config: DictConfig) -> None:
         write_text(path, text)
         print(path)
     needed = "" if find_spec("pytest") else " (needs pip install pytest)"
-    print(f"next: {shlex.quote(sys.executable)} -m pytest test_{kind}_{name}.py{needed}")
+    print("next:", shlex.join([sys.executable, "-m", "pytest", f"test_{kind}_{name}.py"]) + needed)
 
 
 def new_files(kind: str, name: str) -> dict[Path, str]:

@@ -7,6 +7,7 @@ import re
 import runpy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from difflib import get_close_matches
+from functools import cache
 from importlib.util import find_spec
 from itertools import takewhile
 from pathlib import Path
@@ -85,6 +86,7 @@ def read(name: str) -> ConfFile:
     raise FileNotFoundError(name)
 
 
+@cache
 def parse(text: str) -> ConfFile:
     """Parse the text of a file."""
     lines = text.splitlines()
@@ -149,10 +151,9 @@ def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
 
 
 def search(verb: str, task: str | None, words: Sequence[str]) -> list[tuple[Setting, list[Setting], str]]:
-    """Return settings with all the words, those with the words in their names first, each with its part's settings.
+    """Return settings with all the words, those with the words in their names first.
 
-    Words begin where a name's part or a word does; `_` also stands for a space. Each setting comes once, from the verb
-    or from a part's first option that has it, which ends the entry unless it is the part's default.
+    Each entry has the settings of its part, and ends with its option, unless that is the default.
     """
     entries = [(setting, list[Setting](), "") for setting in settings_of_verb(verb, task)]
     for group, place, default, _ in choices_of_verb(verb, task):

@@ -15,7 +15,7 @@ from fake_converter import calls, install
 from PIL import Image
 from support import compose_config, some_gaussians, strict_json
 
-from completesplat.commands.predict import find_images, remarks, run, unusual_field_of_view
+from completesplat.commands.predict import find_images, remarks, run, unusual_field_of_view, wanted_files
 from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, concatenate
@@ -224,7 +224,6 @@ def test_missing_images_are_refused_before_the_model_is_loaded(command, monkeypa
     monkeypatch.setattr(CompleteSplat, "from_pretrained", lambda *_: pytest.fail("loaded"))
     for given, message in (
         (["nofile.jpg"], "nofile.jpg: no such file"),
-        (["x.png", "y.png"], "x.png: no such file"),
         (["*.png"], "*.png: no image fits (.jpg, "),
     ):
         refused = command("predict", *given)
@@ -261,13 +260,6 @@ def test_videos_and_formats_are_written_and_recorded_and_a_strange_field_of_view
     assert len(calls(program)) == 3  # its version, before the model runs
 
 
-def test_a_video_needs_no_format(predict, tmp_path):
-    finished = predict(save(tmp_path / "a.png"), "formats=[]", "video=[orbit]")
-    assert finished.status == 0, finished.err
-    files = {path.name for path in (tmp_path / "out/a").iterdir()}
-    assert files == {"orbit_00.mp4", "sheet.png", "scene.json"}
-
-
 def test_a_converter_that_is_missing_is_told_before_the_model_is_loaded(predict, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(CompleteSplat, "from_pretrained", lambda *_: pytest.fail("loaded"))
@@ -290,6 +282,8 @@ def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_pat
         config = compose_config("predict", images, "weights=nowhere", setting, *video)
         with pytest.raises(CompleteSplatError, match=re.escape(message)):
             run(config, tmp_path)
+    only_videos = wanted_files(compose_config("predict", "image=a.png", "formats=[]"))
+    assert (only_videos.formats, only_videos.videos) == ((), ("orbit",))
 
 
 @pytest.mark.parametrize("broken", ["some", "all"])

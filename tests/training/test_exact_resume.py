@@ -90,6 +90,7 @@ def test_a_run_that_is_continued_is_bit_equal(settings, whole, tmp_path, monkeyp
     assert any("current_model_state" in name for name in weights(tmp_path / "run")) == (stage != "var")
 
 
+@pytest.mark.slow
 def test_a_finished_run_whose_end_moves_is_the_run_that_had_this_end_from_the_start(settings, whole, tmp_path, command):
     """The first end is a multiple of the images' interval, because images are also drawn at the end."""
     run = tmp_path / "run"
