@@ -35,11 +35,7 @@ ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {6,}\S.*)*)", re.MULTILINE)
 
 
 def page(verb: str, arguments: Sequence[str]) -> str:
-    """Return the help text of a verb, of one of its tasks (`data toy --help`) or groups (`fit --help data`).
-
-    Raises:
-        CompleteSplatError: there is no such task or group.
-    """
+    """Return the help of a verb, its task (`data toy`) or group (`fit data`); raise CompleteSplatError for others."""
     words = [argument for argument in arguments if argument not in FLAGS and not argument.startswith("-")]
     task = None
     if verb in TASKS:
