@@ -104,12 +104,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, if it is missing, in an existing one.
-
-    Raises:
-        CompleteSplatError: the folder is a link, through which results would be written elsewhere.
-        DiskError: the folder above is gone, or the disk is full.
-    """
+    """Make a missing folder in an existing one; raise CompleteSplatError for a link, DiskError if it cannot be made."""
     if folder.is_symlink():
         raise CompleteSplatError(f"{folder}: is a link, and results are not written through links; remove it")
     with writing(folder):

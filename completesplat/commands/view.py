@@ -133,11 +133,7 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
 
 
 def newest_scenes(run: Path) -> tuple[str, Sequence[Any], Sequence[float]]:
-    """Return a note on the step of the newest fixed scenes of a run, them and the up direction; wait until some exist.
-
-    Raises:
-        CompleteSplatError: the folder is no run of `fit` that draws fixed scenes, or they cannot be read.
-    """
+    """Wait for a run's fixed scenes; return a note on their step, them and up, or raise CompleteSplatError."""
     from completesplat.viewer.sample import NEWEST_FILE, read_newest
 
     folder = run / NEWEST

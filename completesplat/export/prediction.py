@@ -25,12 +25,12 @@ from completesplat.export.images import (
 )
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform
-from completesplat.export.video import Frames, render_views, write_video
+from completesplat.export.video import Frames, orbit_views, render_views, write_video
 from completesplat.files import make_folder, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.surfaces import normals_from_depth
-from completesplat.geometry.trajectories import PATHS, orbit
+from completesplat.geometry.trajectories import PATHS
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers import Rasterizer
 
@@ -182,8 +182,7 @@ def write_scene(
         cameras = PATHS[kind](reference, pivot, up, wanted.frames)
         frames, _ = render_views(rasterizer, scene, cameras, wanted.background)
         write_video(folder / f"{kind}{suffix}.mp4", frames)
-    around = orbit(reference, pivot, up, DIRECTIONS)
-    views, depths = render_views(rasterizer, scene, around, wanted.background)
+    views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
     return views, depths[0], files
 
 
@@ -256,11 +255,7 @@ def write_maps(
 def write_scene_json(
     path: str | Path, reference: Cameras, settings: Mapping[str, Any], seed: int, files: Mapping[str, str]
 ) -> None:
-    """Write the scene description as JSON, with the `settings` of the scene and the names of its `files` by purpose.
-
-    Raises:
-        ValueError: a number is not finite, which JSON cannot represent.
-    """
+    """Write a scene's description, `settings` and `files` as JSON; raise ValueError if a number is not finite."""
     scene = {
         "format": "completesplat scene 1",
         "reference_camera": plain_camera(reference),

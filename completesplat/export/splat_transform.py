@@ -47,11 +47,7 @@ class SplatTransform:
 
 
 def find_splat_transform() -> SplatTransform:
-    """Return the program on PATH, or else that of npm's package, which `npx` downloads once (some 200 MB).
-
-    Raises:
-        CompleteSplatError: there is neither the program nor `npx`, or the program does not start.
-    """
+    """Return the program on PATH or npm's, which `npx` downloads once; raise CompleteSplatError if neither works."""
     program = shutil.which(PROGRAM)
     if program is None:
         npx = shutil.which("npx")

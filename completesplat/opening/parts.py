@@ -138,11 +138,7 @@ def untrained(part: Any) -> Any:
 
 
 def check_architecture(architecture: object, file: Path | None = None) -> None:
-    """Check a config against `PARTS`, the signatures of these classes, and the bounds in their annotations.
-
-    Raises:
-        WeightsError: a setting does not fit; the message names the file, if it is given, and the first such setting.
-    """
+    """Raise WeightsError, naming `file`, for the first setting that `PARTS` or the signatures of its classes refuse."""
     settings = architecture if isinstance(architecture, Mapping) else {}
     hints = ONE_ANSWER if "network" in settings else DRAWING
     try:

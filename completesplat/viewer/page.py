@@ -15,10 +15,9 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED, FORMATS, suffix, write_formats
 from completesplat.export.images import to_bytes
 from completesplat.export.splat_transform import PageView, find_splat_transform
-from completesplat.export.video import render_views, write_video
+from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.files import SPLATS, printable, write_text
 from completesplat.geometry.cameras import Cameras
-from completesplat.geometry.trajectories import orbit
 from completesplat.rasterizers import Rasterizer
 from completesplat.viewer.access import GuardedServer, say, stop_server, with_head
 from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Pixels, add_looking, add_opening, add_saving, thumbnail_row
@@ -130,8 +129,8 @@ class Saver:
         """Write a video of a full turn around a sample."""
         path = self._next("orbit", ".mp4")
         up = sample.reference.intrinsics.new_tensor(self.view.up.tolist())
-        cameras = orbit(sample.reference, sample.pivot(), up, self.frames)
-        frames, _ = render_views(self.rasterizer(), sample.gaussians, cameras, self.background)
+        seen = sample.gaussians, sample.reference, sample.pivot()
+        frames, _ = orbit_views(self.rasterizer(), *seen, self.frames, self.background, up)
         write_video(path, frames)
         return path
 

@@ -85,11 +85,7 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
 
 
 def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
-    """Read the fixed scenes that a run has written last (`write_newest`); return the step, them and the direction up.
-
-    Raises:
-        CompleteSplatError: the scenes cannot be read.
-    """
+    """Return step, scenes and up that a run wrote last (`write_newest`); raise CompleteSplatError if unreadable."""
     path = folder / NEWEST_FILE
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
