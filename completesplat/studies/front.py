@@ -21,8 +21,7 @@ def rows(renderer: SampleRenderer, scenes: Scenes, tick: Tick) -> tuple[list[dic
 
     The rungs are those of `mode_benchmark.rungs`, then the model's samples at skip weight 1, the same after two
     rounds of `fit_colors`, and at skip weight 0. The other scene is the previous one; with one scene there is no rung
-    `other_scene`. The sheet shows two samples of each rung and `AMPLIFIED` times their difference, in the reference
-    view and then in the farthest view.
+    `other_scene`. The sheet shows two samples of each rung and their difference times `AMPLIFIED`, from both views.
     """
     methods = rungs(renderer.model.autoreconstructor, renderer.samples, renderer.samples)
     methods["samples"] = lambda scene, other, seed: renderer.generate(scene, seed=seed, skip_weight=1.0)

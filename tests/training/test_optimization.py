@@ -10,11 +10,11 @@ from support import SMALL, compose_config
 from completesplat.training.optimization import constant, cosine, exponential, muon
 
 
-def factors(schedule, steps: int, **settings) -> list[float]:
+def factors(schedule, count: int, **settings) -> list[float]:
     optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
     scheduler = schedule(optimizer, **settings)
     values = []
-    for _ in range(steps):
+    for _ in range(count):
         values.append(optimizer.param_groups[0]["lr"])
         optimizer.step()
         scheduler.step()
