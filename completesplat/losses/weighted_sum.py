@@ -43,8 +43,7 @@ class WeightedSum:
     """Weighted sum of named loss terms.
 
     Args:
-        terms: name -> {weight, term, start_step (default 0)}; an entry is left out if it is None (as in an
-            ablation) or has weight 0.
+        terms: name -> {weight, term, start_step (default 0)}; None (an ablation) or weight 0 leaves it out.
 
     Raises:
         CompleteSplatError: no term counts at step 0.

@@ -38,8 +38,7 @@ class Evaluation:
     """Scores of several predictors over a test set.
 
     Every metric scores each predictor on all pixels (`full`) and on true object pixels (`object`), for the reference
-    view and the novel views apart (CO3D protocol, paper Section 4 and supplement). A scene counts once, even if
-    several processes scored it.
+    view and the novel views apart (CO3D protocol, paper Section 4 and supplement). A scene counts once.
 
     Args:
         samples: number of samples per scene. With more than one, the rows are `model` (the first sample), two oracles

@@ -20,8 +20,7 @@ class ReferenceRasterizer:
     """Rasterizer that evaluates every Gaussian at every pixel, which suits tests and small scenes only.
 
     Gradients reach all parameters of the Gaussians and the cameras. Gaussians that are culled, not finite, or so
-    large or far aside that their projection overflows are left out before anything is computed, so their
-    gradients are zero, never NaN.
+    large or far aside that their projection overflows are left out first, so their gradients are zero.
     """
 
     def __init__(self, constants: RenderingConstants | None = None) -> None:

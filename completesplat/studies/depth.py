@@ -14,8 +14,7 @@ from completesplat.studies.samples import SampleRenderer, farthest, near
 def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tensor, "*view 1 height width"]:
     """Return the standard deviation of the depth over those samples that have one (more than 0) at a pixel.
 
-    Its square is the unbiased variance, so pixels with different numbers of samples compare. It is NaN where fewer
-    than two samples have a depth.
+    Its square is the unbiased variance, so pixels with different counts compare. It is NaN with fewer than two depths.
     """
     known = depth > 0
     count = known.sum(0)

@@ -145,10 +145,7 @@ def encode_training_set(
         DataError: damaged or unpacked data, too little space, another cache in the folder, or encodings not finite.
     """
     views = views if autoreconstructor.sees_views else 0
-    source = data.source("train")
-    if not isinstance(source, PackedSource):
-        advice = "run `completesplat data prepare` first, then give overrides=['data.root=STORE']"
-        raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
+    source = _packed(data)
     origin = _origin(autoreconstructor, data, conditioning, frames, views, precision)
     if (out / MANIFEST).is_file():
         if (store := LatentCache(out)).origin != origin:
@@ -171,6 +168,14 @@ def encode_training_set(
         deque(batches, maxlen=0)
     gathered(None)  # the other processes wait until the manifest is written
     return LatentCache(out)
+
+
+def _packed(data: SceneDataModule) -> PackedSource:
+    source = data.source("train")
+    if not isinstance(source, PackedSource):
+        advice = "run `completesplat data prepare` first, then give overrides=['data.root=STORE']"
+        raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
+    return source
 
 
 def _references(

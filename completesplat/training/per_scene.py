@@ -168,8 +168,7 @@ class PreoptimizedVAE(Preoptimized):
 
     Before training, Gaussians are fitted to each training sequence and stored in files (`FittedScenes`). Validation
     sequences are fitted when they are first used. A training step projects these Gaussians into the Splatter Images of
-    its reference views, so image augmentation has no effect. Test scenes are fitted when they are tested, to the views
-    that they are scored on.
+    its reference views, so image augmentation has no effect. Test scenes are fitted to the views they are scored on.
 
     The paper does not state the loss. Here it is the mean error of depth, offset, scale, rotation and colour, plus the
     weighted error of the opacity (`SparseVAE.errors`), plus the weighted KL. The KL is divided by the number of raw

@@ -10,11 +10,11 @@ from support import SMALL, compose_config
 from completesplat.training.optimization import constant, cosine, exponential, muon
 
 
-def factors(schedule, steps: int, **settings) -> list[float]:
+def factors(schedule, count: int, **settings) -> list[float]:
     optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
     scheduler = schedule(optimizer, **settings)
     values = []
-    for _ in range(steps):
+    for _ in range(count):
         values.append(optimizer.param_groups[0]["lr"])
         optimizer.step()
         scheduler.step()
@@ -49,7 +49,7 @@ def test_a_schedule_goes_on_with_the_end_and_the_rate_of_its_config():
     assert optimizer.param_groups[0]["lr"] == pytest.approx(0.1)
     longer.load_state_dict(optimizer.state_dict())
     other.load_state_dict(schedule.state_dict())
-    expected = [2 * rate for rate in factors(cosine, 201, total_steps=200, warmup_steps=10, final_ratio=0.1)]
+    expected = [2 * rate for rate in factors(cosine, 201, steps=200, warmup_steps=10, final_ratio=0.1)]
     for step in range(100, 201):
         assert longer.param_groups[0]["lr"] == other.get_last_lr()[0] == pytest.approx(expected[step])
         longer.step()

@@ -1,8 +1,7 @@
 """Splatter Image with its authors' published weights (Szymanowicz et al., CVPR 2024): one pass, one answer.
 
 It sees an object on a plain background and predicts one Gaussian per pixel. It draws no samples, so hidden parts are
-reconstructed as an average. This is a new implementation after commit 78a6ad0 of szymanowiczs/splatter-image
-(`scene/gaussian_predictor.py`).
+reconstructed as an average. New, after `scene/gaussian_predictor.py` of szymanowiczs/splatter-image at 78a6ad0.
 """
 
 from collections import OrderedDict
@@ -132,8 +131,7 @@ class PublishedSplatterImage(ReconstructionModel):
         depths: depth range of its Gaussians.
 
     Args:
-        weights: `splatter_image:NAME` on the hub, a `.pth` file beside its `config_NAME.yaml`, or a folder with
-            both; see `files.py`.
+        weights: `splatter_image:NAME` on the hub, a `.pth` file beside its `config_NAME.yaml`, or their folder.
 
     Raises:
         WeightsError: the files are missing, unreadable, or have other tensors (name, size, type) than this network.
