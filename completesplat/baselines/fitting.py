@@ -1,13 +1,15 @@
 """Optimisation of 3D Gaussians for single scenes from posed views (Kerbl et al. 2023, "3D Gaussian Splatting").
 
-`fit_gaussians` has no densification and no pruning, so its number of Gaussians stays constant (`densification` has
-both). They start from random pixels at random depths, or from points, where a data set has them.
+`fit_gaussians` keeps the number of Gaussians. `relocate` adds and moves them, as 3DGS-MCMC (Kheradmand et al. 2024) does:
+without gradients of image positions, so with every rasterizer. Gaussians start from random pixels at random depths, or
+from points, where a data set has them.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians
@@ -22,6 +24,9 @@ POSITION_RATE, POSITION_DECAY = 1.6e-4, 0.01
 RATES = {"log_scales": 5e-3, "quaternions": 1e-3, "logits": 5e-2, "harmonics": 2.5e-3}
 """3DGS's rates for 30,000 steps (graphdeco-inria/gaussian-splatting, `arguments/__init__.py`): the rate of the
 positions is relative to the scene's extent and decays exponentially to a hundredth."""
+
+DEAD_OPACITY, MOST_COPIES = 0.005, 51  # as in the authors' code and gsplat
+NOISE, NOISE_STEEPNESS = 5e5, 100.0
 
 
 @dataclass(frozen=True)
@@ -147,3 +152,54 @@ def _optimizer(raw: RawGaussians, settings: FittingSettings, depth_range: Tensor
     rates = {"means": settings.position_rate * POSITION_RATE * extent, **rates}
     groups = [{"params": [getattr(raw, name).requires_grad_()], "lr": rate} for name, rate in rates.items()]
     return torch.optim.Adam(groups, eps=1e-15)
+
+
+def opacity_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Return the opacity of each of several equal Gaussians that together are as opaque as one (paper, Eq. 9)."""
+    return 1 - (1 - opacities) ** (1 / copies)
+
+
+def scale_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Return the factor on the scales of such copies, which preserves the integral of alpha along a line (Eq. 9).
+
+    The paper's double sum is written as one sum, by C(0, k) + ... + C(n - 1, k) = C(n, k + 1).
+    """
+    n, o = copies.double()[:, None], opacity_of_copies(opacities.double(), copies)[:, None]
+    j = torch.arange(1, int(copies.max()) + 1, dtype=torch.float64, device=o.device)
+    logarithm = torch.lgamma(n + 1) - torch.lgamma(j + 1) - torch.lgamma((n - j).clamp(min=0) + 1)
+    terms = torch.where(j <= n, logarithm.exp() * o**j / j.sqrt(), 0) * (1 - 2 * ((j + 1) % 2))
+    return (opacities / terms.sum(-1)).to(opacities.dtype)
+
+
+@torch.no_grad()
+def relocate(raw: Mapping[str, Tensor], count: int, new_count: int) -> Int64[Tensor, " changed"]:
+    """Make dead Gaussians, and rows `count` to `new_count`, copies of living ones, drawn by opacity.
+
+    Args:
+        raw: tensors [row ...] of `RawGaussians` by name, which are changed.
+
+    Returns:
+        The rows that were changed, whose state in an optimizer is no longer true.
+    """
+    logits = raw["logits"]
+    opacities = logits[:count].sigmoid()
+    dead = opacities <= DEAD_OPACITY
+    vacant = torch.cat([dead.nonzero()[:, 0], torch.arange(count, new_count, device=logits.device)])
+    if len(vacant) == 0 or bool(dead.all()):
+        return vacant[:0]
+    sources = torch.multinomial(opacities.where(~dead, 0), len(vacant), replacement=True)
+    copies = sources.bincount(minlength=count) + 1
+    parents = (copies > 1).nonzero()[:, 0]
+    number, opacity = copies[parents].clamp(max=MOST_COPIES), opacities[parents].clamp(max=1 - 1e-6)
+    raw["log_scales"][parents] += scale_of_copies(opacity, number).log()[:, None]
+    logits[parents] = opacity_of_copies(opacity, number).clamp(min=DEAD_OPACITY).logit()
+    for tensor in raw.values():
+        tensor[vacant] = tensor[sources]
+    return torch.cat([parents, vacant])
+
+
+def position_noise(gaussians: Gaussians, rate: float) -> Float[Tensor, "gaussian 3"]:
+    """Draw noise that moves transparent Gaussians along their covariance (paper, Eq. 8), for a rate of positions."""
+    weights = torch.sigmoid(NOISE_STEEPNESS * (DEAD_OPACITY - gaussians.opacities)) * (NOISE * rate)
+    noise = torch.randn_like(gaussians.means) * weights[:, None]
+    return (gaussians.covariances() @ noise[..., None])[..., 0]

@@ -14,7 +14,6 @@ from torch.nn.functional import normalize
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
-from completesplat.baselines.densification import position_noise, relocate
 from completesplat.baselines.fitting import (
     POSITION_DECAY,
     POSITION_RATE,
@@ -22,6 +21,8 @@ from completesplat.baselines.fitting import (
     RawGaussians,
     gaussians_at_points,
     initial_gaussians,
+    position_noise,
+    relocate,
 )
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import CompleteSplatError

@@ -6,8 +6,7 @@ import pytest
 import torch
 from support import some_gaussians
 
-from completesplat.baselines.densification import opacity_of_copies, position_noise, relocate, scale_of_copies
-from completesplat.baselines.fitting import RawGaussians
+from completesplat.baselines.fitting import RawGaussians, opacity_of_copies, position_noise, relocate, scale_of_copies
 
 
 @pytest.mark.parametrize("copies", [1, 2, 3, 10, 51])
