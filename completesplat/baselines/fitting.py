@@ -1,8 +1,8 @@
 """Optimisation of 3D Gaussians for single scenes from posed views (Kerbl et al. 2023, "3D Gaussian Splatting").
 
-`fit_gaussians` keeps the number of Gaussians. `relocate` adds and moves them, as 3DGS-MCMC does (Kheradmand et al. 2024),
-without gradients of image positions, so with every rasterizer. Gaussians start from random pixels at random depths, or
-from points, where a data set has them.
+`fit_gaussians` keeps the number of Gaussians. `relocate` adds and moves them, as 3DGS-MCMC does (Kheradmand et al.
+2024), without gradients of image positions, so with every rasterizer. Gaussians start from random pixels at random
+depths, or from points, where a data set has them.
 """
 
 from collections.abc import Mapping
