@@ -238,8 +238,8 @@ def test_a_phone_says_what_it_waits_for(chromium, page, monkeypatch):
     monkeypatch.setattr(viser.ClientHandle, "get_render", lambda *_, **__: waiting.wait(LIMIT))
     phone = chromium.new_page(viewport={"width": 390, "height": 700})
     phone.set_default_timeout(1000 * LIMIT)
-    phone.goto(page.server.address, wait_until="commit")
-    phone.get_by_text("completesplat: starting the page").wait_for(state="attached")
+    html = phone.goto(page.server.address).text()
+    assert '<div id="root">completesplat: starting the page</div>' in html  # until viser's program has started
     phone.get_by_text("Drawing the first image").wait_for()
     say(page.server, "drawing from photo.png")
     phone.get_by_text("completesplat: drawing from photo.png").wait_for()
