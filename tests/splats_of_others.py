@@ -12,18 +12,18 @@ from completesplat.gaussians import Gaussians
 NAMES = ("means", "quaternions", "scales", "opacities", "colors")
 SCENE = Gaussians(
     torch.tensor([[1.0, 2, 3], [-0.5, 0.25, 4], [0, -1, 2]]),
-    torch.tensor([[0.5, 0.5, -0.5, 0.5], [0.8, 0, 0.6, 0], [0.1, 0.7, -0.1, 0.7]]),
-    torch.tensor([[0.1, 0.2, 0.4], [0.05, 0.05, 0.3], [0.2, 0.1, 0.1]]),
+    torch.tensor([[0.5, 0.1, -0.7, 0.3], [0.8, -0.2, 0.5, 0.1], [0.1, 0.6, -0.3, 0.7]]),
+    torch.tensor([[0.1, 0.2, 0.4], [0.05, 0.1, 0.3], [0.3, 0.1, 0.02]]),
     torch.tensor([0.9, 0.5, 0.2]),
     torch.tensor([[0.9, 0.1, 0.2], [0.2, 0.6, 0.4], [0.3, 0.3, 1.0]]),
 )
 # The `.ply` of SCENE, converted by npm's @playcanvas/splat-transform 2.7.1 with --spz-version 3 and 4.
 CONVERTED = {
-    3: "H4sIAAAAAAAAA/NzDw5gZmBgAGEGHiAWYGB48J/hwn+GH/8Z/vxnOPCfASb4rMF4m2d4eG9RSsrh6raJBQW9bdXVmUvnijGc4Dvg"
-    "8aKfBQC3Ct80TAAAAA==",
+    3: "H4sIAAAAAAAAA/NzDw5gZmBgAGEGHiAWYGB48J/hwn+GH/8Z/vxnOPCfASb4rMF4m2d4eG9RSsrh6raJBdW9vdWJXVt/u3hfi33p"
+    "VXV7NwDn7BMUTAAAAA==",
     4: "TkdTUAQAAAADAAAAAAwABSAAAAAAAAAAAAAAAAAAAAAkAAAAAAAAABsAAAAAAAAADAAAAAAAAAADAAAAAAAAABIAAAAAAAAACQAA"
     "AAAAAAASAAAAAAAAAAkAAAAAAAAAFQAAAAAAAAAMAAAAAAAAACi1L/0gG9kAAAAQAADg/wDQ/wD4/wD8/wDA/wAAAAAQAADg/yi1"
-    "L/0gAxkAAOaAMyi1L/0gCUkAALZJV1eNcmRkwyi1L/0gCUkAAHuGkXBwjYZ7eyi1L/0gDGEAAGmlnRYAyA7ASOiPBA==",
+    "L/0gAxkAAOaAMyi1L/0gCUkAALZJV1eNcmRkwyi1L/0gCUkAAHuGkXB7jY17YSi1L/0gDGEAAIq1+0RL1l3pSnrbuw==",
 }
 
 
