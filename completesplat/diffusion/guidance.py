@@ -1,6 +1,6 @@
 """The paper's two controls of sampling, guidance and skip weight, and the values that they may have.
 
-Guidance has the paper's meaning: a weight w mixes in the unconditional prediction, for diversity; skips carry the image.
+Guidance has the paper's meaning: a weight w mixes in the unconditional prediction for diversity. Skips carry the image.
 """
 
 from collections.abc import Callable
