@@ -140,11 +140,7 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
 
 
 def optimized(metric: str | None, out: Path) -> float | None:
-    """Return a finished job's metric for a sweeper such as Optuna: NaN if not finite, None if no metric is asked for.
-
-    Raises:
-        CompleteSplatError: the job has no metric of this name; the message lists those that it has.
-    """
+    """Return a job's metric for sweepers (NaN: not finite, None: not asked); raise CompleteSplatError if absent."""
     if metric is None:
         return None
     metrics = json.loads((out / METRICS).read_text())
