@@ -43,7 +43,7 @@ def test_splat_and_ply_are_read(tmp_path):
 
 
 def spz(version: int = 3, count: int = 1, body: bytes = bytes(20)) -> bytes:
-    return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", version, count, 0, 12, 0, 0) + body)
+    return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", version, count, 0, 12, 0, 0) + body, mtime=0)
 
 
 V4 = FILES["v4.spz"]
