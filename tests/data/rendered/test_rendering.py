@@ -188,11 +188,13 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_renders_that_were_killed_continue_without_half_written_scenes(cubes, tmp_path, number):
-    given = [f"{key}={value}" for key, value in QUICK.items() if key not in ("progress", "factory")]
+    given = [f"{key}={QUICK[key]}" for key in QUICK.keys() - {"progress", "factory", "front"}]
     command = ["data", "render", f"meshes={cubes / 'meshes'}", f"out={tmp_path}", *given]
     process = subprocess.Popen([sys.executable, "-P", "-m", "completesplat", *command], start_new_session=True)
     category = tmp_path / "rendered"
-    assert waited_for(lambda: any(category.glob("[!.]*/object.json")) and any(category.glob(".*/blender/job.json")))
+    done, begun = "[!.]*/object.json", ".*/blender/job.json"
+    assert waited_for(lambda: process.poll() is not None or (any(category.glob(done)) and any(category.glob(begun))))
+    assert process.returncode is None  # it has not ended by itself
     os.kill(process.pid, number)
     process.wait()
 
@@ -201,7 +203,7 @@ def test_renders_that_were_killed_continue_without_half_written_scenes(cubes, tm
         return [pid for pid in pids if _session_of(pid) == process.pid]
 
     assert waited_for(lambda: not session())  # Blender ends, too
-    before = {path.parent.name: contents(path.parent) for path in category.glob("[!.]*/object.json")}
+    before = {path.parent.name: contents(path.parent) for path in category.glob(done)}
     assert 0 < len(before) < 3
     assert all(len([name for name in files if name.startswith("images/")]) == 3 for files in before.values())
     render(str(cubes / "meshes"), out=tmp_path, **QUICK)
