@@ -313,8 +313,9 @@ def test_captures_in_folders_are_sequences_and_broken_ones_are_counted(tmp_path)
     assert other.fingerprint() != fingerprint
     with pytest.raises(BadAnnotation, match=r"c/transforms\.json, c: no frames"):
         CaptureDataModule(str(tmp_path / "c")).source("train")
-    with pytest.raises(MissingFile, match="empty: no cameras there"):
-        CaptureDataModule(str(tmp_path / "empty")).source("train")
+    for name, reason in {"empty": "no cameras there", "nowhere": "no such file or folder"}.items():
+        with pytest.raises(MissingFile, match=f"{name}: {reason}"):
+            CaptureDataModule(str(tmp_path / name)).source("train")
 
 
 def test_photographs_have_the_cameras_of_their_squares(tmp_path):

@@ -155,6 +155,8 @@ class CaptureDataModule(ObjectDataModule):
 
     def open(self, split: str) -> Mapping[str, CaptureSource]:
         """Read the cameras of all captures; the error of one capture is only raised if no other can be read."""
+        if not self.root.exists():
+            raise MissingFile("no such file or folder", str(self.root))
         captures: dict[str, Capture] = {}
         refused: list[DataError] = []
         folders = [self.root, *sorted(path for path in self.root.glob("*/") if path.is_dir())]

@@ -207,21 +207,21 @@ def without_background(image: Image.Image) -> Image.Image:
     """Make the background of an RGB image transparent (RGBA) with U2-Net (Qin et al. 2020) from rembg, or by GrabCut.
 
     Raises:
-        CompleteSplatError: neither rembg nor OpenCV is installed, or rembg fails; it downloads the network (176 MB).
+        CompleteSplatError: OpenCV is not installed, nor a rembg that works; it downloads its network (176 MB).
         ImageError: the whole image is background.
     """
     pixels = Image.fromarray(np.array(image))  # without EXIF, because rembg would turn the image again
     try:
         import rembg
+
+        cut = rembg.remove(pixels, session=_session())
+        log.info("background: removed by rembg (%s)", CUTTER)
     except (ImportError, SystemExit):  # rembg exits if onnxruntime is missing
         cut = by_grabcut(pixels)
-    else:
-        try:
-            cut = rembg.remove(pixels, session=_session())
-        except Exception as error:  # from the HTTP library, onnxruntime or the file system
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-            raise CompleteSplatError(f"background=remove: rembg fails with its network {CUTTER} ({reason})") from error
-        log.info("background: removed by rembg (%s)", CUTTER)
+    except Exception as error:  # from the HTTP library, onnxruntime or the file system
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        log.warning("background: rembg fails with its network %s (%s)", CUTTER, reason)
+        cut = by_grabcut(pixels)
     if not cut.getchannel("A").getbbox():
         raise ImageError("background=remove leaves nothing of it: no object is found")
     return cut
