@@ -103,7 +103,7 @@ notebooks: $(READY) ## Run every notebook from top to bottom, and store what it 
 	$(BIN)/python tests/stored_notebooks.py
 
 # The same commit gives the same bytes: hatchling takes all times from SOURCE_DATE_EPOCH, and sets the files' modes. The
-# bill of materials has the versions of requirements.lock, which are those that .ci/run tries; torch is not among them.
+# bill of materials has the versions of requirements.lock, and of torch, which is not in it, the range that is allowed.
 release: export SOURCE_DATE_EPOCH = $(shell git log -1 --format=%ct)
 release: ## Wheel, sdist, checksums and a bill of materials (CycloneDX), in dist; nothing is uploaded
 	rm -rf dist build/release
@@ -111,8 +111,9 @@ release: ## Wheel, sdist, checksums and a bill of materials (CycloneDX), in dist
 	build/release/bin/python -m pip install --quiet --disable-pip-version-check build twine cyclonedx-bom
 	build/release/bin/python -m build --outdir dist
 	build/release/bin/twine check --strict dist/*
+	{ cat requirements.lock; sed -n 's/^  "\(torch>.*\)",/\1/p' pyproject.toml; } > build/release/requirements.txt
 	build/release/bin/cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible \
-	  --output-file `ls dist/*.whl | sed 's/-py3.*/.cdx.json/'` requirements.lock
+	  --output-file `ls dist/*.whl | sed 's/-py3.*/.cdx.json/'` build/release/requirements.txt
 	cd dist && sha256sum * > SHA256SUMS && cat SHA256SUMS
 
 clean: ## Remove everything that can be made again, the environment included

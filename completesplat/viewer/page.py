@@ -181,7 +181,9 @@ class Page:
 
     def _choose(self, _: viser.GuiEvent[Any]) -> None:
         name = self.opening.chosen.value
-        self.worker.submit("open", partial(self.open, self.scenes[name], name))
+        if name in self.scenes:
+            self.opening.chosen.options = (*self.scenes,)
+            self.worker.submit("open", partial(self.open, self.scenes[name], name))
 
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
         """Show an uploaded scene, or complete an uploaded image; its name is never used as a path."""
@@ -193,12 +195,19 @@ class Page:
             try:
                 if suffix in SPLATS:
                     self.open(path, name)
+                    self._let_choose_another(name)
                 elif self.complete is None:
                     raise CompleteSplatError(f"{name}: not {', '.join(SPLATS)}; images need completesplat view IMAGE")
                 else:
                     self.complete(path, name, event.client)
             except CompleteSplatError as error:
                 self.tell(CompleteSplatError(str(error).replace(str(path), name)), event.client)
+
+    def _let_choose_another(self, name: str) -> None:
+        """Name an uploaded scene in the choice, so that each of `scenes` can be chosen next."""
+        chosen, uploaded = self.opening.chosen, f"loaded: {name}"
+        chosen.options, chosen.visible = (uploaded, *self.scenes), bool(self.scenes)
+        chosen.value = uploaded
 
     def _draw_thumbnails(self, samples: Sequence[Sample]) -> None:
         """Render thumbnails in the worker's thread; a single sample needs none."""

@@ -235,6 +235,12 @@ def test_one_of_several_scenes_is_chosen(server, tmp_path):
         made.opening.chosen.value = name
         assert made.worker.wait(LIMIT)
         assert len(view.samples) == count
+    write_splat(tmp_path / "c.splat", balls_sample().gaussians)
+    assert len(load(made, "c.splat", (tmp_path / "c.splat").read_bytes())) == 1
+    assert made.opening.chosen.value == "loaded: c.splat"
+    made.opening.chosen.value = "a"
+    assert made.worker.wait(LIMIT)
+    assert (len(view.samples), made.opening.chosen.options) == (2, ("a", "b"))
     made.worker.close()
 
 
