@@ -27,6 +27,7 @@ positions is relative to the scene's extent and decays exponentially to a hundre
 
 DEAD_OPACITY, MOST_COPIES = 0.005, 51  # as in the authors' code and gsplat
 NOISE, NOISE_STEEPNESS = 5e5, 100.0
+NEIGHBOURS = 3
 
 
 @dataclass(frozen=True)
@@ -93,11 +94,12 @@ def initial_gaussians(
 
 
 def gaussians_at_points(points: Float[Tensor, "gaussian 3"], views: Views, opacity: float) -> RawGaussians:
-    """Return Gaussians [1 gaussian] as large as the mean distance to the three nearest points (3DGS).
+    """Return Gaussians [1 gaussian] as large as the mean distance to the `NEIGHBOURS` nearest points (3DGS).
 
     Colours are means over the views [view] that contain the point, whether it is seen or hidden there.
     """
-    nearest = [torch.cdist(part, points).topk(4, largest=False).values[:, 1:] for part in torch.split(points, 500)]
+    parts = torch.split(points, 500)
+    nearest = [torch.cdist(part, points).topk(NEIGHBOURS + 1, largest=False).values[:, 1:] for part in parts]
     pixels, depth = project(views.cameras, points.expand(len(views.images), -1, -1))
     grid = 2 * pixels / pixels.new_tensor(views.cameras.image_size[::-1]) - 1
     inside = ((depth > 0) & (grid.abs() < 1).all(-1))[..., None]
@@ -155,14 +157,14 @@ def _optimizer(raw: RawGaussians, settings: FittingSettings, depth_range: Tensor
 
 
 def opacity_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Return the opacity of each of several equal Gaussians that together are as opaque as one (paper, Eq. 9)."""
+    """Return the opacity of each of several equal Gaussians that together are as opaque as one (3DGS-MCMC, Eq. 9)."""
     return 1 - (1 - opacities) ** (1 / copies)
 
 
 def scale_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
     """Return the factor on the scales of such copies, which preserves the integral of alpha along a line (Eq. 9).
 
-    The paper's double sum is written as one sum, by C(0, k) + ... + C(n - 1, k) = C(n, k + 1).
+    Their double sum is written as one sum, by C(0, k) + ... + C(n - 1, k) = C(n, k + 1).
     """
     n, o = copies.double()[:, None], opacity_of_copies(opacities.double(), copies)[:, None]
     j = torch.arange(1, int(copies.max()) + 1, dtype=torch.float64, device=o.device)
@@ -173,7 +175,7 @@ def scale_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"])
 
 @torch.no_grad()
 def relocate(raw: Mapping[str, Tensor], count: int, new_count: int) -> Int64[Tensor, " changed"]:
-    """Make dead Gaussians, and rows `count` to `new_count`, copies of living ones, drawn by opacity.
+    """Replace dead Gaussians, and fill rows `count` to `new_count`, by copies of living ones, drawn by opacity.
 
     Args:
         raw: tensors [row ...] of `RawGaussians` by name, which are changed.
@@ -199,7 +201,7 @@ def relocate(raw: Mapping[str, Tensor], count: int, new_count: int) -> Int64[Ten
 
 
 def position_noise(gaussians: Gaussians, rate: float) -> Float[Tensor, "gaussian 3"]:
-    """Draw noise that moves transparent Gaussians along their covariance (paper, Eq. 8), for a rate of positions."""
+    """Draw noise that moves transparent Gaussians along their covariance (3DGS-MCMC, Eq. 8), for a rate of positions."""
     weights = torch.sigmoid(NOISE_STEEPNESS * (DEAD_OPACITY - gaussians.opacities)) * (NOISE * rate)
     noise = torch.randn_like(gaussians.means) * weights[:, None]
     return (gaussians.covariances() @ noise[..., None])[..., 0]

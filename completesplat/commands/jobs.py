@@ -194,11 +194,16 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
         again = shlex.join(["completesplat", "fit", *same, f"ckpt_path={out / LAST}", "out=MORE"])
         advice = f"train on in another folder: {again}" if (out / LAST).is_file() else "choose another out=DIR"
         raise CompleteSplatError(f"{out} holds a run with another {first}: {advice}")
-    finished, end = (out / METRICS).is_file(), _ends(config)["trainer.max_steps"]
-    if not finished or not any(key.startswith(ENDS) for key in different):
+    finished, ends, earlier = (out / METRICS).is_file(), _ends(config), _ends(OmegaConf.load(out / CONFIG))
+    if not finished or ends == earlier:
         return finished
-    if 0 <= end <= (steps := json.loads((out / METRICS).read_text())["steps"]):
-        raise CompleteSplatError(f"trainer.max_steps={end}: {out} has {steps} steps already; give more of them")
+    if not (out / LAST).is_file():
+        raise CompleteSplatError(f"{out} has no {LAST} to continue from: choose another out=DIR")
+    if 0 <= ends["trainer.max_steps"] <= (steps := json.loads((out / METRICS).read_text())["steps"]):
+        raise CompleteSplatError(f"trainer.max_steps={ends['trainer.max_steps']}: {out} has {steps} steps; give more")
+    epochs, before = (end["trainer.max_epochs"] for end in (ends, earlier))
+    if epochs not in (None, -1) and (before in (None, -1) or epochs < before):
+        raise CompleteSplatError(f"trainer.max_epochs={epochs} may end before the run in {out}: choose another out=DIR")
     return False
 
 

@@ -6,7 +6,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from glob import glob
 from pathlib import Path
@@ -25,12 +25,10 @@ from completesplat.data.images.photograph import Photograph, outside_of_box, out
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
-from completesplat.export.mesh import check_available
 from completesplat.export.prediction import Wanted, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.files import folder_names, printable, safe_name
 from completesplat.generator import CompleteSplat
-from completesplat.geometry.trajectories import PATHS
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene_model import SceneModel, distance_to_training
 from completesplat.settings.checks import REMOVE
@@ -94,12 +92,10 @@ def _images_of(path: Path) -> list[Path]:
 
 
 def wanted_files(config: DictConfig) -> Wanted:
-    """Return the outputs for each image; raise CompleteSplatError for unknown formats, paths, or a missing program."""
-    formats, videos = _chosen("formats", config.formats, FORMATS), _chosen("video", config.video, PATHS)
+    """Return the outputs for each image; raise CompleteSplatError for none, an unknown one, or a missing program."""
+    formats, videos = _names(config.formats), _names(config.video)
     if not formats and not videos:
         raise CompleteSplatError(f"formats=[] video=[]: choose a format ({', '.join(FORMATS)}) or a video")
-    if "mesh" in formats:
-        check_available()
     return Wanted(
         formats=formats,
         videos=videos,
@@ -111,12 +107,9 @@ def wanted_files(config: DictConfig) -> Wanted:
     )
 
 
-def _chosen(name: str, value: object, choices: Collection[str]) -> tuple[str, ...]:
-    """Return one name, or the names of a list without duplicates; refuse those that are not in `choices`."""
+def _names(value: object) -> tuple[str, ...]:
+    """Return one name, or the names of a list without duplicates."""
     names = value if isinstance(value, Sequence) and not isinstance(value, str) else [value] if value else []
-    for entry in names:
-        if entry not in choices:
-            raise CompleteSplatError(f"{name}={entry}: choose from {', '.join(choices)}")
     return tuple(dict.fromkeys(map(str, names)))
 
 

@@ -79,7 +79,10 @@ class Trained:
         if self.ckpt is not None and self.data is not None:
             raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
         if self.ckpt is not None:
-            return config_of_run(Path(self.ckpt), list(self.overrides), self.trust)
+            config = config_of_run(Path(self.ckpt), list(self.overrides), self.trust)
+            if "scene_folder" in config.model:
+                config.model.scene_folder = None  # the run's own, whose scene stays as it is
+            return config
         if self.data is None:
             raise CompleteSplatError("weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR")
         config = OmegaConf.create({"seed": self.seed, "data": self.data})

@@ -46,12 +46,13 @@ def run(config: DictConfig, out: Path) -> None:
         if config.export is None:
             print(f"{server.address} (Ctrl-C ends it)", flush=True)
         page = make_page(server, config, out)
+        step = None
         if config.export is not None:
             return export(page, Path(config.export))
         while True:
             time.sleep(PAUSE)
             if config.watch is not None:
-                show_newest(page, Path(config.watch))
+                step = show_newest(page, Path(config.watch), step)
     except Interrupted as stop:
         if stop.signal != SIGINT:
             raise
@@ -70,7 +71,8 @@ def settings_of(path: Path) -> dict[str, str]:
     for folder in (path, path / "weights"):
         if all((folder / name).is_file() for name in WEIGHT_FILES):
             return {"weights": str(folder)}
-    if (path / RUN_CHECKPOINT).is_file():
+    fitted = (path / "scene.ply").is_file()  # a run's result
+    if (path / RUN_CHECKPOINT).is_file() and not fitted:
         return {"weights": str(path)}
     if scenes_in(path):
         return {"scene": str(path)}
@@ -147,17 +149,17 @@ def newest_scenes(run: Path) -> tuple[str, Sequence[Any], Sequence[float]]:
     return AT_STEP.format(step), samples, up
 
 
-def show_newest(page: Any, run: Path) -> None:
-    """Show the scenes that the run has written since the page was last drawn, if any."""
+def show_newest(page: Any, run: Path, shown: int | None) -> int | None:
+    """Show the scenes that the run has written since step `shown` (None: since the page was made); return their step."""
     from completesplat.viewer.sample import read_newest
 
-    steps = {sample.settings["step"] for sample in page.view.samples}
     try:
         step, samples, _ = read_newest(run / NEWEST)
     except CompleteSplatError:
-        return  # the scenes are just being written, or were removed: the page stays as it is
-    if steps != {step} and samples:
+        return shown  # the scenes are just being written, or were removed: the page stays as it is
+    if step not in {shown, *(sample.settings.get("step") for sample in page.view.samples)}:
         page.show(samples, AT_STEP.format(step))
+    return step
 
 
 def export(page: Any, path: Path) -> None:

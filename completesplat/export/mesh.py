@@ -39,7 +39,7 @@ def check_available() -> None:
     try:
         import skimage.measure  # noqa: F401
     except ImportError as error:
-        raise CompleteSplatError('formats=mesh needs scikit-image: pip install "completesplat[mesh]"') from error
+        raise CompleteSplatError('formats=[mesh] needs scikit-image: pip install "completesplat[mesh]"') from error
 
 
 @torch.no_grad()
@@ -64,12 +64,14 @@ def mesh_of(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras, pivot:
     if not (depths > 0).any():
         raise CompleteSplatError("mesh: no surface in the middle of the photo")
     seen = unproject(cameras, pixel_centers(SIDE, SIDE, maps.device).flatten(0, 1), depths)[depths > 0]
-    voxel = (seen.amax(0) - seen.amin(0)).max().item() / VOXELS
+    voxel = max((seen.amax(0) - seen.amin(0)).max().item(), 1e-3 * radius) / VOXELS
     low, high = seen.amin(0) - 2 * voxel, seen.amax(0) + 2 * voxel
     axes = [torch.arange(low[i].item(), high[i].item(), voxel, device=maps.device) for i in range(3)]
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
     field = distances(grid.flatten(0, 2), cameras, maps[:, :1], TRUNCATION * voxel).view(grid.shape[:3])
     field = torch.where((grid - center).norm(dim=-1) < radius, field, 1)
+    if not (field < 0).any():
+        raise CompleteSplatError("mesh: what is seen in the middle of the photo is too thin to be a solid")
     corners, faces, normals = surface_of(field.cpu().numpy())
     vertices = low + voxel * corners.to(low)
     return Mesh(vertices, faces, vertex_colors(vertices, normals.to(low), cameras, maps, 2 * voxel), voxel)

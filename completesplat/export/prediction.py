@@ -11,8 +11,9 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
-from completesplat.export.formats import write_formats
+from completesplat.export.formats import FORMATS, write_formats
 from completesplat.export.images import (
     SheetCell,
     color_depth,
@@ -23,6 +24,7 @@ from completesplat.export.images import (
     to_bytes,
     write_png,
 )
+from completesplat.export.mesh import check_available
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform
 from completesplat.export.video import Frames, orbit_views, render_views, write_video
@@ -50,6 +52,9 @@ CONVENTIONS = {
 class Wanted:
     """Selection of the files that are written for each prediction.
 
+    Raises:
+        CompleteSplatError: a format or video is unknown, or a format needs a package that is missing.
+
     Args:
         formats: scene formats, from `completesplat.export.formats.FORMATS`; some need the converter.
         videos: camera paths, from `completesplat.geometry.trajectories.PATHS`; each video has `frames` frames.
@@ -65,6 +70,14 @@ class Wanted:
     maps: bool = False
     converter: SplatTransform | None = None
     screen_space_dilation: bool = True
+
+    def __post_init__(self) -> None:
+        for name, chosen, known in (("formats", self.formats, FORMATS), ("video", self.videos, PATHS)):
+            for kind in chosen:
+                if kind not in known:
+                    raise CompleteSplatError(f"{name}={kind}: choose from {', '.join(known)}")
+        if "mesh" in self.formats:
+            check_available()
 
 
 def write_prediction(
@@ -127,6 +140,7 @@ def write_fitted_scene(
     truth: Frames,
     seed: int,
     scale: float = 1.0,
+    up: Sequence[float] = (0.0, -1.0, 0.0),
     more: Mapping[str, str] | None = None,
 ) -> None:
     """Write `scene.ply`, `sheet.png` (true and rendered images of at most 8 views, with PSNR) and `scene.json`.
@@ -136,23 +150,20 @@ def write_fitted_scene(
         scene: in the world of the cameras.
         images, truth: rendered and true images of the cameras.
         scale: units of the world in one unit of the files.
+        up: direction up in the world.
         more: other files of the scene by purpose, for `scene.json`.
 
     Raises:
         CompleteSplatError: no Gaussian of the scene can be stored.
     """
-    make_folder(folder.parent)
-    make_folder(folder)
-    enlarged = with_screen_space_dilation(cleaned(scene, name), cameras[0])
-    stored = replace(enlarged, means=enlarged.means / scale, scales=enlarged.scales / scale)
+    stored, reference = in_units(with_screen_space_dilation(cleaned(scene, name), cameras[0]), cameras[0], scale)
     write_ply(folder / "scene.ply", stored, [f"scene {name}"])
     indices = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
     rows = [strip(truth[indices].clamp(0, 1), "true"), strip(images[indices].clamp(0, 1), "fitted")]
     scores = psnr(images[indices].clamp(0, 1), truth[indices]).tolist()
     headings = [f"view {i}: {score:.2f} dB" for i, score in zip(indices, scores, strict=True)]
     write_png(folder / "sheet.png", image_sheet(headings, rows, title))
-    reference = cameras[0].scale_world(torch.tensor(1 / scale).to(cameras.intrinsics))
-    settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True}
+    settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True, "up": list(up)}
     files = {"scene": "scene.ply", "sheet": "sheet.png", **(more or {})}
     write_scene_json(folder / "scene.json", reference, settings, seed, files)
 
@@ -167,15 +178,17 @@ def write_scene(
     up: Float[Tensor, "3"],
     wanted: Wanted,
     comments: Sequence[str],
+    scale: float = 1.0,
 ) -> tuple[Frames, Float[Tensor, "1 height width"], dict[str, str]]:
-    """Write a scene's splats (`NAME.ply`, ...) and videos (`orbitSUFFIX.mp4`, ...).
+    """Write a scene's splats (`NAME.ply`, ...), with `scale` units of its world as one, and videos (`orbitSUFFIX.mp4`).
 
     Returns:
         Views around the scene, the first view's depth, and file names by purpose.
     """
     pivot = seen_center(rasterizer, scene, reference)
-    view = PageView(reference, pivot, up, wanted.background)
-    stored = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
+    dilated = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
+    stored, camera = in_units(dilated, reference, scale)
+    view = PageView(camera, pivot / scale, up, wanted.background)
     files = write_formats(folder, name, stored, wanted.formats, view, wanted.converter, comments, rasterizer)
     for kind in wanted.videos:
         files[f"{kind}{suffix}"] = f"{kind}{suffix}.mp4"
@@ -184,6 +197,12 @@ def write_scene(
         write_video(folder / f"{kind}{suffix}.mp4", frames)
     views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
     return views, depths[0], files
+
+
+def in_units(scene: Gaussians, camera: Cameras, scale: float) -> tuple[Gaussians, Cameras]:
+    """Return a scene and a camera in a unit of `scale` units of their world."""
+    factor = torch.tensor(1 / scale).to(camera.intrinsics)
+    return replace(scene, means=scene.means / scale, scales=scene.scales / scale), camera.scale_world(factor)
 
 
 @torch.no_grad()

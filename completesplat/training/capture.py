@@ -12,9 +12,9 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 from torch.optim import Adam
-from torch.optim.lr_scheduler import LambdaLR
 
 from completesplat.baselines.fitting import (
+    NEIGHBOURS,
     POSITION_DECAY,
     POSITION_RATE,
     RATES,
@@ -24,12 +24,12 @@ from completesplat.baselines.fitting import (
     position_noise,
     relocate,
 )
+from completesplat.data.packed.manifest import is_packed
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED
 from completesplat.export.prediction import Wanted, write_fitted_scene, write_scene
 from completesplat.export.splat_transform import find_splat_transform
-from completesplat.files import make_folder
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import WeightedSum
@@ -37,9 +37,10 @@ from completesplat.losses.weighted_sum import Prediction
 from completesplat.scene import SceneBatch, Views
 from completesplat.settings.schema import Positive, Range, Share
 from completesplat.tensors import stack
-from completesplat.training.optimization import constant
+from completesplat.training.optimization import Schedule, constant
 from completesplat.training.stage import Renders, Stage
 
+Count = Annotated[int, Range(NEIGHBOURS + 1)]
 REFINED_SHARE = 0.8  # of the run, in which Gaussians move and are added (25,000 of 30,000 steps in 3DGS-MCMC)
 
 logger = logging.getLogger(__name__)
@@ -50,15 +51,15 @@ class CaptureSettings:
     """Settings of the Gaussians of a capture.
 
     Attributes:
-        initial, most: numbers of Gaussians at the start (at most as many as there are points) and at the end.
+        initial, most: numbers of Gaussians at the start (at most as many as there are points) and at most.
         opacity: initial opacity of all Gaussians.
         refine_every: steps between relocations of dead Gaussians, which add the share `growth` of new ones.
         opacity_weight, scale_weight: weights of mean opacity and mean scale in the loss.
         position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
     """
 
-    initial: Positive = 20_000
-    most: Positive = 50_000
+    initial: Count = 20_000
+    most: Count = 50_000
     opacity: Share = 0.1
     refine_every: Positive = 50
     growth: Annotated[float, Range(0, 1)] = 0.05
@@ -76,9 +77,9 @@ class CaptureFit(Stage):
     data module's units.
 
     Args:
-        folder: folder of the result, `scene.ply` in the capture's own world and units with what `write_fitted_scene`
-            and `write_scene` add; None: nothing is written.
-        formats, videos, frames: as in `Wanted`, without `ply`. A format that needs a missing program is left out.
+        scene_folder: folder of the result in the capture's own world and units, by `write_fitted_scene` and
+            `write_scene`; None: nothing is written.
+        formats, videos, frames: as in `Wanted`, without `ply`. A format that cannot be written is left out.
     """
 
     without_effect = ("optimizer", "schedule")
@@ -87,7 +88,7 @@ class CaptureFit(Stage):
         self,
         loss: WeightedSum,
         fitting: CaptureSettings,
-        folder: str | None = None,
+        scene_folder: str | None = None,
         formats: Sequence[str] = (),
         videos: Sequence[str] = ("orbit",),
         frames: Positive = 96,
@@ -96,7 +97,7 @@ class CaptureFit(Stage):
         super().__init__(optimizer=Adam, schedule=constant, **rendering)
         self.loss = loss
         self.fitting = fitting
-        self.folder = None if folder is None else Path(folder)
+        self.scene_folder = None if scene_folder is None else Path(scene_folder)
         self.wanted = Wanted(formats, videos, frames, self.background)
         shapes = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "logits": (), "harmonics": (3,)}
         self.raw = nn.ParameterDict({name: torch.zeros(fitting.most, *shape) for name, shape in shapes.items()})
@@ -111,9 +112,10 @@ class CaptureFit(Stage):
     def sequence(self, split: str) -> PosedSequence:
         """Return the frames of a split of the capture; raise CompleteSplatError unless there is exactly one capture."""
         names = self.data.store(split).names
-        if len(names) != 1 or not self.data.splits_share_sequences:
-            where = f"data.root={self.data.root} has {len(names)} sequences"
-            raise CompleteSplatError(f"{where}; model=capture fits one capture: give data=capture data.root=FOLDER")
+        if len(names) != 1 or not self.data.splits_share_sequences or is_packed(self.data.root):
+            found = "is prepared" if is_packed(self.data.root) else f"has {len(names)} sequences"
+            advice = "model=capture fits one capture: give data=capture and its folder, as it was taken"
+            raise CompleteSplatError(f"data.root={self.data.root} {found}; {advice}")
         return self.data.store(split).source.read(names[0])
 
     def reference_poses(self, scenes: SceneBatch, split: str) -> Float[Tensor, "batch 4 4"]:
@@ -132,14 +134,14 @@ class CaptureFit(Stage):
     def on_fit_start(self) -> None:
         """Place the first Gaussians, unless a run is continued."""
         if changed := [key for key, value in self.data.augment.keywords.items() if value]:
-            raise CompleteSplatError(f"data.{changed[0]}: model=capture fits the photos as they are; leave it out")
+            raise CompleteSplatError(f"data.{changed[0]}: model=capture fits the photos as they are; turn it off")
         sequence = self.sequence("train")
         if self.count:
             return
         generator, settings = torch.Generator().manual_seed(0), self.fitting
         scene = stack([self.data.store("train").scene(sequence, 0, range(1, len(sequence.frames)))]).to(self.device)
         views, most = self.in_world(scene, "train"), min(settings.initial, settings.most)
-        if sequence.points is None:
+        if sequence.points is None or len(sequence.points) <= NEIGHBOURS:
             points = initial_gaussians(views, scene.depth_range, most, settings.opacity, generator).means[0]
         else:
             points = sequence.points[torch.randperm(len(sequence.points), generator=generator)[:most]].to(self.device)
@@ -151,7 +153,7 @@ class CaptureFit(Stage):
     def on_train_batch_start(self, batch: SceneBatch, index: int) -> None:
         """Move dead Gaussians, add new ones, and disturb transparent ones, before all steps but the first."""
         step, total, settings = self.global_step, self.trainer.estimated_stepping_batches, self.fitting
-        if step == 0:
+        if step == 0 or index % self.trainer.accumulate_grad_batches:
             return
         (optimizer,) = self.trainer.optimizers
         count, rate = int(self.count), optimizer.param_groups[0]["lr"] / settings.position_rate
@@ -183,7 +185,7 @@ class CaptureFit(Stage):
         optimizer = Adam([{"params": [self.raw[name]], "lr": rate} for name, rate in rates.items()], eps=1e-15)
         steps = max(1, self.trainer.estimated_stepping_batches)
         decays = [lambda step: POSITION_DECAY ** (step / steps), *[lambda step: 1.0] * (len(rates) - 1)]
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": LambdaLR(optimizer, decays), "interval": "step"}}
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": Schedule(optimizer, decays), "interval": "step"}}
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Return the fitted Gaussians in the frame of each scene's reference, a held-out frame."""
@@ -196,23 +198,21 @@ class CaptureFit(Stage):
         super().on_test_start()
 
     def scene_scored(self, name: str, gaussians: Gaussians, cameras: Cameras, images: Renders, truth: Views) -> None:
-        """Write the scene, the held-out frames beside their renders, videos, and a page if Node.js is installed."""
-        if self.folder is None:
+        """Write the scene, the held-out frames beside their renders, videos and other formats."""
+        if self.scene_folder is None:
             return
         sequence, scene, wanted = self.sequence("test"), self.gaussians().detach(), self.wanted
         poses = cameras.world_to_camera @ sequence.cameras.world_to_camera[0].to(cameras.world_to_camera)
         placed, up = replace(cameras, world_to_camera=poses), normalize(-poses[:, 1, :3].mean(0), dim=-1)
-        try:
-            needed = set(wanted.formats) & set(CONVERTED)
-            wanted = replace(wanted, converter=find_splat_transform() if needed else None)
-        except CompleteSplatError as error:
-            logger.warning("left out: %s", error)
-            wanted = replace(wanted, formats=[kind for kind in wanted.formats if kind not in CONVERTED])
-        make_folder(self.folder)
-        around = scene, placed[0], self.rasterizer, up, wanted, [f"scene {name}"]
-        *_, files = write_scene(self.folder, "scene", "", *around)
+        self.scene_folder.mkdir(parents=True, exist_ok=True)
+        target, seen, files = (self.scene_folder, "scene", ""), (scene, placed[0], self.rasterizer, up), {}
+        for formats, videos in [((), wanted.videos), *(((kind,), ()) for kind in wanted.formats)]:
+            try:
+                converter = find_splat_transform() if set(formats) & set(CONVERTED) else None
+                part = replace(wanted, formats=formats, videos=videos, converter=converter)
+                files |= write_scene(*target, *seen, part, [f"scene {name}"], sequence.scale)[-1]
+            except CompleteSplatError as error:
+                logger.warning("left out: %s", error)
         title = f"{name}: held-out photos, Gaussians fitted to the {len(self.sequence('train').frames)} others"
-        seed = self.evaluation.scene_seed(name)
-        write_fitted_scene(
-            self.folder, name, title, scene, placed, images[0], truth.images, seed, sequence.scale, files
-        )
+        shown = scene, placed, images[0], truth.images, self.evaluation.scene_seed(name)
+        write_fitted_scene(self.scene_folder, name, title, *shown, sequence.scale, up.tolist(), files)

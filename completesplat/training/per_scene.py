@@ -62,6 +62,8 @@ class PerScene(Stage):
             return
         folder, seed = self.scenes_folder / safe_name(name), self.evaluation.scene_seed(name)
         try:
+            make_folder(self.scenes_folder)
+            make_folder(folder)
             title = f"{name}: fitted to these views"
             write_fitted_scene(folder, name, title, gaussians[0], cameras, images[0], truth.images, seed)
         except CompleteSplatError as error:

@@ -121,8 +121,10 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     assert jobs.is_finished(tmp_path, config())
     for longer in ({"max_steps": 40}, {"max_steps": -1}, {"max_time": {"hours": 1}, "max_steps": 21}):
         assert not jobs.is_finished(tmp_path, config(**longer))
-    with pytest.raises(CompleteSplatError, match=r"max_steps=10: .* has 20 steps already"):
+    with pytest.raises(CompleteSplatError, match=r"max_steps=10: .* has 20 steps; give more"):
         jobs.is_finished(tmp_path, config(max_steps=10))
+    with pytest.raises(CompleteSplatError, match="max_epochs=3 may end before the run in"):
+        jobs.is_finished(tmp_path, config(max_steps=40, max_epochs=3))
     again = f"completesplat fit optimizer.lr=2 ckpt_path={tmp_path}/checkpoints/last.ckpt out=MORE"
     with pytest.raises(CompleteSplatError, match=f"another optimizer.lr: train on in another folder: {again}$"):
         jobs.is_finished(tmp_path, config(rate=2, max_steps=40), ["out=R", "optimizer.lr=2", "ckpt_path=last"])
@@ -132,6 +134,10 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     (earlier,) = record["earlier_ends"]
     assert (earlier["command"], earlier["trainer.max_steps"]) == (["first"], 20)
     assert {path.name for path in tmp_path.glob("metrics*")} == {"metrics_20_steps.json"}
+    (tmp_path / "metrics_20_steps.json").rename(tmp_path / "metrics.json")
+    (tmp_path / jobs.LAST).unlink()
+    with pytest.raises(CompleteSplatError, match=r"has no checkpoints/last\.ckpt to continue from: choose another out"):
+        jobs.is_finished(tmp_path, config(max_steps=40))
 
 
 FIT = [*SMALL, "experiment=toy_var", "test=false", "trainer.max_steps=2", "trainer.log_every_n_steps=1"]

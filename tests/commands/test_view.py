@@ -19,7 +19,7 @@ from completesplat.commands.view import newest_scenes, scenes_in, settings_of, s
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.training.fixed_scenes import write_newest
-from completesplat.viewer.sample import UP
+from completesplat.viewer.sample import UP, Sample
 
 
 def folder(path, *names: str):
@@ -36,6 +36,8 @@ def test_what_a_path_stands_for(tmp_path):
     prediction = folder(tmp_path / "p", "sample_00.ply", "scene.json")
     outer = folder(tmp_path / "o", "photo/sample_00.ply", "run.json")
     files = folder(tmp_path / "f", "A.PLY", "photo.jpg")
+    fitted = folder(tmp_path / "c", "checkpoints/last.ckpt", "config.yaml", "scene.ply")
+    assert settings_of(fitted) == {"scene": str(fitted)}
     assert settings_of(weights) == {"weights": str(weights)}
     assert settings_of(run) == {"weights": str(run / "weights")}
     assert settings_of(prediction) == {"scene": str(prediction)}
@@ -98,14 +100,16 @@ def test_what_a_run_writes_is_shown_when_it_is_new(tmp_path, capsys):
     page = SimpleNamespace(
         view=view, show=lambda samples, message: (shown.append(message), setattr(view, "samples", samples))
     )
-    show_newest(page, run)
-    assert shown == []
+    last = show_newest(page, run, None)
+    assert (last, shown) == (2, [])
     for step in (4, 4, 6):
         run_in_training(run, step)
-        show_newest(page, run)
+        last = show_newest(page, run, last)
     assert shown == ["step 4 of the training", "step 6 of the training"]
+    view.samples = [Sample(balls(points=5), 1, view.samples[0].reference)]  # a file that somebody loads meanwhile
+    assert show_newest(page, run, last) == 6
     (run / "images/newest/scenes.json").write_text("{")
-    show_newest(page, run)
+    assert show_newest(page, run, last) == 6
     assert len(shown) == 2
     with pytest.raises(CompleteSplatError, match=r"no images/ here, which fit fills"):
         newest_scenes(tmp_path)

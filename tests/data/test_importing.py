@@ -1,5 +1,6 @@
 """Import of captures: cameras by COLMAP against those that the photos were drawn with, and what is refused."""
 
+import errno
 import logging
 import subprocess
 import sys
@@ -96,7 +97,7 @@ def test_all_pairs_are_matched_or_those_of_neighbours_in_a_ring():
     assert all(sum(number in pair for pair in pairs) == 2 * (10 + 2) for number in range(100))  # and 16, 32 apart
 
 
-def test_photos_become_upright_keep_their_focal_length_and_the_unreadable_are_named(tmp_path, caplog):
+def test_photos_become_upright_keep_their_focal_length_and_the_unreadable_are_named(tmp_path, caplog, monkeypatch):
     (tmp_path / "images").mkdir()
     photo, exif = Image.new("RGB", (40, 30)), Image.Exif()
     photo.paste((255, 255, 255), (0, 0, 20, 30))  # its left half
@@ -118,14 +119,21 @@ def test_photos_become_upright_keep_their_focal_length_and_the_unreadable_are_na
     assert caplog.text.count("left out: ") == 1
     assert f"left out: {tmp_path / 'cut.jpg'}: cannot be decoded" in caplog.text
 
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(importing, "save_image", full)
+    with pytest.raises(OSError, match="No space left"):
+        importing._copy_photos(tmp_path, tmp_path / "images")
+
 
 @pytest.mark.parametrize(("asked", "expected"), [(8, range(0, 40, 5)), (100, range(40))])
 def test_a_video_is_split_into_evenly_spread_frames(tmp_path, asked, expected):
     grey = np.arange(40, dtype=np.uint8) * 6
     imageio.imwrite(tmp_path / "a.mp4", np.broadcast_to(grey[:, None, None, None], (40, 64, 64, 3)), fps=10)
-    (tmp_path / "images").mkdir()
-    importing._split_video(tmp_path / "a.mp4", tmp_path / "images", asked)
-    means = [np.asarray(Image.open(path)).mean() for path in sorted((tmp_path / "images").iterdir())]
+    (images := tmp_path / "100%d images").mkdir()
+    importing._split_video(tmp_path / "a.mp4", images, asked)
+    means = [np.asarray(Image.open(path)).mean() for path in sorted(images.iterdir())]
     np.testing.assert_allclose(means, 6 * np.array(expected), atol=2)
 
 
@@ -161,6 +169,11 @@ def test_a_capture_stays_where_it_is_and_the_last_line_goes_on(command, tmp_path
     assert "fox: 18 images with cameras, of which 3 are held out" in finished.out
     last = [str(tmp_path / "out"), "go on with: completesplat fit experiment=capture data.root=fox"]
     assert finished.out.splitlines()[-2:] == last
+    (tmp_path / "several").mkdir()
+    for name in ("a", "b"):
+        write_capture(tmp_path / "several" / name, frames=20)
+    several = command("data", "import", "several", "out=out")
+    assert several.out.splitlines()[-1].endswith(" data.root=several/a")  # one is fitted at a time
 
 
 @pytest.mark.processes

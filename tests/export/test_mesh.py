@@ -112,6 +112,9 @@ def test_where_there_is_nothing_there_is_no_mesh(tmp_path):
     behind = blobs(sphere((0, 0, -3), 0.3, 50), (1.0, 0, 0))
     with pytest.raises(CompleteSplatError, match="no surface in the middle"):
         write_formats(tmp_path, "a", behind, ["mesh"], VIEW, None, rasterizer=TiledRasterizer())
+    speck = blobs(sphere((0, 0, 3), 1e-9, 1), (1.0, 0, 0))
+    with pytest.raises(CompleteSplatError, match="too thin to be a solid"):
+        write_formats(tmp_path, "a", speck, ["mesh"], VIEW, None, rasterizer=TiledRasterizer())
     with pytest.raises(CompleteSplatError, match="a rasterizer is needed for mesh"):
         write_formats(tmp_path, "a", behind, ["mesh"], VIEW, None)
     assert not list(tmp_path.iterdir())

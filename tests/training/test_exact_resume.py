@@ -110,7 +110,7 @@ def test_a_finished_run_whose_end_moves_is_the_run_that_had_this_end_from_the_st
     assert strict_json(run / "metrics_4_steps.json")["steps"] == 4
     again = [command(*settings["var"], f"out={run}", "ckpt_path=last", *more) for more in ([], ["trainer.max_steps=5"])]
     assert "finished before" in again[0].out
-    assert again[1].err.startswith(f"error: trainer.max_steps=5: {run} has {STEPS} steps already")
+    assert again[1].err.startswith(f"error: trainer.max_steps=5: {run} has {STEPS} steps; give more")
 
 
 def must_be_equal(whole, result) -> None:

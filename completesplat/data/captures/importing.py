@@ -32,22 +32,22 @@ def import_capture(
     folder: str, cameras: Literal["colmap"] | None, frames: Positive, max_image_size: Positive, out: Path
 ) -> str:
     """Check the cameras of captures, which COLMAP computes first if asked to; return the command that goes on."""
-    root = Path(folder)
-    if not root.exists():
-        raise DataError("no such file or folder", folder)
-    if cameras is not None:
-        root = _make_capture(root, frames, max_image_size, out)
+    root = Path(folder) if cameras is None else _make_capture(Path(folder), frames, max_image_size, out)
     sources = CaptureDataModule(str(root)).open("train")
     for error in sources["train"].refused:
         leave_out(error)
     for name in sources["train"].names:
         counts = [len(sources[split].read(name).frames) for split in ("train", "test")]
         logger.info("%s: %d images with cameras, of which %d are held out", name, sum(counts), counts[1])
-    return f"go on with: completesplat fit experiment=capture {shlex.quote(f'data.root={root}')}"
+    names = sources["train"].names
+    first = root if len(names) == 1 else root / names[0]  # of several captures
+    return f"go on with: completesplat fit experiment=capture {shlex.quote(f'data.root={first}')}"
 
 
 def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> Path:
     """Write and return `out`/NAME, whole or not at all, and name the images that have no pose."""
+    if not source.exists():
+        raise DataError("no such file or folder", str(source))
     pycolmap = import_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     video, path = source.is_file(), source.resolve()
@@ -79,9 +79,10 @@ def _copy_photos(folder: Path, images: Path) -> None:
     photos = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes)
     stems = folder_names("_".join(path.stem.split()) for path in photos)  # COLMAP lists pairs with a space between
     for photo, stem in track(list(zip(photos, stems, strict=True)), "photos"):
-        with refused_to(leave_out), refused_as_bad(str(photo)), opened(photo, FORMATS) as image:
-            check_sums(image, photo)
-            upright = ImageOps.exif_transpose(image)
+        with refused_to(leave_out), refused_as_bad(str(photo)):
+            with opened(photo, FORMATS) as image:
+                check_sums(image, photo)
+                upright = ImageOps.exif_transpose(image)
             options = {"quality": 95, "subsampling": 0, "exif": upright.info.get("exif", b"")}
             save_image(upright, images / f"{stem}{photo.suffix.lower()}", **options)
 
@@ -97,7 +98,8 @@ def _split_video(video: Path, images: Path, frames: int) -> None:
     part = f"{min(frames, count)}/{count}"
     options = ["-vf", f"select=gt(floor(n*{part})\\,floor((n-1)*{part}))", "-fps_mode", "passthrough", "-q:v", "2"]
     command = [get_ffmpeg_exe(), "-nostdin", "-v", "error", "-i", str(video.absolute()), *options]
-    subprocess.run([*command, str(images / "%05d.jpg")], check=True)
+    if subprocess.run([*command, "%05d.jpg"], cwd=images).returncode:
+        raise DataError("ffmpeg cannot split it; the reason is above", str(video))
 
 
 def image_pairs(images: int, sequential: bool) -> list[tuple[int, int]]:
