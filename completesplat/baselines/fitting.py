@@ -1,7 +1,7 @@
 """Optimisation of 3D Gaussians for single scenes from posed views (Kerbl et al. 2023, "3D Gaussian Splatting").
 
 `fit_gaussians` keeps the number of Gaussians. `relocate` adds and moves them, as 3DGS-MCMC does (Kheradmand et al.
-2024), without gradients of image positions, so with every rasterizer. Gaussians start from random pixels at random
+2024), without gradients of image positions, so any rasterizer serves. Gaussians start from random pixels at random
 depths, or from points, where a data set has them.
 """
 
@@ -201,7 +201,7 @@ def relocate(raw: Mapping[str, Tensor], count: int, new_count: int) -> Int64[Ten
 
 
 def position_noise(gaussians: Gaussians, rate: float) -> Float[Tensor, "gaussian 3"]:
-    """Draw noise that moves transparent Gaussians along their covariance (3DGS-MCMC, Eq. 8), for a rate of positions."""
+    """Draw noise for the positions' rate, by which transparent Gaussians move along their covariance (3DGS-MCMC, Eq. 8)."""
     weights = torch.sigmoid(NOISE_STEEPNESS * (DEAD_OPACITY - gaussians.opacities)) * (NOISE * rate)
     noise = torch.randn_like(gaussians.means) * weights[:, None]
     return (gaussians.covariances() @ noise[..., None])[..., 0]

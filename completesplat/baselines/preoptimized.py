@@ -1,6 +1,6 @@
 """Projection of any 3D Gaussians into a Splatter Image: each goes to the pixel that its centre falls into.
 
-The supplement ("Pre-optimizing 3D Gaussian splats and projecting into Splatter Images") leaves 80 % of pixels empty.
+It leaves 80 % of pixels empty (supplement, "Pre-optimizing 3D Gaussian splats and projecting into Splatter Images").
 """
 
 import math

@@ -192,7 +192,7 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
         first = min(others, key=lambda key: (key.count("."), key))  # `model` repeats settings from outside it
         same = [argument for argument in overrides if not argument.startswith(("out=", "ckpt_path="))]
         again = shlex.join(["completesplat", "fit", *same, f"ckpt_path={out / LAST}", "out=MORE"])
-        advice = f"train on in another folder: {again}" if (out / LAST).is_file() else "choose another out=DIR"
+        advice = f"continue in another folder: {again}" if (out / LAST).is_file() else "choose another out=DIR"
         raise CompleteSplatError(f"{out} holds a run with another {first}: {advice}")
     finished, ends, earlier = (out / METRICS).is_file(), _ends(config), _ends(OmegaConf.load(out / CONFIG))
     if not finished or ends == earlier:
@@ -216,7 +216,7 @@ def _differences(first: object, second: object, key: str = "") -> set[str]:
 
 
 def _record(out: Path, command: list[str], overrides: list[str], config: Mapping[str, object]) -> None:
-    """Write `run.json` with times, command and earlier ends; results at one become `metrics_N_steps.json`."""
+    """Write `run.json` with times, command and earlier ends; rename earlier results `metrics_N_steps.json`."""
     path, now = out / RECORD, time.strftime("%Y-%m-%dT%H:%M:%S%z")
     record: dict[str, Any] = {"version": __version__, "commit": git_commit(), "command": command}
     record |= {"overrides": overrides, "started": now}

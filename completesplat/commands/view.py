@@ -135,7 +135,7 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
 
 
 def newest_scenes(run: Path) -> tuple[str, Sequence[Any], Sequence[float]]:
-    """Wait for a run's fixed scenes; return a note on their step, them and up, or raise CompleteSplatError."""
+    """Wait for a run's fixed scenes; return a note on their step, scenes and up; raise CompleteSplatError if none come."""
     from completesplat.viewer.sample import NEWEST_FILE, read_newest
 
     folder = run / NEWEST
@@ -150,7 +150,7 @@ def newest_scenes(run: Path) -> tuple[str, Sequence[Any], Sequence[float]]:
 
 
 def show_newest(page: Any, run: Path, shown: int | None) -> int | None:
-    """Show the scenes that the run has written since step `shown` (None: since the page was made); return their step."""
+    """Show what the run has written after step `shown` (None: after the page was made); return its newest step."""
     from completesplat.viewer.sample import read_newest
 
     try:

@@ -1,6 +1,7 @@
 """The paper's two controls of sampling, guidance and skip weight, and the values that they may have.
 
-Guidance has the paper's meaning: a weight w mixes in the unconditional prediction, for diversity; skips carry images.
+Guidance has the paper's meaning: a weight w mixes in the unconditional prediction, for diversity; skips carry
+visible content.
 """
 
 from collections.abc import Callable

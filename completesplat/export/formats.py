@@ -177,7 +177,7 @@ def _linear(colors: Float[Tensor, "n 3"], opacities: Float[Tensor, "n 1"]) -> np
 
 
 def _write_gltf(path: str | Path, arrays: dict[str, np.ndarray], primitive: Any, others: Any, comments: Any) -> None:
-    """Write arrays [item, component] by name: triangles as `indices`, attributes of the primitive as all others."""
+    """Write arrays [item, component] by name: `indices` are triangles, all others attributes of the primitive."""
     accessors: list[dict[str, Any]] = []
     views: list[dict[str, int]] = []
     offset = 0

@@ -38,7 +38,7 @@ from completesplat.rasterizers import Rasterizer
 
 DIRECTIONS = 8
 CONVENTIONS = {
-    "axes": "cameras have OpenCV's: +x right, +y down, +z forward; world_to_camera says where the world's are",
+    "axes": "OpenCV's for cameras: +x right, +y down, +z forward; world_to_camera gives the world's",
     "world_to_camera": "4 x 4, rows first; maps homogeneous world points (as columns) to camera points",
     "intrinsics": "3 x 3, rows first, in pixels; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)",
     "image_size": "(height, width) in pixels",

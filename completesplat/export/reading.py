@@ -26,10 +26,10 @@ LARGEST_RATIO = 40  # of what a file unpacks to; splat-transform's have 2
 
 
 def read_gaussians(path: str | Path) -> Gaussians:
-    """Read a file of the format that its suffix names, in our axes; colours are those of all directions.
+    """Read a file of the format that its suffix names, in our axes; colours are the zeroth harmonics.
 
     Raises:
-        PlyError: the file is missing, damaged, or not finite.
+        PlyError: the file is missing or damaged, or has values that are not finite.
     """
     read = {".splat": _read_splat, ".spz": _read_spz}.get(Path(path).suffix.lower())
     if read is None:
@@ -37,7 +37,7 @@ def read_gaussians(path: str | Path) -> Gaussians:
     try:
         values = read(Path(path).read_bytes())
     except (OSError, EOFError, ValueError, struct.error, zlib.error) as error:
-        raise PlyError(f"{path}: damaged, or of another version ({error})") from error
+        raise PlyError(f"{path}: cannot be read: missing, damaged, or of another version ({error})") from error
     gaussians = Gaussians(*(torch.from_numpy(value.astype(np.float32)) for value in values))
     if not gaussians.finite().all():
         raise PlyError(f"{path}: some Gaussians are not finite")
@@ -81,7 +81,7 @@ def _unpacked(data: bytes, table: int, streams: int, sizes: np.ndarray) -> bytes
 
 
 def _quaternions(packed: UInt8[np.ndarray, "gaussian bytes"]) -> Float[np.ndarray, "gaussian 4"]:
-    """Unpack three of x, y, z, w: a byte each, without w, or ten bits each, behind two with the index of the fourth."""
+    """Unpack x, y, z of a byte each, or two bits that name the largest of x, y, z, w and ten for each other."""
     if packed.shape[1] == 3:
         fourth, three = np.full((len(packed), 1), 3), packed / 127.5 - 1
     else:

@@ -34,7 +34,7 @@ class KullbackLeibler:
 
     Stable Diffusion adds 1e-6 times the KL of a latent to the *sum* of the errors over the 3 * H * W values of its
     image (CompVis `ldm/modules/losses/contperceptual.py`). The other terms here are means over values, so the KL is
-    divided by 3 * H * W too: its weight means the same as Stable Diffusion's at every size. It is 0 without posterior.
+    divided by 3 * H * W too: its weight means the same as Stable Diffusion's at every size. Without posterior it is 0.
     """
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:

@@ -44,7 +44,8 @@ def rows(model: CompleteSplat, scenes: Sequence[SceneBatch], draws: int, seed: i
     modes: with four modes, 0.25 in pure noise and 1 without noise. The denoiser's clean estimate is projected onto
     combinations of the modes' latents with weights of sum 1; `denoiser_share` is the true mode's weight. Where it is
     lower than `best_share`, the denoiser blends the modes.
-    `training_share` is the share of training's timesteps from the last level to this one, `steps` the sampler's there.
+    `training_share` is the share of training's timesteps from the previous level to this one, `steps` the sampler's
+    there.
     """
     total = model.sampler.training_timesteps
     timesteps = [round(level * total) for level in LEVELS]

@@ -117,7 +117,7 @@ def start_server(port: int, background: float = 0.5) -> GuardedServer:
 
 
 def say(server: viser.ViserServer, text: str) -> None:
-    """Show what the page does or has done as the title of its panel, of which narrow windows first show only that."""
+    """Show what the page does or did as its panel's title, all that narrow windows first show."""
     server.gui.set_panel_label(f"{TITLE}: {text}" if text else TITLE)
 
 

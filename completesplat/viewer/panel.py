@@ -22,7 +22,9 @@ from completesplat.scene_model import SceneModel
 MOST_SAMPLES, MOST_STEPS, MOST_SEED, MOST_LAYERS = 8, 100, 99, 16
 SLIDERS = ("samples", "skip_weight", "guidance_weight", "color_fits", "steps", "seed")  # settings of `CompleteSplat`
 SIDE_BY_SIDE = "all, side by side"
-CUT_OUT = "of the next images: only the object, before what the weights know (needs completesplat[background])"
+CUT_OUT = (
+    "of the next images: only the object, on the weights' background (needs completesplat[background] or [grabcut])"
+)
 FILES = f"an image to complete, or a scene ({', '.join(SPLATS)}); or drop the file anywhere on the page"
 KEYS = 9  # keys 1 to 9 choose a sample; 0 shows all
 ONE_ANSWER = "One answer for each image: these weights draw no samples."
@@ -98,7 +100,7 @@ def add_looking(gui: viser.GuiApi) -> SimpleNamespace:
 def add_saving(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
     """Add the folder `Save`; return handles of the file's `kind` (a format or a video) and of the button `save`."""
     with gui.add_folder("Save", order=4):
-        kind = gui.add_dropdown("Format", (*formats, VIDEO), hint="spz and sog need Node.js")
+        kind = gui.add_dropdown("Format", (*formats, VIDEO), hint="spz and sog need Node.js, mesh completesplat[mesh]")
         return SimpleNamespace(kind=kind, save=gui.add_button("Save what is shown"))
 
 

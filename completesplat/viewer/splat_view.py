@@ -159,7 +159,7 @@ class SplatView:
                     camera.fov = view.fov_in(camera.image_width / camera.image_height)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """Fit the view to a new browser's window, as narrow as a phone's, and say there until it has drawn an image."""
+        """Fit the view to a new browser's window, even a phone's; show a notice until it has drawn an image."""
         last_aspect: float | None = None
 
         def fit(camera: viser.CameraHandle) -> None:

@@ -126,7 +126,7 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     with pytest.raises(CompleteSplatError, match="max_epochs=3 may end before the run in"):
         jobs.is_finished(tmp_path, config(max_steps=40, max_epochs=3))
     again = f"completesplat fit optimizer.lr=2 ckpt_path={tmp_path}/checkpoints/last.ckpt out=MORE"
-    with pytest.raises(CompleteSplatError, match=f"another optimizer.lr: train on in another folder: {again}$"):
+    with pytest.raises(CompleteSplatError, match=f"another optimizer.lr: continue in another folder: {again}$"):
         jobs.is_finished(tmp_path, config(rate=2, max_steps=40), ["out=R", "optimizer.lr=2", "ckpt_path=last"])
     jobs._record(tmp_path, ["second"], [], config(max_steps=40))
     record = strict_json(tmp_path / "run.json")

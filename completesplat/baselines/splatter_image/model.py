@@ -1,7 +1,7 @@
 """Splatter Image with its authors' published weights (Szymanowicz et al., CVPR 2024): one pass, one answer.
 
 It sees an object on a plain background and predicts one Gaussian per pixel. It draws no samples, so hidden parts are
-reconstructed as an average. New, after `scene/gaussian_predictor.py` of szymanowiczs/splatter-image at 78a6ad0.
+reconstructed as an average. Written after `scene/gaussian_predictor.py` of szymanowiczs/splatter-image at 78a6ad0.
 """
 
 from collections import OrderedDict

@@ -1,4 +1,4 @@
-"""Import of captures: a look at their cameras, or cameras by COLMAP for photos or a video."""
+"""Import of captures: a check of their cameras, or cameras by COLMAP for photos or a video."""
 
 import logging
 import os
@@ -103,7 +103,7 @@ def _split_video(video: Path, images: Path, frames: int) -> None:
 
 
 def image_pairs(images: int, sequential: bool) -> list[tuple[int, int]]:
-    """Return the pairs to match: all, or those of neighbours in a ring of images and of a power of two apart."""
+    """Return the pairs to match: all, or, in a ring of images, those at most `NEAR` or a power of two apart."""
     pairs = ((a, b, min(b - a, images - b + a)) for a, b in combinations(range(images), 2))
     return [(a, b) for a, b, apart in pairs if not sequential or apart <= NEAR or apart.bit_count() == 1]
 

@@ -30,7 +30,8 @@ logger = logging.getLogger(__name__)
 class SeededSplit(NamedTuple):
     """Shares of the sequences that are held out by seed, at least one sequence for each share.
 
-    Without a set list, they are shares of all sequences; without validation in a list, `val_fraction` is of training.
+    Without a set list, they are shares of all sequences; without validation in a list, `val_fraction` is taken from
+    training.
     """
 
     val_fraction: float
