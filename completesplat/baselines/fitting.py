@@ -201,7 +201,7 @@ def relocate(raw: Mapping[str, Tensor], count: int, new_count: int) -> Int64[Ten
 
 
 def position_noise(gaussians: Gaussians, rate: float) -> Float[Tensor, "gaussian 3"]:
-    """Draw noise for the positions' rate, by which transparent Gaussians move along their covariance (3DGS-MCMC, Eq. 8)."""
+    """Draw noise that moves transparent Gaussians along their covariance (3DGS-MCMC, Eq. 8), for a positions' rate."""
     weights = torch.sigmoid(NOISE_STEEPNESS * (DEAD_OPACITY - gaussians.opacities)) * (NOISE * rate)
     noise = torch.randn_like(gaussians.means) * weights[:, None]
     return (gaussians.covariances() @ noise[..., None])[..., 0]

@@ -269,7 +269,7 @@ def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str
 
 
 def visible_part(config: DictConfig, image: Path, size: int) -> Float[Tensor, "1 size size"] | None:
-    """Return 0 where `mask` or `box` hides the photo, else 1 (None: neither is given); raise CompleteSplatError if unfit."""
+    """Return 0 where `mask` or `box` hides the photo, else 1; None without both. Raise CompleteSplatError if unfit."""
     if config.mask is not None and config.box is not None:
         raise CompleteSplatError("give mask=FILE or box=[x0,y0,x1,y1], not both")
     if config.mask is not None:

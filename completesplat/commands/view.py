@@ -135,7 +135,7 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
 
 
 def newest_scenes(run: Path) -> tuple[str, Sequence[Any], Sequence[float]]:
-    """Wait for a run's fixed scenes; return a note on their step, scenes and up; raise CompleteSplatError if none come."""
+    """Wait for a run's fixed scenes; return a note on their step, scenes and up, or raise CompleteSplatError."""
     from completesplat.viewer.sample import NEWEST_FILE, read_newest
 
     folder = run / NEWEST

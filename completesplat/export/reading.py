@@ -37,7 +37,7 @@ def read_gaussians(path: str | Path) -> Gaussians:
     try:
         values = read(Path(path).read_bytes())
     except (OSError, EOFError, ValueError, struct.error, zlib.error) as error:
-        raise PlyError(f"{path}: cannot be read: missing, damaged, or of another version ({error})") from error
+        raise PlyError(f"{path}: damaged, missing, or of another version ({error})") from error
     gaussians = Gaussians(*(torch.from_numpy(value.astype(np.float32)) for value in values))
     if not gaussians.finite().all():
         raise PlyError(f"{path}: some Gaussians are not finite")

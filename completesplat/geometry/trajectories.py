@@ -48,7 +48,7 @@ def swipe(reference: Cameras, pivot: Vector, up: Vector, frames: int, reach: flo
 def wobble(reference: Cameras, pivot: Vector, up: Vector, frames: int, radius: float = 0.1) -> Cameras:
     """Return cameras on a small circle around the reference camera (unbatched), looking at `pivot`.
 
-    The circle is orthogonal to the direction of `pivot`, begins on the right and goes up; its end is one step before its start.
+    The circle is orthogonal to the direction of `pivot`, begins right, goes up and ends one step before its start.
 
     Args:
         radius: radius of the circle, as a share of the distance of `pivot`.

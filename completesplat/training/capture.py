@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -205,12 +206,13 @@ class CaptureFit(Stage):
         poses = cameras.world_to_camera @ sequence.cameras.world_to_camera[0].to(cameras.world_to_camera)
         placed, up = replace(cameras, world_to_camera=poses), normalize(-poses[:, 1, :3].mean(0), dim=-1)
         self.scene_folder.mkdir(parents=True, exist_ok=True)
-        target, seen, files = (self.scene_folder, "scene", ""), (scene, placed[0], self.rasterizer, up), {}
-        for formats, videos in [((), wanted.videos), *(((kind,), ()) for kind in wanted.formats)]:
+        write = partial(write_scene, self.scene_folder, "scene", "", scene, placed[0], self.rasterizer, up)
+        parts = [replace(wanted, formats=()), *(replace(wanted, formats=[kind], videos=()) for kind in wanted.formats)]
+        files: dict[str, str] = {}
+        for part in parts:
             try:
-                converter = find_splat_transform() if set(formats) & set(CONVERTED) else None
-                part = replace(wanted, formats=formats, videos=videos, converter=converter)
-                files |= write_scene(*target, *seen, part, [f"scene {name}"], sequence.scale)[-1]
+                converter = find_splat_transform() if set(part.formats) & set(CONVERTED) else None
+                files |= write(replace(part, converter=converter), [f"scene {name}"], sequence.scale)[-1]
             except CompleteSplatError as error:
                 logger.warning("left out: %s", error)
         title = f"{name}: held-out photos, Gaussians fitted to the {len(self.sequence('train').frames)} others"

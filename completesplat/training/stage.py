@@ -141,7 +141,7 @@ class Stage(LightningModule):
             trust: the checkpoint names your own modules, and you trust its author; not needed below the working folder.
 
         Raises:
-            WeightsError: the checkpoint is damaged, missing, of another class or without a config, or `check_names` fails.
+            WeightsError: the checkpoint is damaged, missing, of another class, has no config, or `check_names` fails.
         """
         path = Path(checkpoint_path)
         config = read_checkpoint(path).get("hyper_parameters")

@@ -85,7 +85,7 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
 
 
 def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
-    """Return step, scenes and direction up of a run (`write_newest`); raise CompleteSplatError if they are unreadable."""
+    """Return a run's newest step, scenes and direction up (`write_newest`); raise CompleteSplatError if unreadable."""
     path = folder / NEWEST_FILE
     try:
         data = json.loads(path.read_text(encoding="utf-8"))

@@ -214,7 +214,7 @@ def without_background(image: Image.Image) -> Image.Image:
     try:
         import rembg
 
-        cut = rembg.remove(pixels, session=_session())
+        cut: Image.Image = rembg.remove(pixels, session=_session())
         log.info("background: removed by rembg (%s)", CUTTER)
     except (ImportError, SystemExit):  # rembg exits if onnxruntime is missing
         cut = by_grabcut(pixels)
