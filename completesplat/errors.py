@@ -37,7 +37,7 @@ class ImageError(CompleteSplatError):
 
 
 class PlyError(CompleteSplatError):
-    """A `.ply` file that is damaged, or not a finite set of Gaussians."""
+    """A file of Gaussians (`.ply`, `.splat`, `.spz`) that is damaged or not finite."""
 
 
 class TensorFileError(CompleteSplatError):

@@ -20,6 +20,7 @@ BLOCK_BYTES = 512  # unit of `st_blocks`
 LONGEST = 100  # bytes of UTF-8
 MOST_SHOWN = 500  # characters
 UNNAMED = "unnamed"
+SPLATS = (".ply", ".splat", ".spz")  # files of Gaussians that are read
 # Control characters, line breaks, and the surrogates that stand for bytes that are not UTF-8.
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 SEPARATORS = re.compile(r"[/\\]")
@@ -103,12 +104,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, if it is missing, in an existing one.
-
-    Raises:
-        CompleteSplatError: the folder is a link, through which results would be written elsewhere.
-        DiskError: the folder above is gone, or the disk is full.
-    """
+    """Make a missing folder in an existing one; raise CompleteSplatError for a link, DiskError if it cannot be made."""
     if folder.is_symlink():
         raise CompleteSplatError(f"{folder}: is a link, and results are not written through links; remove it")
     with writing(folder):

@@ -49,10 +49,6 @@ class Gaussians(TensorDataclass):
         quaternions = quaternion_multiply(rotation, normalize_quaternion(self.quaternions))
         return replace(self, means=transform_points(matrix, self.means), quaternions=quaternions)
 
-    def keep(self, mask: Bool[Tensor, " gaussian"]) -> "Gaussians":
-        """Return the Gaussians of one unbatched set that the mask marks."""
-        return self[mask]
-
     def finite(self) -> Bool[Tensor, "*batch gaussian"]:
         """Return a mask of the Gaussians whose values are all finite."""
         marks = [self.opacities.isfinite()]

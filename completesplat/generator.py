@@ -226,11 +226,7 @@ class OneAnswer(SceneModel):
     def with_trained(
         architecture: Mapping[str, Any], network: Mapping[str, Tensor], camera: Mapping[str, Any]
     ) -> "OneAnswer":
-        """Return a model with a trained network's weights, and with its training set's typical camera.
-
-        Raises:
-            WeightsError: as the constructor and `camera_tensors`.
-        """
+        """Return a trained network's model, with its data's typical camera; raise WeightsError if they do not fit."""
         model = OneAnswer(**architecture)
         model.load_state_dict({f"network.{name}": x for name, x in network.items()} | camera_tensors(camera))
         return model.eval()

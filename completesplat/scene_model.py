@@ -26,8 +26,7 @@ from completesplat.splatter_image import Parameterization
 from completesplat.tensors import concatenate
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
 
-Visible = Float[Tensor, "batch 1 height width"]
-"""Masks that are 0 where an image is hidden, and 1 elsewhere."""
+Visible = Float[Tensor, "batch 1 height width"]  # masks that are 0 where an image is hidden, and 1 elsewhere
 _rasterizer = cache(auto)
 
 
@@ -196,11 +195,6 @@ class SceneModel(nn.Module):
         """Read an image at the model's size (`read_photograph`); an unknown field of view is the training set's."""
         return read_photograph(image, self.image_size, fov_degrees, self.fov_degrees.item(), remove_background)
 
-    @property
-    def knows_hidden(self) -> bool:
-        """Whether parts of the images were hidden in training; False if the weights do not record it."""
-        return bool(self.architecture.get("training", {}).get("box_masks", 0) > 0)
-
     def camera(self, photograph: Photograph) -> Cameras:
         """Return the camera that took a photo, at the origin of the world."""
         device = self.up.device
@@ -235,11 +229,7 @@ def distance_to_training(photograph: Photograph, architecture: Mapping[str, Any]
 
 
 def camera_tensors(camera: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return a training set's typical camera as tensors of a `SceneModel`.
-
-    Raises:
-        WeightsError: the camera lacks `fov_degrees`, `depth_range` or `up`, or they are no numbers.
-    """
+    """Return a training set's typical camera as tensors of a `SceneModel`; raise WeightsError if one is not known."""
     try:
         return {name: torch.tensor(camera[name], dtype=torch.float32) for name in ("fov_degrees", "depth_range", "up")}
     except (KeyError, TypeError, ValueError) as error:

@@ -30,16 +30,9 @@ class TensorDataclass:
         return replace(self, **{field.name: apply(getattr(self, field.name)) for field in fields(self)})
 
     def to(self: T, *args: Any, **kwargs: Any) -> T:
-        """Apply `torch.Tensor.to` to every tensor; integer and boolean tensors keep their dtype."""
-        dtype_only_for_floats = {k: v for k, v in kwargs.items() if k != "dtype"}
-        places: list[Any] = [a.device if isinstance(a, Tensor) else a for a in args if not isinstance(a, torch.dtype)]
-
-        def move(tensor: Tensor) -> Tensor:
-            if tensor.is_floating_point():
-                return tensor.to(*args, **kwargs)
-            return tensor.to(*places, **dtype_only_for_floats) if places or dtype_only_for_floats else tensor
-
-        return self.map(move)
+        """Move every tensor as `torch.nn.Module.to` does; integer and boolean tensors keep their dtype."""
+        device, dtype, non_blocking, _ = torch._C._nn._parse_to(*args, **kwargs)
+        return self.map(lambda x: x.to(device, dtype if x.is_floating_point() else x.dtype, non_blocking))
 
     def pin_memory(self: T) -> T:
         """Copy every tensor into page-locked memory (called by `torch.utils.data.DataLoader`)."""

@@ -6,7 +6,7 @@ from torch import Tensor
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at
 from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants
-from completesplat.rasterizers.reference import ReferenceRasterizer, project_gaussians, visible_in_depth_order
+from completesplat.rasterizers.reference import ReferenceRasterizer, project_gaussians, visible_by_depth
 
 # A scene keeps this far from the steps of the function, relative to where they are: alpha from its threshold and its
 # clamp; the transmittance from the stop (it is a product of many factors); depths from each other and the near plane.
@@ -55,7 +55,7 @@ def keeps_clear_of_the_steps(gaussians: Gaussians, cameras: Cameras, constants: 
     for b in range(gaussians.means.shape[0]):
         for v in range(cameras.intrinsics.shape[1]):
             scene, camera = gaussians[b].to(torch.float64), cameras[b, v].to(torch.float64)
-            visible, order = visible_in_depth_order(scene, camera, constants)
+            visible, order = visible_by_depth(scene, camera, constants)
             scene = scene[visible][order]
             centers, depths, covariances = project_gaussians(scene, camera, constants)
             height, width = camera.image_size

@@ -1,5 +1,6 @@
 """What the documents say of the repository is so: links, paths, targets of make, groups, versions, authors."""
 
+import json
 import re
 import subprocess
 import tomllib
@@ -57,7 +58,7 @@ def test_the_readme_is_a_page_and_leads_to_every_document():
 
 def test_documents_are_short_and_a_change_is_one_line():
     words = {path: len(path.read_text().split()) for path in DOCUMENTS if path != STUDIES}
-    assert sum(words.values()) <= 10_400
+    assert sum(words.values()) <= 10_500
     assert words[ROOT / "completesplat/training/README.md"] <= 1_400
     entries = [line for line in CHANGELOG.read_text().partition("## [")[2].splitlines()[1:] if line]
     assert [line for line in entries if not line.startswith(("- ", "## ", "### ")) or len(line) > 160] == []
@@ -89,7 +90,22 @@ def test_the_citation_is_the_readmes_and_the_changelog_knows_this_version():
         assert re.search(rf"{field} += {re.escape(f'{{{value}}}')}", text)
     assert citation.version == PROJECT["version"]
     assert citation.license == PROJECT["license"]
-    assert f"## [{PROJECT['version']}]" in CHANGELOG.read_text()
+    assert f"## [{PROJECT['version']}] - {citation['date-released']}" in CHANGELOG.read_text()
+    zenodo = json.loads((ROOT / ".zenodo.json").read_text())
+    same = {"title": "title", "description": "abstract", "version": "version", "license": "license"}
+    same |= {"keywords": "keywords", "creators": "authors"}
+    assert {key: zenodo[key] for key in same} == {key: citation[name] for key, name in same.items()}
+    assert zenodo["publication_date"] == str(citation["date-released"])
+
+
+def test_colab_opens_the_first_notebook_of_the_repository_and_installs_it():
+    """The address is a setting; a test of the wheel sees that the badge is not in it."""
+    repository = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["completesplat"]["repository"]
+    notebook = ROOT / "notebooks/0_quickstart.ipynb"
+    for path in (README, notebook):
+        (opened,) = re.findall(r"\]\(https://colab\.research\.google\.com/github/([^)]*)\)", path.read_text())
+        assert opened == f"{repository}/blob/main/{notebook.relative_to(ROOT).as_posix()}"
+    assert re.findall(r"git\+https://github\.com/([\w./-]+)", notebook.read_text()) == [repository]
 
 
 def test_the_hooks_are_the_checks_of_make_and_the_workflow_runs_what_must_hold():

@@ -33,6 +33,7 @@ from fuzzing import (
 from hypothesis import strategies as st
 from PIL import Image, ImageCms
 from realestate10k_trees import make_clip, write_chunk_form
+from splats_of_others import FILES
 from support import some_gaussians, write_capture
 
 from completesplat.data.captures.capture import CapturedFrame, Lens
@@ -45,7 +46,9 @@ from completesplat.data.images.photograph import read_photograph
 from completesplat.data.realestate10k.clips import ChunkedClips
 from completesplat.data.validation import read_points
 from completesplat.errors import CompleteSplatError
+from completesplat.export.formats import write_splat
 from completesplat.export.ply import read_ply, write_ply
+from completesplat.export.reading import read_gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.weights import CONFIG_FILE, SUMS_FILE
 
@@ -152,6 +155,23 @@ def test_ply(tmp_path):
         max_size=30,
     )
     fuzz(damaged(seeds) | words.map(lambda result: b"ply\n" + b"\n".join(result)), read_plys, examples=60)
+
+
+def test_splats_of_others(tmp_path):
+    path = {suffix: tmp_path / f"a{suffix}" for suffix in (".splat", ".spz")}
+    write_splat(path[".splat"], some_gaussians(1)[0])
+    seeds = {".splat": [path[".splat"].read_bytes()], ".spz": [*FILES.values()]}
+
+    def read_splats(changed: tuple[str, bytes]) -> None:
+        path[changed[0]].write_bytes(changed[1])
+        read_gaussians(path[changed[0]])
+
+    def of(suffix: str) -> st.SearchStrategy[tuple[str, bytes]]:
+        unpacked = [gzip.decompress(content) for content in seeds[suffix] if content.startswith(b"\x1f\x8b")]
+        changed = damaged(seeds[suffix]) | damaged(unpacked).map(gzipped) if unpacked else damaged(seeds[suffix])
+        return st.tuples(st.just(suffix), changed)
+
+    fuzz(of(".splat") | of(".spz"), read_splats, examples=60)
 
 
 def test_annotations(tmp_path):

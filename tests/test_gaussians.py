@@ -78,7 +78,7 @@ def test_finite_marks_a_bad_value_in_any_field_and_keep_selects_the_marked_ones(
         assert marks.shape == (2, 12)
         assert (~marks).nonzero().tolist() == [[1, 5]]
     gaussians = make()
-    selected = gaussians.keep(gaussians.opacities > 0.5)
+    selected = gaussians[gaussians.opacities > 0.5]
     marked = [i for i in range(12) if gaussians.opacities[i] > 0.5]
     assert 0 < selected.count == len(marked) < 12
     assert all(torch.equal(getattr(selected, f), getattr(gaussians, f)[marked]) for f in FIELDS)

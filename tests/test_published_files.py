@@ -49,7 +49,7 @@ def test_the_hub_is_asked_once_and_without_it_a_line_says_what_to_fetch(tmp_path
     ) as caught:
         find("splatter_image:cars")
     assert "\n" not in str(caught.value)
-    with pytest.raises(WeightsError, match=r"give the NAME of a config_NAME.yaml"):
+    with pytest.raises(WeightsError, match=r"give NAME of a config_NAME.yaml"):
         find("splatter_image:../cars")
 
 

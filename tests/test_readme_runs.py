@@ -25,9 +25,7 @@ BRIEF = {
     "fit": [*SMALL, "test=false", "data.scenes=20", "callbacks.images=null"],
     "predict": ["frames=2", "steps=2"],
     "test": ["trainer.accelerator=cpu"],
-    **{
-        f"report {study}": ["scenes=1", "samples=2"] for study in ("calibration", "controls", "depth", "front", "modes")
-    },
+    **{f"report {study}": ["scenes=1", "samples=2"] for study in ("calibration", "controls", "depth", "modes")},
 }
 # Stage 2 has as many levels as the small stage 1.
 BRIEF |= {

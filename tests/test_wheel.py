@@ -1,8 +1,10 @@
 """The wheel: what is in it, and that it works from an empty folder, as somebody has it who has nothing else."""
 
 import re
+import subprocess
 from email import message_from_bytes
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -35,7 +37,8 @@ def test_the_wheel_has_the_package_its_settings_and_weights_and_no_link_that_lea
     assert "Typing :: Typed" in metadata.get_all("Classifier")
     description, readme = metadata.get_payload(), (ROOT / "README.md").read_text()
     assert [link for link in LINK.findall(description) if "://" not in link] == []
-    assert {link for link in LINK.findall(readme) if "://" in link} <= set(LINK.findall(description))
+    badge = {link for link in LINK.findall(readme) if link.startswith("https://colab.")}
+    assert {link for link in LINK.findall(readme) if "://" in link} - badge <= set(LINK.findall(description))
     commands = [line for line in readme.splitlines() if line.startswith(("completesplat", "##"))]
     assert [line for line in description.splitlines() if line.startswith(("completesplat", "##"))] == commands
     assert "![" not in description
@@ -62,3 +65,23 @@ def test_the_installed_wheel_predicts_sweeps_and_writes_tables_from_an_empty_fol
         assert "Table 2" in text
         assert "images, 32 pixels" in text
     assert "SWEEP/seed-1" in tables["md"]
+
+
+def test_a_commit_gives_the_same_release_in_another_folder_with_other_permissions(tmp_path):
+    """The release is of the last commit: what is not committed is in neither."""
+    releases = []
+    for name, mask in (("a", 0o022), ("b", 0o077)):
+        folder = tmp_path / name
+        for command in (["git", "clone", "--quiet", ROOT, folder], ["make", "--silent", "-C", folder, "release"]):
+            subprocess.run(command, check=True, umask=mask, stdout=subprocess.DEVNULL)
+        files = {path.name: sha256(path.read_bytes()).hexdigest() for path in (folder / "dist").iterdir()}
+        sums = files.pop("SHA256SUMS")
+        listed = [line.split() for line in (folder / "dist/SHA256SUMS").read_text().splitlines()]
+        assert files == {name: value for value, name in listed}
+        releases.append((files, sums))
+    assert releases[0] == releases[1]
+    assert sorted(name.rpartition("0.1.0")[2] for name in files) == ["-py3-none-any.whl", ".cdx.json", ".tar.gz"]
+    bill = strict_json(folder / f"dist/{next(name for name in files if name.endswith('.json'))}")
+    assert bill["bomFormat"] == "CycloneDX"
+    assert bill["metadata"]["component"]["version"] == "0.1.0"
+    assert {"lightning", "hydra-core", "numpy"} <= {component["name"] for component in bill["components"]}

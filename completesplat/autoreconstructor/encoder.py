@@ -31,9 +31,7 @@ def zeroed(layer: nn.Module) -> nn.Module:
     return layer
 
 
-def vae_encoder(
-    inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, norm_groups: int
-) -> vae.Encoder:
+def vae_encoder(inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, groups: int) -> vae.Encoder:
     """Build the network of Stable Diffusion's VAE encoder; the resolution halves between levels."""
     return vae.Encoder(
         in_channels=inputs,
@@ -41,7 +39,7 @@ def vae_encoder(
         down_block_types=("DownEncoderBlock2D",) * len(channels),
         block_out_channels=tuple(channels),
         layers_per_block=layers_per_block,
-        norm_num_groups=norm_groups,
+        norm_num_groups=groups,
         double_z=False,
     )
 
@@ -88,24 +86,21 @@ class Encoder(nn.Module):
 
     def encode(self, values: Float[Tensor, "batch channel height width"]) -> tuple[Posterior, Features]:
         """Encode values around zero without rescaling them; `forward` describes the result."""
-        network: Any = self.network
+        network, run = self.network, recompute if self.gradient_checkpointing else nn.Module.__call__
         features = self.features(values, len(network.down_blocks))
-        hidden = self._run(network.mid_block, features[-1])
+        hidden = run(network.mid_block, features[-1])
         hidden = network.conv_act(network.conv_norm_out(hidden))
         return from_moments(self.quant_conv(network.conv_out(hidden))), features
 
     def features(self, values: Float[Tensor, "batch channel height width"], levels: int) -> Features:
         """Return the features of the first levels as `encode` does, without computing anything after them."""
         network: Any = self.network
+        run = recompute if self.gradient_checkpointing else nn.Module.__call__
         hidden, features = network.conv_in(values), list[Tensor]()
         for level, block in enumerate(network.down_blocks[:levels]):
             for downsampler in network.down_blocks[level - 1].downsamplers if level else ():
-                hidden = self._run(downsampler, hidden)
+                hidden = run(downsampler, hidden)
             for resnet in block.resnets:
-                hidden = self._run(resnet, hidden, None)
+                hidden = run(resnet, hidden, None)
             features.append(hidden)
         return features
-
-    def _run(self, block: nn.Module, *inputs: Tensor | None) -> Tensor:
-        output: Tensor = recompute(block, *inputs) if self.gradient_checkpointing else block(*inputs)
-        return output

@@ -46,9 +46,7 @@ class PlaneSweep(nn.Module):
         self.network = vae_encoder(inputs, 2 * latent_channels, channels[1:], layers_per_block, norm_groups)
         zeroed(self.network.conv_out)
 
-    def forward(
-        self, views: Views, depth_range: DepthRange
-    ) -> Float[Tensor, "batch moment latent_height latent_width"]:
+    def forward(self, views: Views, depth_range: DepthRange) -> Float[Tensor, "batch moment _ _"]:
         """Return what to add to the moments; the reference is the first view, and its frame is the world."""
         with torch.autocast(views.images.device.type, enabled=False):
             swept = sweep(views, depth_range, self.planes)

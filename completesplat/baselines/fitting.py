@@ -1,17 +1,19 @@
 """Optimisation of 3D Gaussians for single scenes from posed views (Kerbl et al. 2023, "3D Gaussian Splatting").
 
-There is no densification and no pruning, so the number of Gaussians stays constant. They start from random pixels at
-random depths instead of a structure-from-motion cloud, because a data set may lack one.
+`fit_gaussians` keeps the number of Gaussians. `relocate` adds and moves them, as 3DGS-MCMC does (Kheradmand et al.
+2024), without gradients of image positions, so any rasterizer serves. Gaussians start from random pixels at random
+depths, or from points, where a data set has them.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import pixel_centers, unproject
+from completesplat.geometry.cameras import pixel_centers, project, unproject
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
@@ -22,6 +24,10 @@ POSITION_RATE, POSITION_DECAY = 1.6e-4, 0.01
 RATES = {"log_scales": 5e-3, "quaternions": 1e-3, "logits": 5e-2, "harmonics": 2.5e-3}
 """3DGS's rates for 30,000 steps (graphdeco-inria/gaussian-splatting, `arguments/__init__.py`): the rate of the
 positions is relative to the scene's extent and decays exponentially to a hundredth."""
+
+DEAD_OPACITY, MOST_COPIES = 0.005, 51  # as in the authors' code and gsplat
+NOISE, NOISE_STEEPNESS = 5e5, 100.0
+NEIGHBOURS = 3
 
 
 @dataclass(frozen=True)
@@ -87,6 +93,27 @@ def initial_gaussians(
     )
 
 
+def gaussians_at_points(points: Float[Tensor, "gaussian 3"], views: Views, opacity: float) -> RawGaussians:
+    """Return Gaussians [1 gaussian] as large as the mean distance to the `NEIGHBOURS` nearest points (3DGS).
+
+    Colours are means over the views [view] that contain the point, whether it is seen or hidden there.
+    """
+    parts = torch.split(points, 500)
+    nearest = [torch.cdist(part, points).topk(NEIGHBOURS + 1, largest=False).values[:, 1:] for part in parts]
+    pixels, depth = project(views.cameras, points.expand(len(views.images), -1, -1))
+    grid = 2 * pixels / pixels.new_tensor(views.cameras.image_size[::-1]) - 1
+    inside = ((depth > 0) & (grid.abs() < 1).all(-1))[..., None]
+    sampled = torch.nn.functional.grid_sample(views.images, grid[:, None], align_corners=False)[:, :, 0].mT
+    colors = (sampled.where(inside, 0).sum(0) + 1e-3 * 0.5) / (inside.sum(0) + 1e-3)
+    return RawGaussians(
+        means=points[None],
+        log_scales=torch.cat(nearest).mean(-1).clamp(min=1e-6).log()[None, :, None].repeat(1, 1, 3),
+        quaternions=torch.tensor([1.0, 0, 0, 0], device=points.device).repeat(1, len(points), 1),
+        logits=torch.full_like(points[None, :, 0], opacity).logit(),
+        harmonics=(colors[None] - 0.5) / SH_C0,
+    )
+
+
 def fit_gaussians(
     views: Views,
     depth_range: Float[Tensor, "batch 2"],
@@ -127,3 +154,54 @@ def _optimizer(raw: RawGaussians, settings: FittingSettings, depth_range: Tensor
     rates = {"means": settings.position_rate * POSITION_RATE * extent, **rates}
     groups = [{"params": [getattr(raw, name).requires_grad_()], "lr": rate} for name, rate in rates.items()]
     return torch.optim.Adam(groups, eps=1e-15)
+
+
+def opacity_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Return the opacity of each of several equal Gaussians that together are as opaque as one (3DGS-MCMC, Eq. 9)."""
+    return 1 - (1 - opacities) ** (1 / copies)
+
+
+def scale_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Return the factor on the scales of such copies, which preserves the integral of alpha along a line (Eq. 9).
+
+    Their double sum is written as one sum, by C(0, k) + ... + C(n - 1, k) = C(n, k + 1).
+    """
+    n, o = copies.double()[:, None], opacity_of_copies(opacities.double(), copies)[:, None]
+    j = torch.arange(1, int(copies.max()) + 1, dtype=torch.float64, device=o.device)
+    logarithm = torch.lgamma(n + 1) - torch.lgamma(j + 1) - torch.lgamma((n - j).clamp(min=0) + 1)
+    terms = torch.where(j <= n, logarithm.exp() * o**j / j.sqrt(), 0) * (1 - 2 * ((j + 1) % 2))
+    return (opacities / terms.sum(-1)).to(opacities.dtype)
+
+
+@torch.no_grad()
+def relocate(raw: Mapping[str, Tensor], count: int, new_count: int) -> Int64[Tensor, " changed"]:
+    """Replace dead Gaussians, and fill rows `count` to `new_count`, by copies of living ones, drawn by opacity.
+
+    Args:
+        raw: tensors [row ...] of `RawGaussians` by name, which are changed.
+
+    Returns:
+        The rows that were changed, whose state in an optimizer is no longer true.
+    """
+    logits = raw["logits"]
+    opacities = logits[:count].sigmoid()
+    dead = opacities <= DEAD_OPACITY
+    vacant = torch.cat([dead.nonzero()[:, 0], torch.arange(count, new_count, device=logits.device)])
+    if len(vacant) == 0 or bool(dead.all()):
+        return vacant[:0]
+    sources = torch.multinomial(opacities.where(~dead, 0), len(vacant), replacement=True)
+    copies = sources.bincount(minlength=count) + 1
+    parents = (copies > 1).nonzero()[:, 0]
+    number, opacity = copies[parents].clamp(max=MOST_COPIES), opacities[parents].clamp(max=1 - 1e-6)
+    raw["log_scales"][parents] += scale_of_copies(opacity, number).log()[:, None]
+    logits[parents] = opacity_of_copies(opacity, number).clamp(min=DEAD_OPACITY).logit()
+    for tensor in raw.values():
+        tensor[vacant] = tensor[sources]
+    return torch.cat([parents, vacant])
+
+
+def position_noise(gaussians: Gaussians, rate: float) -> Float[Tensor, "gaussian 3"]:
+    """Draw noise that moves transparent Gaussians along their covariance (3DGS-MCMC, Eq. 8), for a positions' rate."""
+    weights = torch.sigmoid(NOISE_STEEPNESS * (DEAD_OPACITY - gaussians.opacities)) * (NOISE * rate)
+    noise = torch.randn_like(gaussians.means) * weights[:, None]
+    return (gaussians.covariances() @ noise[..., None])[..., 0]

@@ -1,7 +1,6 @@
 """Projection of any 3D Gaussians into a Splatter Image: each goes to the pixel that its centre falls into.
 
-The supplement ("Pre-optimizing 3D Gaussian splats and projecting into Splatter Images") reports that this leaves 80 %
-of the pixels empty.
+It leaves 80 % of pixels empty (supplement, "Pre-optimizing 3D Gaussian splats and projecting into Splatter Images").
 """
 
 import math
@@ -69,9 +68,7 @@ def occupied(image: SplatterImage) -> Bool[Tensor, "batch layer height width"]:
     return image.split()["opacity"].squeeze(2) > EMPTY_LOGIT
 
 
-def _places(
-    gaussians: Gaussians, cameras: Cameras, layers: int
-) -> tuple[Int64[Tensor, " place"], Int64[Tensor, " place"]]:
+def _places(gaussians: Gaussians, cameras: Cameras, layers: int) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"]]:
     """Return the selected Gaussians and their places: indices into [batch gaussian] and [batch layer height width]."""
     height, width = cameras.image_size
     # The Gaussians are in the camera's frame, so its pose in the world does not matter.

@@ -4,7 +4,6 @@ import gc
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -53,8 +52,7 @@ PAPERS_WORK = {"image_size": 128, "batch": 32, "samples": 20, "steps": 50}
 PAPERS_CHANNELS = {"encoder": [128, 256, 512, 512], "denoiser": [320, 640, 1280, 1280]}
 
 
-@dataclass(frozen=True)
-class Way:
+class Way(NamedTuple):
     """Precision of the networks and mode of `torch.compile`; None does not compile them."""
 
     name: str
@@ -90,10 +88,7 @@ def run(
     ways = [way for way in WAYS if compile or way.compile is None]
     quieten()
     rows: list[Row] = []
-    with (
-        TemporaryDirectory(prefix="bench_paper_", dir=out) as folder,
-        Console(stderr=True).status("building") as status,
-    ):
+    with TemporaryDirectory(prefix="bench_", dir=out) as folder, Console(stderr=True).status("building") as status:
         loaded: SceneDataModule = instantiate(data, root=f"{folder}/scenes", _convert_="all")
         loaded.prepare_data()
         scenes: SceneBatch = next(iter(loaded.train_dataloader())).to(torch.device(device))

@@ -1,6 +1,6 @@
 """Workloads of the rasterizers: scenes like splatter images, and the time and memory of one rendering."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,8 +30,7 @@ REACHED_BYTES = 2 * 64 + 4 + 48  # its row of gradients written and read, its pl
 PEAK_SIDE, PEAK_COPY = 1536, 2**25  # of a matrix, and floats
 
 
-@dataclass(frozen=True)
-class Backend:
+class Backend(NamedTuple):
     """A rasterizer, its name in the tables, and the device of its tensors."""
 
     name: str

@@ -14,17 +14,16 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
-from completesplat.commands import jobs
+from completesplat.commands import jobs, new
 from completesplat.errors import CompleteSplatError
 from completesplat.files import file_refusal
 from completesplat.settings import help
 from completesplat.settings.arguments import SWEEP, behind_dashes, for_hydra
-from completesplat.settings.composition import nearest_names, sweep_arguments, use_working_folder
+from completesplat.settings.composition import compose, nearest_names, sweep_arguments, use_working_folder
 from completesplat.settings.options import conf_folder
 from completesplat.signals import end_with, ended_by_signals
 
 CALLED = re.compile(r"Error in call to target '(?:torch|lightning|diffusers|torchmetrics)\.")
-LIGHTNINGS = "MisconfigurationException"
 UNHELPFUL_WARNINGS = (
     ".*does not have many workers.*",
     ".*but have no `val_dataloader`.*",
@@ -44,8 +43,10 @@ def launch(verb: str, arguments: list[str]) -> None:
         return _join_job(verb, arguments[0])
     program, original = sys.argv[0], arguments
     arguments = behind_dashes(arguments)
-    if any(flag in arguments for flag in help.FLAGS):
+    if any(flag in arguments for flag in help.FLAGS) or (verb == "bench" and not arguments):
         return print(help.page(verb, arguments))
+    if verb == "new":  # its files are the user's, and it has no folder for a job
+        return new.run(compose(verb, *arguments))
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     # Logging stays silent on a full disk, because the next file that is written reports it in one line.
@@ -120,7 +121,7 @@ def _of_a_part(error: InstantiationException) -> str | None:
     cause = error.__cause__
     if cause is not None and isinstance(cause.__cause__, ModuleNotFoundError):
         return str(cause)
-    refused = isinstance(cause, ValueError | TypeError) or type(cause).__name__ == LIGHTNINGS
+    refused = isinstance(cause, ValueError | TypeError) or type(cause).__name__ == "MisconfigurationException"
     if CALLED.match(str(error)) is None or not refused:
         return None
     return f"{str(error).rpartition('full_key: ')[2].strip()}: {cause}"

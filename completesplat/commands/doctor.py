@@ -27,13 +27,14 @@ EXTRAS = {
     "cuda": "to draw on an NVIDIA GPU",
     "view": "to show scenes in a browser",
     "background": "to cut objects out of photos",
-    "colmap": "to read captures whose lens distorts",
+    "grabcut": "to cut them out by colour, without a download",
+    "mesh": "to write meshes",
+    "colmap": "to find cameras of photos, to read captures whose lens distorts",
     "slurm": "to spread sweeps over a cluster",
     "perceptual": "to train on perceptual features without a download",
 }
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
-LEAST_SPACE = 100_000_000
-"""Bytes that the files of a few predictions take."""
+LEAST_SPACE = 100_000_000  # bytes that the files of a few predictions take
 
 
 class Finding(NamedTuple):
@@ -78,15 +79,16 @@ def required_packages(requirements: Iterable[Requirement]) -> Iterator[Finding]:
 
 
 def check_extras(requirements: Iterable[str] | None = None) -> Iterator[Finding]:
-    """Yield the packages of each extra; one that is not installed is no error."""
+    """Yield the packages of each extra, as `EXTRA: PACKAGE`; one that is not installed is no error."""
     lines = requires("completesplat") or () if requirements is None else requirements
     for requirement in map(Requirement, lines):
         for extra, purpose in EXTRAS.items():
             if requirement.marker is not None and requirement.marker.evaluate({"extra": extra}):
+                name = f"{extra}: {requirement.name}"
                 try:
-                    yield Finding(requirement.name, "yes", f"{version(requirement.name)}: {purpose}")
+                    yield Finding(name, "yes", f"{version(requirement.name)}: {purpose}")
                 except PackageNotFoundError:
-                    yield Finding(requirement.name, "no", f'{purpose}: `pip install "completesplat[{extra}]"`')
+                    yield Finding(name, "no", f'{purpose}: `pip install "completesplat[{extra}]"`')
 
 
 def check_imports() -> Iterator[Finding]:

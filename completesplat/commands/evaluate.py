@@ -1,6 +1,6 @@
 """`completesplat test`: score a trained model's images against true ones, and its samples against hidden modes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
@@ -155,19 +155,16 @@ def run_hidden_modes(
     used = {"scenes": measured.names, "skipped": skipped, **provenance(data, out), **tested.facts()}
     write_json(out / "protocol.json", _modes_protocol(evaluation, module, data) | used)
     draw(measured, samples, out / "hidden_modes.png")
-    _log_modes(results, list(instantiate(logger or {}, _convert_="all").values()), out)
+    scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
+    loggers: list[Logger] = list(instantiate(logger or {}, _convert_="all").values())
+    with wandb_runs(loggers, OmegaConf.load(out / CONFIG)):
+        for each in loggers:
+            each.log_metrics(scores, step=0)
+            each.save()
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
     Console(width=140).print(table(title, COLUMNS, [{"method": name, **values} for name, values in results.items()]))
     if skipped:
         print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
-
-
-def _log_modes(results: Mapping[str, Mapping[str, float]], loggers: Sequence[Logger], out: Path) -> None:
-    scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
-    with wandb_runs(loggers, OmegaConf.load(out / CONFIG)):
-        for logger in loggers:
-            logger.log_metrics(scores, step=0)
-            logger.save()
 
 
 def _modes_protocol(evaluation: HiddenModesEvaluation, module: Stage, data: SceneDataModule) -> dict[str, object]:

@@ -5,6 +5,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from hydra.utils import get_class
 from hydra.utils import instantiate as build
 from lightning import Trainer, seed_everything
 from lightning.pytorch.callbacks import WeightAveraging
@@ -18,6 +19,7 @@ from completesplat.commands.protocol import checkpoint_facts, protocol, write_js
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.results.runs import PLAN, read_record
 from completesplat.results.tables import evaluation_table, show
 from completesplat.settings.checks import check_image_size, check_optimizer, check_verb
 from completesplat.training.checkpoints import newest_whole
@@ -65,6 +67,7 @@ def run(config: DictConfig, out: Path) -> None:
     """Train and test; write `metrics.csv`, checkpoints and at the end `metrics.json` into the run directory."""
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
+    refuse_without_effect(config, out)
     seed_everything(config.seed, verbose=False)
     data, module = instantiate(config)
     # A test that cannot work is refused now, not after the training.
@@ -113,6 +116,17 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
         for key in OTHER_WEIGHTS & part.keys():
             part[key] = None
     return str(path)
+
+
+def refuse_without_effect(config: DictConfig, out: Path) -> None:
+    """Raise CompleteSplatError for a setting of a command, not of a sweep, that its model does not use."""
+    stage, given = get_class(config.model._target_), read_record(out).get("overrides", [])
+    unused: tuple[str, ...] = getattr(stage, "without_effect", ())
+    # Models that use no steps of the trainer only fit the scenes of a test.
+    unused += ("test=false",) if "trainer.max_" in unused else ()
+    for setting in [] if (out.parent / PLAN).is_file() else given:
+        if setting.lstrip("+~").startswith(unused):
+            raise CompleteSplatError(f"{setting}: {stage.__name__} does nothing with it; leave it out")
 
 
 def refuse_missing(config: DictConfig) -> None:

@@ -8,11 +8,12 @@ import platform
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
@@ -35,11 +36,10 @@ CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
 LAST = "checkpoints/last.ckpt"
 LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
-MAY_CHANGE = (
-    *("ckpt_path", "data.allow_changed", "optimized_metric"),
-    *("trainer.devices", "trainer.num_nodes", "trainer.strategy"),
-)
-"""Settings that may differ when a run continues; of the last one, also all settings below it."""
+OF_MACHINES = ("trainer.devices", "trainer.num_nodes", "trainer.strategy")
+MAY_CHANGE = ("ckpt_path", "data.allow_changed", "optimized_metric", *OF_MACHINES)
+"""Settings that may differ when a run continues, with all settings below them; also its end (`ENDS`)."""
+ENDS = ("trainer.max_steps", "trainer.max_epochs", "trainer.max_time")
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
 
 
@@ -115,36 +115,32 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     OmegaConf.set_struct(config, False)
     config.out = str(out)
     resolved = resolved_settings(config)
-    if is_finished(out, resolved):
+    if is_finished(out, resolved, hydra_config.overrides.task):
         print(f"{out}: finished before, not repeated")
         return optimized(config.get("optimized_metric"), out)
     first = is_first()
     try:
         with ended_by_signals():
             if first:
+                _record(out, [f"completesplat {verb}", *given], list(hydra_config.overrides.task), resolved)
                 with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
                     OmegaConf.save(resolved, temporary)
-                _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
             for key in ("checkpoint", "autoreconstructor_checkpoint"):
                 # The path may refer to the job's choices (`hydra:runtime.choices`), which `start` cannot resolve.
                 if (path := OmegaConf.select(config, f"model.{key}")) is not None:
                     config.model[key] = path
             with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{out}"]):
-                start(verb, config, out)
+                result = start(verb, config, out)
     except Interrupted as stop:
         if first:
             print(_how_to_continue(stop, verb, given, out), file=sys.stderr)
         raise
-    print(out)
+    print(out, *([result] if isinstance(result, str) else []), sep="\n")
     return optimized(config.get("optimized_metric"), out)
 
 
 def optimized(metric: str | None, out: Path) -> float | None:
-    """Return a finished job's metric for a sweeper such as Optuna: NaN if not finite, None if no metric is asked for.
-
-    Raises:
-        CompleteSplatError: the job has no metric of this name; the message lists those that it has.
-    """
+    """Return a job's metric for sweepers (NaN: not finite, None: not asked); raise CompleteSplatError if absent."""
     if metric is None:
         return None
     metrics = json.loads((out / METRICS).read_text())
@@ -168,8 +164,8 @@ def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) 
     return f"ended by {stop.signal.name}{checkpoint}; {'go on' if begun else 'start again'} with: {shlex.join(again)}"
 
 
-def start(verb: str, config: DictConfig, out: Path) -> None:
-    """Check the settings and call the function that the config names as its task, or else the verb's `run`."""
+def start(verb: str, config: DictConfig, out: Path) -> object:
+    """Check the settings and call the config's task or else the verb's `run`; return its result (a text is printed)."""
     with importing(), postponing() if verb == "predict" else nullcontext():
         check_verb(verb, config)
         if config.get("task") is None:
@@ -177,11 +173,11 @@ def start(verb: str, config: DictConfig, out: Path) -> None:
         else:
             check_settings(get_method(config.task._target_), resolved_settings(config.task))
             run = partial(instantiate, config.task, out=out, _convert_="all")
-    run()
+    return run()
 
 
-def is_finished(out: Path, config: Mapping[str, object]) -> bool:
-    """Return whether a job's directory holds its results, for jobs that can continue a run (`ckpt_path`).
+def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str] = ()) -> bool:
+    """Return whether a job's directory holds its results up to its end, for jobs that can continue (`ckpt_path`).
 
     Raises:
         CompleteSplatError: the directory holds a run that would be lost, or that had other settings.
@@ -192,11 +188,23 @@ def is_finished(out: Path, config: Mapping[str, object]) -> bool:
     if config["ckpt_path"] != "last":
         raise CompleteSplatError(f"{out} holds a run: continue it with ckpt_path=last, or choose another out=DIR")
     different = _differences(OmegaConf.to_container(OmegaConf.load(out / CONFIG)), config)
-    different = {key for key in different if key not in MAY_CHANGE and not key.startswith(f"{MAY_CHANGE[-1]}.")}
-    if different:
-        first = min(different, key=lambda key: (key.count("."), key))  # `model` repeats settings from outside it
-        raise CompleteSplatError(f"{out} holds a run with another {first}: choose another out=DIR")
-    return (out / METRICS).is_file()
+    if others := {key for key in different if not key.startswith((*MAY_CHANGE, *ENDS))}:
+        first = min(others, key=lambda key: (key.count("."), key))  # `model` repeats settings from outside it
+        same = [argument for argument in overrides if not argument.startswith(("out=", "ckpt_path="))]
+        again = shlex.join(["completesplat", "fit", *same, f"ckpt_path={out / LAST}", "out=MORE"])
+        advice = f"continue in another folder: {again}" if (out / LAST).is_file() else "choose another out=DIR"
+        raise CompleteSplatError(f"{out} holds a run with another {first}: {advice}")
+    finished, ends, earlier = (out / METRICS).is_file(), _ends(config), _ends(OmegaConf.load(out / CONFIG))
+    if not finished or ends == earlier:
+        return finished
+    if not (out / LAST).is_file():
+        raise CompleteSplatError(f"{out} has no {LAST} to continue from: choose another out=DIR")
+    if 0 <= ends["trainer.max_steps"] <= (steps := json.loads((out / METRICS).read_text())["steps"]):
+        raise CompleteSplatError(f"trainer.max_steps={ends['trainer.max_steps']}: {out} has {steps} steps; give more")
+    epochs, before = (end["trainer.max_epochs"] for end in (ends, earlier))
+    if epochs not in (None, -1) and (before in (None, -1) or epochs < before):
+        raise CompleteSplatError(f"trainer.max_epochs={epochs} may end before the run in {out}: choose another out=DIR")
+    return False
 
 
 def _differences(first: object, second: object, key: str = "") -> set[str]:
@@ -207,15 +215,24 @@ def _differences(first: object, second: object, key: str = "") -> set[str]:
     return {name for place, part in parts for name in _differences(first.get(part), second.get(part), place)}
 
 
-def _record(path: Path, command: list[str], overrides: list[str]) -> None:
-    """Write `run.json`: version, command and overrides, and the times of the start and of continuations."""
-    now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-    record = {"version": __version__, "commit": git_commit(), "command": command, "overrides": overrides}
-    record |= {"started": now}
-    if path.is_file() and (path.parent / LAST).is_file():
+def _record(out: Path, command: list[str], overrides: list[str], config: Mapping[str, object]) -> None:
+    """Write `run.json` with times, command and earlier ends; rename earlier results `metrics_N_steps.json`."""
+    path, now = out / RECORD, time.strftime("%Y-%m-%dT%H:%M:%S%z")
+    record: dict[str, Any] = {"version": __version__, "commit": git_commit(), "command": command}
+    record |= {"overrides": overrides, "started": now}
+    if path.is_file() and (out / LAST).is_file():
         earlier = json.loads(path.read_text())
         record |= {"started": earlier["started"], "continued": [*earlier.get("continued", []), now]}
+        record |= {"earlier_ends": earlier.get("earlier_ends", [])}
+        if "ckpt_path" in config and (before := _ends(OmegaConf.load(out / CONFIG))) != _ends(config):
+            record["earlier_ends"] += [{"until": now, "command": earlier["command"], **before}]
+            if (results := out / METRICS).is_file():
+                results.rename(out / f"metrics_{json.loads(results.read_text())['steps']}_steps.json")
     write_json(path, record)
+
+
+def _ends(config: object) -> dict[str, Any]:
+    return {key: OmegaConf.select(OmegaConf.create(config), key) for key in ENDS}  # type: ignore[call-overload]
 
 
 @contextmanager

@@ -2,6 +2,8 @@
 
 import keyword
 import re
+import shlex
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -13,27 +15,23 @@ from completesplat.settings.options import conf_folder
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
 KINDS = ("loss", "rasterizer", "dataset", "ablation", "experiment")
-FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)
-"""Line of a template that names the file which follows."""
+FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)  # line of a template that names the file which follows
 
 
-def run(config: DictConfig, out: Path) -> None:
-    """Write the part's files into the working folder; print their names and the next command."""
+def run(config: DictConfig) -> None:
+    """Write the part's files into the working folder; print their names and the commands that test them."""
     kind, name = str(config.kind), str(config.name)
     files = new_files(kind, name)
     for path, text in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, text)
         print(path)
-    print(f"next: python -m pytest test_{kind}_{name}.py")
+    needed = "" if find_spec("pytest") else " (needs pip install pytest)"
+    print("next:", shlex.join([sys.executable, "-m", "pytest", f"test_{kind}_{name}.py"]) + needed)
 
 
 def new_files(kind: str, name: str) -> dict[Path, str]:
-    """Return the contents of a new part's files, by their paths in the working folder.
-
-    Raises:
-        CompleteSplatError: there is no such kind, the name is not a Python name or is taken, or a file exists.
-    """
+    """Return a new part's files by path; raise CompleteSplatError if kind or name is unfit, or a file exists."""
     if kind not in KINDS:
         raise CompleteSplatError(f"kind={kind}: choose one of {', '.join(KINDS)}")
     if not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):

@@ -77,11 +77,7 @@ def plan_table(plans: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def plan_of(config: DictConfig) -> dict[str, Any]:
-    """Return the figures of a training, with `assumptions` and `remarks`.
-
-    Raises:
-        CompleteSplatError: a setting does not fit, the GPU is unknown, or nothing says how long the training is.
-    """
+    """Return a training's figures, `assumptions` and `remarks`; raise CompleteSplatError if a setting does not fit."""
     check_image_size(config)
     check_optimizer(config.optimizer)
     if config.gpu != HERE and config.gpu not in config.gpus:
@@ -89,7 +85,9 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
         raise CompleteSplatError(f"gpu={config.gpu}: there are {', '.join(names)}{did_you_mean(config.gpu, names)}")
     data, accumulated = config.data, config.trainer.accumulate_grad_batches
     batch = batch_per_process(data.batch_size, config.devices, accumulated)
-    sequences, frames = size_of_data(config)
+    sequences, frames = data.get("scenes", config.sequences), data.get("frames", config.frames)
+    if not OmegaConf.is_missing(data, "root") and Path(data.root).is_dir():
+        sequences = len(build(data, _convert_="all").source("train").names)
     steps, counts, limit = steps_of(config, sequences), counted(config, batch), memory_limit(config)
     flops, measured, fits = counts.flops * config.devices, None, counts.peak <= limit
     if config.gpu == HERE:
@@ -138,15 +136,6 @@ def precision(config: DictConfig) -> str:
     chosen = str(config.trainer.precision)
     default = str(config.trainer._get_node("precision")._value()).startswith("${best_precision")
     return "bf16-mixed" if config.gpu != HERE and (default or chosen.startswith("16")) else chosen
-
-
-def size_of_data(config: DictConfig) -> tuple[int, int]:
-    """Return the numbers of training sequences and of frames of each: in `data.root`, to be made, or assumed."""
-    data = config.data
-    sequences, frames = data.get("scenes", config.sequences), data.get("frames", config.frames)
-    if not OmegaConf.is_missing(data, "root") and Path(data.root).is_dir():
-        sequences = len(build(data, _convert_="all").source("train").names)
-    return sequences, frames
 
 
 def steps_of(config: DictConfig, sequences: int) -> int:

@@ -6,8 +6,9 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from glob import glob
 from pathlib import Path
 
 import numba.np.arraymath  # else the first kernel imports it, and scipy with it  # noqa: F401
@@ -28,27 +29,30 @@ from completesplat.export.prediction import Wanted, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.files import folder_names, printable, safe_name
 from completesplat.generator import CompleteSplat
-from completesplat.geometry.trajectories import PATHS
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene_model import SceneModel, distance_to_training
 from completesplat.settings.checks import REMOVE
 from completesplat.weights import CONFIG_FILE, read_small, shipped
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
-FAR = 1.5
-"""Ratio of tan(fov / 2), photo to training, from which a warning is given."""
-UNLIKE = 2.0
-"""Distance from the training images (`distance_to_training`) from which a warning is given."""
+FAR = 1.5  # ratio of tan(fov / 2), photo to training, from which a warning is given
+UNLIKE = 2.0  # distance from the training images (`distance_to_training`) from which a warning is given
+# The network has 56.4 million numbers in float32; its authors' checkpoint may hold more.
+ELSEWHERE = (
+    "; for an object try weights=splatter_image:objaverse background=remove (MIT, downloads at least 226 MB) or"
+    " github.com/VAST-AI-Research/TripoSplat (MIT), for a scene github.com/apple/ml-sharp (weights for research only);"
+    " view and test scenes= read the PLY files of both projects"
+)
 
 log = logging.getLogger(__name__)
 
 
 def run(config: DictConfig, out: Path) -> None:
     """Write each photo's files into `out/<its name>/`."""
+    wanted = wanted_files(config)
     images = find_images(config.image)
     if config.mask is not None and len(images) > 1:
         raise CompleteSplatError("mask=FILE belongs to one image; box=[x0,y0,x1,y1] goes for several")
-    wanted = wanted_files(config)  # before the model runs, because the converter may be missing
     if config.cameras is not None:
         predict_from_views(config, images, wanted, out)
     else:
@@ -56,46 +60,45 @@ def run(config: DictConfig, out: Path) -> None:
 
 
 def find_images(image: object) -> list[Path]:
-    """Return the files of `image=FILE`, `image=FOLDER` or a list of both; of a folder its images, by suffix, sorted.
-
-    Files that are named one by one are not checked here, even missing ones, because reading them reports the fault.
+    """Return the files of `image=FILE`, or the images, sorted, of `image=FOLDER` or `image=PATTERN`, or of a list.
 
     Raises:
-        CompleteSplatError: a folder has no image or cannot be read, the list is empty, or an entry is no name.
+        CompleteSplatError: no file exists, a folder or pattern has no image, the list is empty, or an entry is no name.
     """
     entries = image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
     if not entries:
         raise CompleteSplatError("image=[]: name at least one image")
     if any(entry == "" or isinstance(entry, bool) or not isinstance(entry, str | int) for entry in entries):
         raise CompleteSplatError(f"image={image}: give an image, a folder, or a list of them")
-    return [path for entry in entries for path in _images_of(Path(str(entry)))]
+    images = [path for entry in entries for path in _images_of(Path(str(entry)))]
+    if not any(map(os.path.lexists, images)):
+        raise CompleteSplatError(f"{printable(str(images[0])[:300])}: no such file")
+    return images
 
 
 def _images_of(path: Path) -> list[Path]:
     # `os.path`, because the methods of `Path` raise an error if a name is too long.
-    if not os.path.isdir(path):
+    folder = os.path.isdir(path)
+    if not folder and (os.path.lexists(path) or not set("*?[") & set(str(path))):
         return [path]
     try:
-        images = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
+        files = path.iterdir() if folder else map(Path, glob(str(path), recursive=True))
+        images = sorted(file for file in files if file.suffix.lower() in SUFFIXES and file.is_file())
     except OSError as error:
         raise CompleteSplatError(f"{path}: {error.strerror}") from error
     if not images:
-        raise CompleteSplatError(f"{path}: no image in this folder ({', '.join(SUFFIXES)})")
+        raise CompleteSplatError(f"{path}: no image {'in this folder' if folder else 'fits'} ({', '.join(SUFFIXES)})")
     return images
 
 
 def wanted_files(config: DictConfig) -> Wanted:
-    """Return the outputs to write for each image.
-
-    Raises:
-        CompleteSplatError: no such format or camera path, no format at all, or no converter for one that needs it.
-    """
-    formats = _chosen("formats", config.formats, FORMATS)
-    if not formats:
-        raise CompleteSplatError(f"formats=[]: choose from {', '.join(FORMATS)}")
+    """Return the outputs for each image; raise CompleteSplatError for none, an unknown one, or a missing program."""
+    formats, videos = _names(config.formats), _names(config.video)
+    if not formats and not videos:
+        raise CompleteSplatError(f"formats=[] video=[]: choose a format ({', '.join(FORMATS)}) or a video")
     return Wanted(
         formats=formats,
-        videos=_chosen("video", config.video, PATHS),
+        videos=videos,
         frames=config.frames,
         background=Wanted.background if config.background == REMOVE else config.background,
         maps=config.maps,
@@ -104,12 +107,9 @@ def wanted_files(config: DictConfig) -> Wanted:
     )
 
 
-def _chosen(name: str, value: object, choices: Collection[str]) -> tuple[str, ...]:
-    """Return one name, or the names of a list without duplicates; refuse those that are not in `choices`."""
+def _names(value: object) -> tuple[str, ...]:
+    """Return one name, or the names of a list without duplicates."""
     names = value if isinstance(value, Sequence) and not isinstance(value, str) else [value] if value else []
-    for entry in names:
-        if entry not in choices:
-            raise CompleteSplatError(f"{name}={entry}: choose from {', '.join(choices)}")
     return tuple(dict.fromkeys(map(str, names)))
 
 
@@ -121,12 +121,10 @@ def predict_images(config: DictConfig, model: SceneModel, images: Sequence[Path]
         DiskError: the disk is full; the remaining images are not predicted.
     """
     console, failed = Console(), []
-    if (config.mask is not None or config.box is not None) and not model.knows_hidden:
-        log.warning(
-            "%s: these weights were not trained with parts of the image hidden (data.box_masks, conf/experiment/"
-            "*_masked.yaml): hidden parts may come out black or grey",
-            "mask" if config.mask is not None else "box",
-        )
+    hiding = [name for name in ("mask", "box") if config[name] is not None]
+    if hiding and not model.architecture.get("training", {}).get("box_masks"):
+        text = "these weights were not trained with parts of the image hidden (data.box_masks, conf/experiment/"
+        log.warning("%s: %s*_masked.yaml): hidden parts may come out black or grey", hiding[0], text)
     rasterizer = instantiate(config.rasterizer, _convert_="all")
     folders = folder_names(image.stem for image in images)
     with Progress(console=console, disable=not console.is_terminal) as bar:
@@ -243,13 +241,13 @@ def remarks(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]
 
 
 def nearer_weights(photograph: Photograph, distance: float) -> str:
-    """Name the shipped weights whose training images are nearer to a photo; return "" if there are none."""
+    """Name the shipped weights whose training images are nearer to a photo, and `ELSEWHERE` if these are far, too."""
     nearest = ""
     for name, folder in shipped().items():
         other = distance_to_training(photograph, json.loads(read_small(folder / CONFIG_FILE)))
         if other is not None and other < distance:
             nearest, distance = f"; weights={name} were trained on images that are nearer ({other:.1f})", other
-    return nearest
+    return nearest + (ELSEWHERE if distance > UNLIKE else "")
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:
@@ -271,12 +269,7 @@ def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str
 
 
 def visible_part(config: DictConfig, image: Path, size: int) -> Float[Tensor, "1 size size"] | None:
-    """Return 0 where `mask` or `box` hides the photo and 1 elsewhere; None without them.
-
-    Raises:
-        ImageError: the mask is not a readable image.
-        CompleteSplatError: mask and box at once, an impossible box, or a mask that hides nothing.
-    """
+    """Return 0 where `mask` or `box` hides the photo, else 1; None without both. Raise CompleteSplatError if unfit."""
     if config.mask is not None and config.box is not None:
         raise CompleteSplatError("give mask=FILE or box=[x0,y0,x1,y1], not both")
     if config.mask is not None:

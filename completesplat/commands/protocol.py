@@ -80,6 +80,7 @@ def protocol(
         **{"samples": scored.samples, "criterion": scored.criterion, "seed": scored.seed},
         **({"best": BEST_RULES} if scored.samples > 1 else {}),
         **drawing(module),
+        **({} if module.fitted_to is None else {"fitted_to": module.fitted_to}),
         "object_pixels": "background black in both, by the true mask cut at 0.5",
         "average": "over the views of a scene, then over scenes",
         "metrics": {name: METRICS[name] for name in scored.metrics if name in METRICS},

@@ -24,11 +24,7 @@ def tables(runs: str | None, out: Path) -> None:
 
 
 def summary(sweeps: Sequence[str], out: Path) -> None:
-    """Write and print the summary of one sweep whose jobs lie in several folders, as `fit -m` does for one folder.
-
-    Raises:
-        CompleteSplatError: there is no such folder.
-    """
+    """Write and print the summary of a sweep in several folders; raise CompleteSplatError if a folder is missing."""
     folders = [Path(sweep) for sweep in sweeps]
     for folder in folders:
         if not folder.is_dir():

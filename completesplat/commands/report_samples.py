@@ -27,7 +27,6 @@ from completesplat.settings.schema import Entries, Positive, Range, Share
 from completesplat.studies import calibration as calibration_study
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
-from completesplat.studies import front as front_study
 from completesplat.studies import noise_levels
 from completesplat.studies.controls import Tick
 from completesplat.studies.samples import SampleRenderer, first_scenes
@@ -99,16 +98,6 @@ def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Un
     calibration_study.plot_calibration(rows, out / "calibration.png", title)
     ideal = f"calibrated: {1 / (1 + run['samples']):.3g} of the true values below and above all samples, ratio 1"
     show(records_table(f"Novel views; {ideal}", rows))
-
-
-def front(out: Path, **run: Unpack[Run]) -> None:
-    """Write `front.json` and `front.png`, and print the table; `studies.front.rows` explains the rungs."""
-    with _opened(run) as (renderer, scenes, settings, tick):
-        rows, sheet = front_study.rows(renderer, scenes, tick)
-    write_json(out / "front.json", {"settings": settings, "rows": rows})
-    title = f"{scenes[0].names[0]}: two samples and {front_study.AMPLIFIED} times their difference, from the front"
-    write_png(out / "front.png", image_sheet(None, sheet, f"{title}; then in the farthest view"))
-    show(records_table("Reference view: PSNR, dB; mean absolute difference of two samples, in 1/255", rows))
 
 
 def modes(spread_views: Positive, out: Path, **run: Unpack[Run]) -> None:

@@ -14,7 +14,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.generator import CompleteSplat
 from completesplat.opening import config_of_run, locate
 from completesplat.scene_model import SceneModel
-from completesplat.weights import sha256_of, shipped
+from completesplat.weights import RUN_CHECKPOINT, sha256_of, shipped
 from completesplat.weights.checkpoint_reading import load_part
 
 if TYPE_CHECKING:
@@ -46,6 +46,10 @@ class Trained:
     sampler: Mapping[str, object] | None = None
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        if self.ckpt is not None and Path(self.ckpt).is_dir():
+            object.__setattr__(self, "ckpt", str(Path(self.ckpt, RUN_CHECKPOINT)))
+
     @cached_property
     def model(self) -> SceneModel:
         """Return the model of `weights`."""
@@ -75,7 +79,10 @@ class Trained:
         if self.ckpt is not None and self.data is not None:
             raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
         if self.ckpt is not None:
-            return config_of_run(Path(self.ckpt), list(self.overrides), self.trust)
+            config = config_of_run(Path(self.ckpt), list(self.overrides), self.trust)
+            if "scene_folder" in config.model:
+                config.model.scene_folder = None  # the run's own, whose scene stays as it is
+            return config
         if self.data is None:
             raise CompleteSplatError("weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR")
         config = OmegaConf.create({"seed": self.seed, "data": self.data})
@@ -89,12 +96,7 @@ class Trained:
         return self.open_module(configuration), instantiate(configuration.data, _convert_="all")
 
     def open_module(self, configuration: Any) -> "Stage":
-        """Return the stage of the config, with its weights and, if given, another sampler.
-
-        Raises:
-            WeightsError: the weights do not fit.
-            CompleteSplatError: a sampler is given for a model that draws no samples.
-        """
+        """Return the stage with its weights and sampler (if given); raise CompleteSplatError if one does not fit."""
         stage: Stage = self._stage() if self.ckpt is None else instantiate(configuration.model, _convert_="all")
         if self.ckpt is not None:
             load_part(stage, self.ckpt, prefix="")

@@ -12,16 +12,16 @@ from omegaconf import DictConfig
 from completesplat.commands.imports import importing, postponing
 from completesplat.commands.jobs import at_work
 from completesplat.errors import CompleteSplatError
-from completesplat.files import printable
+from completesplat.files import SPLATS, printable
 from completesplat.settings.checks import REMOVE, check_parts
 from completesplat.signals import Interrupted
 from completesplat.weights import CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, check_name
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
-KINDS = {".ply": "scene", ".ckpt": "weights", ".pth": "weights"}
+KINDS = dict.fromkeys(SPLATS, "scene") | {".ckpt": "weights", ".pth": "weights"}
 PAUSE = 2.0  # seconds between two checks for new scenes of a run
 SCENE_FILES = ("sample_*.ply", "scene.ply")
-LOADING = "**Loading** what the page shows: the model, or scenes. The controls come with it."
+AT_STEP = "step {} of the training"
 
 
 def run(config: DictConfig, out: Path) -> None:
@@ -45,15 +45,14 @@ def run(config: DictConfig, out: Path) -> None:
     try:
         if config.export is None:
             print(f"{server.address} (Ctrl-C ends it)", flush=True)
-        loading = server.gui.add_markdown(LOADING)
         page = make_page(server, config, out)
-        loading.remove()
+        step = None
         if config.export is not None:
             return export(page, Path(config.export))
         while True:
             time.sleep(PAUSE)
             if config.watch is not None:
-                show_newest(page, Path(config.watch))
+                step = show_newest(page, Path(config.watch), step)
     except Interrupted as stop:
         if stop.signal != SIGINT:
             raise
@@ -62,11 +61,7 @@ def run(config: DictConfig, out: Path) -> None:
 
 
 def settings_of(path: Path) -> dict[str, str]:
-    """Return the setting that a path stands for: `scene`, `image`, `weights`, or `watch` for a run in training.
-
-    Raises:
-        CompleteSplatError: the path is none of these.
-    """
+    """Return the setting (`scene`, `image`, `weights`, `watch`) for a path; raise CompleteSplatError if none fits."""
     if path.is_file():
         return {KINDS.get(path.suffix.lower(), "image"): str(path)}
     if not path.is_dir():
@@ -76,17 +71,21 @@ def settings_of(path: Path) -> dict[str, str]:
     for folder in (path, path / "weights"):
         if all((folder / name).is_file() for name in WEIGHT_FILES):
             return {"weights": str(folder)}
-    if (path / RUN_CHECKPOINT).is_file():
+    fitted = (path / "scene.ply").is_file()  # a run's result
+    if (path / RUN_CHECKPOINT).is_file() and not fitted:
         return {"weights": str(path)}
-    inner = [*path.iterdir(), *((path / SCENES).iterdir() if (path / SCENES).is_dir() else [])]
-    folders = [folder for folder in (path, *sorted(inner)) if any(any(folder.glob(name)) for name in SCENE_FILES)]
-    if len(folders) == 1 or path in folders:
-        return {"scene": str(folders[0])}
-    if folders:
-        raise CompleteSplatError(f"{path} holds {len(folders)} predictions: give one of them, {folders[0]} for example")
-    raise CompleteSplatError(
-        f"{path}: neither weights ({', '.join(WEIGHT_FILES)}, here or in weights/) nor a prediction (sample_*.ply)"
-    )
+    if scenes_in(path):
+        return {"scene": str(path)}
+    raise CompleteSplatError(f"{path}: neither weights nor scenes in it ({', '.join((*WEIGHT_FILES, *SPLATS))})")
+
+
+def scenes_in(path: Path) -> dict[str, Path]:
+    """Return a scene itself (a file, a prediction, a fitted scene), or those in a folder and its `scenes/`, by name."""
+    if path.is_file() or any(any(path.glob(name)) for name in SCENE_FILES):
+        return {path.name: path}
+    inner = [entry for folder in (path, path / SCENES) if folder.is_dir() for entry in sorted(folder.iterdir())]
+    found = [x for x in inner if x.suffix.lower() in SPLATS or any(any(x.glob(name)) for name in SCENE_FILES)]
+    return {printable(str(x.relative_to(path))): x for x in found}
 
 
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
@@ -105,11 +104,13 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
 
         check_parts(config)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = None
+    model, scenes, status = None, {}, ""
     if config.watch is not None:
-        samples, up = newest_scenes(Path(config.watch))
+        status, samples, up = newest_scenes(Path(config.watch))
     elif config.scene is not None:
-        samples, up = read_scene(Path(config.scene))
+        scenes = scenes_in(Path(config.scene)) or {"": Path(config.scene)}  # which `read_scene` refuses
+        status, path = next(iter(scenes.items()))
+        samples, up = read_scene(path)
     else:
         model = open_generator(config).to(device)
         samples, up = [], tuple(model.up.tolist())
@@ -122,11 +123,10 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     splats.show(samples)
     rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
     saver = Saver(out, splats, rasterizer, config.frames, background)
+    page = Page(server, splats, saver, scenes)
     if model is None:
-        page = Page(server, splats, saver, max(sample.layers for sample in samples))
-        page.show(samples, "" if config.watch is None else step_of(samples))
+        page.show(samples, status)
         return page
-    page = Page(server, splats, saver, model.parameterization.layers)
     start = {name: config[name] for name in SLIDERS} | {"remove_background": remove}
     completion = Completion(page, model, start)
     if photograph is not None:
@@ -134,12 +134,8 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     return page
 
 
-def newest_scenes(run: Path) -> tuple[Sequence[Any], Sequence[float]]:
-    """Return the newest fixed scenes of a run and the up direction; wait until there are scenes.
-
-    Raises:
-        CompleteSplatError: the folder is no run of `fit` that draws fixed scenes, or they cannot be read.
-    """
+def newest_scenes(run: Path) -> tuple[str, Sequence[Any], Sequence[float]]:
+    """Wait for a run's fixed scenes; return a note on their step, scenes and up, or raise CompleteSplatError."""
     from completesplat.viewer.sample import NEWEST_FILE, read_newest
 
     folder = run / NEWEST
@@ -149,35 +145,25 @@ def newest_scenes(run: Path) -> tuple[Sequence[Any], Sequence[float]]:
         print(f"{run}: no scenes yet; waiting for them (every callbacks.images.every_n_steps steps)", flush=True)
     while not (folder / NEWEST_FILE).is_file():
         time.sleep(PAUSE)
-    _, samples, up = read_newest(folder)
-    return samples, up
+    step, samples, up = read_newest(folder)
+    return AT_STEP.format(step), samples, up
 
 
-def step_of(samples: Sequence[Any]) -> str:
-    """Return the page's note on the training step of a run's scenes; an empty one for other scenes."""
-    steps = [sample.settings["step"] for sample in samples if "step" in sample.settings]
-    return f"step {steps[0]} of the training" if steps else ""
-
-
-def show_newest(page: Any, run: Path) -> None:
-    """Show the scenes that the run has written since the page was last drawn, if any."""
+def show_newest(page: Any, run: Path, shown: int | None) -> int | None:
+    """Show what the run has written after step `shown` (None: after the page was made); return its newest step."""
     from completesplat.viewer.sample import read_newest
 
-    steps = {sample.settings["step"] for sample in page.view.samples}
     try:
         step, samples, _ = read_newest(run / NEWEST)
     except CompleteSplatError:
-        return  # the scenes are just being written, or were removed: the page stays as it is
-    if steps != {step} and samples:
-        page.show(samples, step_of(samples))
+        return shown  # the scenes are just being written, or were removed: the page stays as it is
+    if step not in {shown, *(sample.settings.get("step") for sample in page.view.samples)}:
+        page.show(samples, AT_STEP.format(step))
+    return step
 
 
 def export(page: Any, path: Path) -> None:
-    """Write the page to a file when its work is done.
-
-    Raises:
-        CompleteSplatError: the page shows no scene.
-    """
+    """Write the page to a file when its work is done; raise CompleteSplatError if the page shows no scene."""
     from completesplat.viewer.page import write_page
 
     page.worker.wait()

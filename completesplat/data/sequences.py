@@ -33,6 +33,8 @@ class PosedSequence:
         read: index of a frame (not its number) -> its image; a DataError if it cannot be read.
         read_depth: index of a frame -> depth along the optical axis in units of the cameras, 0 where it is unknown; a
             DataError if it cannot be read; None: there is no depth.
+        points: points of a reconstruction in the cameras' world and units, if the data set has them.
+        scale: units of the cameras in one unit of the data set's own files, where it is known.
     """
 
     name: str
@@ -41,6 +43,8 @@ class PosedSequence:
     depth_ranges: Float[Tensor, "view 2"]
     read: Callable[[int], MaskedImage]
     read_depth: Callable[[int], Float[Tensor, "1 size size"]] | None = None
+    points: Float[Tensor, "n 3"] | None = None
+    scale: float = 1.0
 
 
 @runtime_checkable

@@ -1,7 +1,7 @@
 """The paper's two controls of sampling, guidance and skip weight, and the values that they may have.
 
-Guidance has the paper's meaning: a weight w mixes in the unconditional prediction, which adds diversity. Skips carry
-what the image shows into the scene.
+Guidance has the paper's meaning: a weight w mixes in the unconditional prediction, for diversity; skips carry
+visible content.
 """
 
 from collections.abc import Callable

@@ -43,17 +43,15 @@ def target(scheduler: ConfigMixin, latent: Latents, noise: Latents, timestep: In
     return {"epsilon": noise, "sample": latent, "flow": noise - latent}[kind]
 
 
-def clean_estimate(
-    scheduler: ConfigMixin, noisy_latent: Latents, predicted: Latents, timestep: Int[Tensor, ""]
-) -> Latents:
+def clean_estimate(scheduler: ConfigMixin, noisy: Latents, predicted: Latents, timestep: Int[Tensor, ""]) -> Latents:
     """Return the clean latent h that a prediction implies; raise like `prediction_type`."""
     kind = prediction_type(scheduler)
-    signal, noise = signal_and_noise(scheduler, timestep, noisy_latent)
+    signal, noise = signal_and_noise(scheduler, timestep, noisy)
     if kind == "epsilon":
-        return (noisy_latent - noise * predicted) / signal
+        return (noisy - noise * predicted) / signal
     if kind == "v_prediction":
-        return signal * noisy_latent - noise * predicted
-    return noisy_latent - noise * predicted if kind == "flow" else predicted
+        return signal * noisy - noise * predicted
+    return noisy - noise * predicted if kind == "flow" else predicted
 
 
 def is_flow(scheduler: object) -> bool:
@@ -67,7 +65,5 @@ def prediction_type(scheduler: ConfigMixin) -> str:
         return "flow"
     kind: str = scheduler.config["prediction_type"]
     if kind not in PREDICTION_TYPES:
-        raise CompleteSplatError(
-            f"sampler.scheduler.prediction_type={kind}: unknown; choose one of {', '.join(PREDICTION_TYPES)}"
-        )
+        raise CompleteSplatError(f"sampler.scheduler.prediction_type={kind}: choose from {', '.join(PREDICTION_TYPES)}")
     return kind

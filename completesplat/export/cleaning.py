@@ -37,7 +37,7 @@ def cleaned(gaussians: Gaussians, name: object) -> Gaussians:
     if broken == gaussians.count:
         raise CompleteSplatError(f"{name}: all {broken} Gaussians are broken (not finite, or no extent)")
     log.warning("%s: left out %d of %d Gaussians (not finite, or no extent)", name, broken, gaussians.count)
-    return gaussians.keep(mask)
+    return gaussians[mask]
 
 
 def beyond_gamut(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:

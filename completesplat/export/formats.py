@@ -1,4 +1,4 @@
-"""Export of one scene to several file formats, and the writers of `.splat` and binary glTF.
+"""Export of one scene to several file formats, and the writers of `.splat` and binary glTF (splats or a mesh).
 
 glTF has the extension KHR_gaussian_splatting; readers without it show a cloud of coloured points. Formats: the Khronos
 Group's glTF 2.0 specification, and the text of the extension (`extensions/2.0/Khronos/` in their repository, version of
@@ -6,6 +6,7 @@ Group's glTF 2.0 specification, and the text of the extension (`extensions/2.0/K
 """
 
 import json
+import logging
 import struct
 import tempfile
 from collections.abc import Sequence
@@ -15,20 +16,23 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from completesplat import __version__
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import cleaned, transparent
+from completesplat.export.mesh import VOXELS, Mesh, mesh_of
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform, write_page
 from completesplat.files import write_bytes
 from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import transform_points
 from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.rasterizers import Rasterizer
 from completesplat.splatter_image import SH_C0
 
-FORMATS = ("ply", "splat", "glb", "spz", "sog", "html")
+FORMATS = ("ply", "splat", "glb", "mesh", "spz", "sog", "html")
 CONVERTED = ("spz", "sog", "html")
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quaternions", "u1", 4)])
 EXTENSION = "KHR_gaussian_splatting"
@@ -38,10 +42,14 @@ RENDERING = {
     "projection": "perspective",
     "sortingMethod": "cameraDistance",
 }
-COMPONENTS = {"float32": 5126, "uint16": 5123}
+UNLIT = "KHR_materials_unlit"
+MATERIAL = {"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "extensions": {UNLIT: {}}}
+COMPONENTS = {"float32": 5126, "uint16": 5123, "uint32": 5125}
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 TO_GLTF = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 """Half a turn about x, from our axes (+y down, +z forward) to those of glTF (+y up, cameras look along -z)."""
+
+log = logging.getLogger(__name__)
 
 
 def write_formats(
@@ -52,8 +60,9 @@ def write_formats(
     view: PageView,
     converter: SplatTransform | None,
     comments: Sequence[str] = (),
+    rasterizer: Rasterizer | None = None,
 ) -> dict[str, str]:
-    """Write one scene as `NAME.ply`, `NAME.spz` and so on.
+    """Write one scene as `NAME.ply`, `NAME.spz` and so on, its mesh as `NAME_mesh.glb`.
 
     All formats except `.ply` get colours clipped to [0, 1], because only some formats and readers would clip them. The
     `.ply` keeps colours above 1, because Gaussians may be seen through others. All files keep the frame of the given
@@ -64,30 +73,39 @@ def write_formats(
         File names by purpose: `NAME` for the `.ply`, `NAME_spz` and so on for the others.
 
     Raises:
-        CompleteSplatError: there is nothing to write, or the converter (for `CONVERTED` formats) is missing or fails.
+        CompleteSplatError: there is nothing to write, the converter (for `CONVERTED` formats) or the rasterizer (for a
+            mesh) is missing, or one of them fails.
     """
     clipped = replace(gaussians, colors=gaussians.colors.clamp(0, 1))
-    for kind in formats:
-        target = folder / f"{name}.{kind}"
+    files = {kind: name + suffix(kind) for kind in formats}
+    for kind, file in files.items():
+        target = folder / file
         if kind == "ply":
             write_ply(target, gaussians, comments)
         elif kind == "splat":
             write_splat(target, clipped)
         elif kind == "glb":
             write_glb(target, clipped, comments)
-        elif converter is None:
-            raise CompleteSplatError(f"a converter is needed for {kind}")
+        elif kind == "mesh" and rasterizer is not None:
+            write_mesh(target, mesh_of(rasterizer, clipped, view.reference, view.pivot), comments)
+        elif converter is None or kind == "mesh":
+            raise CompleteSplatError(f"a {'rasterizer' if kind == 'mesh' else 'converter'} is needed for {kind}")
         elif kind == "html":
             write_page(target, clipped, view, converter)
         else:
-            stored = clipped.keep(~transparent(clipped)) if kind == "spz" else clipped
+            stored = clipped[~transparent(clipped)] if kind == "spz" else clipped
             if not stored.count:
                 raise CompleteSplatError(f"{target}: all {clipped.count} Gaussians are transparent")
             with tempfile.TemporaryDirectory() as temporary:
                 source = Path(temporary) / f"{name}.ply"
                 write_ply(source, stored, comments)
                 converter.convert(source, target)
-    return {name if kind == "ply" else f"{name}_{kind}": f"{name}.{kind}" for kind in formats}
+    return {name if kind == "ply" else f"{name}_{kind}": file for kind, file in files.items()}
+
+
+def suffix(kind: str) -> str:
+    """Return the end of the names of a format's files."""
+    return "_mesh.glb" if kind == "mesh" else f".{kind}"
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> int:
@@ -120,21 +138,27 @@ def write_glb(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
     stored = cleaned(gaussians, path).detach().to("cpu", torch.float32).transform(TO_GLTF)
     if not stored.count:
         raise CompleteSplatError(f"{path}: glTF has no empty sets of Gaussians")
-    arrays = _attributes(stored)
-    content = b"".join(array.tobytes() for array in arrays.values())  # each a multiple of four bytes
-    text = json.dumps(_description(arrays, len(content), comments)).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = [struct.pack("<I4s", len(data), kind) + data for kind, data in ((b"JSON", text), (b"BIN\0", content))]
-    write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + sum(map(len, chunks))) + b"".join(chunks))
+    primitive = {"mode": 0, "extensions": {EXTENSION: RENDERING}}
+    _write_gltf(path, _attributes(stored), primitive, {"extensionsUsed": [EXTENSION]}, comments)
     return stored.count
+
+
+def write_mesh(path: Path, mesh: Mesh, comments: Sequence[str] = ()) -> None:
+    """Write a mesh with colours at its vertices, in the frame of `write_glb`; log its resolution."""
+    arrays = {
+        "POSITION": transform_points(TO_GLTF, mesh.vertices.cpu()).numpy().astype("<f4"),
+        "COLOR_0": _linear(mesh.colors.cpu(), torch.ones(len(mesh.colors), 1)),
+        "indices": mesh.faces.astype("<u4").reshape(-1, 1),
+    }
+    used = {"extensionsUsed": [UNLIT], "materials": [MATERIAL]}
+    _write_gltf(path, arrays, {"mode": 4, "material": 0}, used, comments)
+    text = "%s: watertight, %d triangles; its longest side has %d voxels of %.2g units"
+    log.info(text, path.name, len(mesh.faces), VOXELS, mesh.voxel)
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     """Return arrays [gaussian, component] by attribute name of the glTF primitive."""
     opacities, colors = gaussians.opacities.clamp(0, 1)[:, None], gaussians.colors.clamp(0, 1)
-    # From sRGB to linear light (IEC 61966-2-1), in which glTF stores the colours of points.
-    linear = torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
-    points = torch.cat([linear, opacities], dim=-1)
     splats = {
         "ROTATION": normalize_quaternion(gaussians.quaternions).roll(-1, dims=-1),  # x, y, z, w
         "SCALE": gaussians.scales,
@@ -143,31 +167,44 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     }
     arrays = {"POSITION": gaussians.means} | {f"{EXTENSION}:{name}": values for name, values in splats.items()}
     as_floats = {name: values.numpy().astype("<f4") for name, values in arrays.items()}
-    return as_floats | {"COLOR_0": points.mul(65535).round().numpy().astype("<u2")}
+    return as_floats | {"COLOR_0": _linear(colors, opacities)}
 
 
-def _description(arrays: dict[str, np.ndarray], size: int, comments: Sequence[str]) -> dict[str, Any]:
+def _linear(colors: Float[Tensor, "n 3"], opacities: Float[Tensor, "n 1"]) -> np.ndarray:
+    """Convert sRGB to linear light (IEC 61966-2-1), in which glTF stores colours of points and vertices."""
+    linear = torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    return torch.cat([linear, opacities], dim=-1).mul(65535).round().numpy().astype("<u2")
+
+
+def _write_gltf(path: str | Path, arrays: dict[str, np.ndarray], primitive: Any, others: Any, comments: Any) -> None:
+    """Write arrays [item, component] by name: `indices` are triangles, all others attributes of the primitive."""
     accessors: list[dict[str, Any]] = []
     views: list[dict[str, int]] = []
     offset = 0
-    for array in arrays.values():
+    for name, array in arrays.items():
         kind = {"componentType": COMPONENTS[array.dtype.name], "type": TYPES[array.shape[1]]}
         accessors.append({"bufferView": len(views), "count": len(array), **kind})
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": 34962})
-        offset += array.nbytes
+        target = 34963 if name == "indices" else 34962
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target})
+        offset += array.nbytes  # each a multiple of four bytes
     names = {name: index for index, name in enumerate(arrays)}
     positions = arrays["POSITION"]
     accessors[names["POSITION"]] |= {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
     accessors[names["COLOR_0"]] |= {"normalized": True}
-    primitive = {"attributes": names, "mode": 0, "extensions": {EXTENSION: RENDERING}}
-    return {
+    indices = {"indices": names.pop("indices")} if "indices" in names else {}
+    description = {
         "asset": {"version": "2.0", "generator": f"completesplat {__version__}", "extras": {"comments": [*comments]}},
-        "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
+        "meshes": [{"primitives": [{"attributes": names, **indices, **primitive}]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": size}],
+        "buffers": [{"byteLength": offset}],
+        **others,
     }
+    text = json.dumps(description).encode()
+    text += b" " * (-len(text) % 4)
+    content = b"".join(array.tobytes() for array in arrays.values())
+    chunks = [struct.pack("<I4s", len(data), kind) + data for kind, data in ((b"JSON", text), (b"BIN\0", content))]
+    write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + sum(map(len, chunks))) + b"".join(chunks))

@@ -34,11 +34,7 @@ STOPS = [
 
 
 def to_bytes(images: Colors) -> UInt8[np.ndarray, "*batch height width 3"]:
-    """Convert images (sRGB, clamped to [0, 1]) to bytes with the channels last.
-
-    Raises:
-        ValueError: a value is not finite.
-    """
+    """Convert images (sRGB, clamped to [0, 1]) to bytes, channels last; raise ValueError if a value is not finite."""
     if not images.isfinite().all():
         raise ValueError("images hold values that are not finite")
     scaled = images.detach().clamp(0, 1).mul(255).round().to(torch.uint8)

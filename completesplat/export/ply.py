@@ -64,23 +64,21 @@ def read_ply(path: str | Path) -> Gaussians:
         PlyError: `read_vertices` fails, or a value is not finite.
     """
     try:
-        gaussians = _gaussians(read_vertices(path, REQUIRED))
+        vertices = read_vertices(path, REQUIRED)
     except PlyError as error:
         raise PlyError(f"{path}: {error}") from error.__cause__
-    damaged = int((~gaussians.finite()).sum())
-    if damaged:
-        raise PlyError(f"{path}: {damaged} of {gaussians.count} Gaussians are not finite")
-    return gaussians
 
-
-def _gaussians(vertices: np.ndarray) -> Gaussians:
     def gather(names: Sequence[str]) -> Float[Tensor, "gaussian channel"]:
         return torch.from_numpy(np.stack([vertices[name].astype(np.float64) for name in names], axis=-1))
 
-    return Gaussians(
+    gaussians = Gaussians(
         means=gather(MEANS).float(),
         quaternions=gather(QUATERNIONS).float(),
         scales=gather(SCALES).exp().float(),
         opacities=gather(["opacity"])[:, 0].sigmoid().float(),
         colors=(0.5 + SH_C0 * gather(COLORS)).clamp(min=0).float(),
     )
+    damaged = int((~gaussians.finite()).sum())
+    if damaged:
+        raise PlyError(f"{path}: {damaged} of {gaussians.count} Gaussians are not finite")
+    return gaussians

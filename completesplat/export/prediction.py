@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,9 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
-from completesplat.export.formats import write_formats
+from completesplat.export.formats import FORMATS, write_formats
 from completesplat.export.images import (
     SheetCell,
     color_depth,
@@ -23,6 +24,7 @@ from completesplat.export.images import (
     to_bytes,
     write_png,
 )
+from completesplat.export.mesh import check_available
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform
 from completesplat.export.video import Frames, orbit_views, render_views, write_video
@@ -31,11 +33,12 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.geometry.trajectories import PATHS
+from completesplat.metrics.images import psnr
 from completesplat.rasterizers import Rasterizer
 
 DIRECTIONS = 8
 CONVENTIONS = {
-    "axes": "OpenCV: +x right, +y down, +z forward, seen from the reference camera",
+    "axes": "OpenCV's for cameras: +x right, +y down, +z forward; world_to_camera gives the world's",
     "world_to_camera": "4 x 4, rows first; maps homogeneous world points (as columns) to camera points",
     "intrinsics": "3 x 3, rows first, in pixels; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)",
     "image_size": "(height, width) in pixels",
@@ -48,6 +51,9 @@ CONVENTIONS = {
 @dataclass(frozen=True)
 class Wanted:
     """Selection of the files that are written for each prediction.
+
+    Raises:
+        CompleteSplatError: a format or video is unknown, or a format needs a package that is missing.
 
     Args:
         formats: scene formats, from `completesplat.export.formats.FORMATS`; some need the converter.
@@ -64,6 +70,14 @@ class Wanted:
     maps: bool = False
     converter: SplatTransform | None = None
     screen_space_dilation: bool = True
+
+    def __post_init__(self) -> None:
+        for name, chosen, known in (("formats", self.formats, FORMATS), ("video", self.videos, PATHS)):
+            for kind in chosen:
+                if kind not in known:
+                    raise CompleteSplatError(f"{name}={kind}: choose from {', '.join(known)}")
+        if "mesh" in self.formats:
+            check_available()
 
 
 def write_prediction(
@@ -97,7 +111,8 @@ def write_prediction(
     files: dict[str, str] = {}
     for i, scene in enumerate(scenes):
         comments = [*(f"{name} {value}" for name, value in settings.items()), f"sample {i}"]
-        around, depth, written = _write_sample(folder, i, scene, reference, rasterizer, up, wanted, comments)
+        names = f"sample_{i:02}", f"_{i:02}"
+        around, depth, written = write_scene(folder, *names, scene, reference, rasterizer, up, wanted, comments)
         views.append(around)
         depths.append(depth)
         files |= written
@@ -116,51 +131,78 @@ def write_prediction(
 
 
 def write_fitted_scene(
-    folder: Path, name: str, scene: Gaussians, cameras: Cameras, images: Frames, truth: Frames, seed: int
+    folder: Path,
+    name: str,
+    title: str,
+    scene: Gaussians,
+    cameras: Cameras,
+    images: Frames,
+    truth: Frames,
+    seed: int,
+    scale: float = 1.0,
+    up: Sequence[float] = (0.0, -1.0, 0.0),
+    more: Mapping[str, str] | None = None,
 ) -> None:
-    """Write `scene.ply`, `sheet.png` (true and rendered images of at most 8 views) and `scene.json`.
+    """Write `scene.ply`, `sheet.png` (true and rendered images of at most 8 views, with PSNR) and `scene.json`.
 
     Args:
-        scene: in the frame of the first camera, whose image also defines the direction up.
+        title: heading of the sheet; says what the scene was fitted to.
+        scene: in the world of the cameras.
         images, truth: rendered and true images of the cameras.
+        scale: units of the world in one unit of the files.
+        up: direction up in the world.
+        more: other files of the scene by purpose, for `scene.json`.
 
     Raises:
         CompleteSplatError: no Gaussian of the scene can be stored.
     """
-    make_folder(folder.parent)
-    make_folder(folder)
-    stored = with_screen_space_dilation(cleaned(scene, name), cameras[0])
+    stored, reference = in_units(with_screen_space_dilation(cleaned(scene, name), cameras[0]), cameras[0], scale)
     write_ply(folder / "scene.ply", stored, [f"scene {name}"])
     indices = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
     rows = [strip(truth[indices].clamp(0, 1), "true"), strip(images[indices].clamp(0, 1), "fitted")]
-    write_png(folder / "sheet.png", image_sheet([f"view {i}" for i in indices], rows, name))
-    files = {"scene": "scene.ply", "sheet": "sheet.png"}
-    settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True}
-    write_scene_json(folder / "scene.json", cameras[0], settings, seed, files)
+    scores = psnr(images[indices].clamp(0, 1), truth[indices]).tolist()
+    headings = [f"view {i}: {score:.2f} dB" for i, score in zip(indices, scores, strict=True)]
+    write_png(folder / "sheet.png", image_sheet(headings, rows, title))
+    settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True, "up": list(up)}
+    files = {"scene": "scene.ply", "sheet": "sheet.png", **(more or {})}
+    write_scene_json(folder / "scene.json", reference, settings, seed, files)
 
 
-def _write_sample(
+def write_scene(
     folder: Path,
-    index: int,
+    name: str,
+    suffix: str,
     scene: Gaussians,
     reference: Cameras,
     rasterizer: Rasterizer,
     up: Float[Tensor, "3"],
     wanted: Wanted,
     comments: Sequence[str],
+    scale: float = 1.0,
 ) -> tuple[Frames, Float[Tensor, "1 height width"], dict[str, str]]:
-    """Write a sample's splats and videos; return views around it, the first view's depth, and file names by purpose."""
+    """Write a scene's splats (`NAME.ply`, ...), with `scale` units of its world as one, and videos (`orbitSUFFIX.mp4`).
+
+    Returns:
+        Views around the scene, the first view's depth, and file names by purpose.
+    """
     pivot = seen_center(rasterizer, scene, reference)
-    view = PageView(reference, pivot, up, wanted.background)
-    stored = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
-    files = write_formats(folder, f"sample_{index:02}", stored, wanted.formats, view, wanted.converter, comments)
+    dilated = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
+    stored, camera = in_units(dilated, reference, scale)
+    view = PageView(camera, pivot / scale, up, wanted.background)
+    files = write_formats(folder, name, stored, wanted.formats, view, wanted.converter, comments, rasterizer)
     for kind in wanted.videos:
-        files[f"{kind}_{index:02}"] = f"{kind}_{index:02}.mp4"
+        files[f"{kind}{suffix}"] = f"{kind}{suffix}.mp4"
         cameras = PATHS[kind](reference, pivot, up, wanted.frames)
         frames, _ = render_views(rasterizer, scene, cameras, wanted.background)
-        write_video(folder / f"{kind}_{index:02}.mp4", frames)
+        write_video(folder / f"{kind}{suffix}.mp4", frames)
     views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
     return views, depths[0], files
+
+
+def in_units(scene: Gaussians, camera: Cameras, scale: float) -> tuple[Gaussians, Cameras]:
+    """Return a scene and a camera in a unit of `scale` units of their world."""
+    factor = torch.tensor(1 / scale).to(camera.intrinsics)
+    return replace(scene, means=scene.means / scale, scales=scene.scales / scale), camera.scale_world(factor)
 
 
 @torch.no_grad()
@@ -232,11 +274,7 @@ def write_maps(
 def write_scene_json(
     path: str | Path, reference: Cameras, settings: Mapping[str, Any], seed: int, files: Mapping[str, str]
 ) -> None:
-    """Write the scene description as JSON, with the `settings` of the scene and the names of its `files` by purpose.
-
-    Raises:
-        ValueError: a number is not finite, which JSON cannot represent.
-    """
+    """Write a scene's description, `settings` and `files` as JSON; raise ValueError if a number is not finite."""
     scene = {
         "format": "completesplat scene 1",
         "reference_camera": plain_camera(reference),

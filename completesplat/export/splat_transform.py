@@ -39,11 +39,7 @@ class SplatTransform:
     program: str
 
     def convert(self, source: Path, target: Path, options: Sequence[str] = ()) -> None:
-        """Write `target` in the format of its suffix, whole or not at all.
-
-        Raises:
-            CompleteSplatError: the program fails, writes nothing, or takes more than ten minutes.
-        """
+        """Write `target` in its suffix's format, whole or not at all; raise CompleteSplatError if the program fails."""
         with atomic_path(target) as temporary:
             _run([self.program, "--quiet", "--overwrite", *options, str(source), str(temporary)])
             if not temporary.is_file():
@@ -51,11 +47,7 @@ class SplatTransform:
 
 
 def find_splat_transform() -> SplatTransform:
-    """Return the program on PATH, or else that of npm's package, which `npx` downloads once (some 200 MB).
-
-    Raises:
-        CompleteSplatError: there is neither the program nor `npx`, or the program does not start.
-    """
+    """Return the program on PATH or npm's, which `npx` downloads once; raise CompleteSplatError if neither works."""
     program = shutil.which(PROGRAM)
     if program is None:
         npx = shutil.which("npx")

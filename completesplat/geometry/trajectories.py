@@ -34,8 +34,7 @@ def orbit(reference: Cameras, pivot: Vector, up: Vector, frames: int, degrees: f
 def swipe(reference: Cameras, pivot: Vector, up: Vector, frames: int, reach: float = 0.3) -> Cameras:
     """Return cameras that go left, right and back on a level straight line, looking at `pivot`.
 
-    They start at the reference camera (unbatched), slow down towards both ends, and stop one step before the start, so
-    that the video loops smoothly.
+    They start at the reference camera (unbatched), slow down towards both ends, and stop one step before the start.
 
     Args:
         up: the line is orthogonal to it and to the direction of `pivot`.
@@ -49,8 +48,7 @@ def swipe(reference: Cameras, pivot: Vector, up: Vector, frames: int, reach: flo
 def wobble(reference: Cameras, pivot: Vector, up: Vector, frames: int, radius: float = 0.1) -> Cameras:
     """Return cameras on a small circle around the reference camera (unbatched), looking at `pivot`.
 
-    The circle is orthogonal to the direction of `pivot`, begins on the right and goes up first. The last frame stops
-    one step before the start.
+    The circle is orthogonal to the direction of `pivot`, begins right, goes up and ends one step before its start.
 
     Args:
         radius: radius of the circle, as a share of the distance of `pivot`.

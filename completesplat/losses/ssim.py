@@ -18,8 +18,7 @@ def structural_similarity(first: Images, second: Images) -> Images:
     """Return the SSIM of each pixel (Wang et al. 2004), for values in [0, 1], in the images' precision.
 
     The Gaussian window is applied as two products with banded matrices, which are three to five times as fast as
-    convolutions on a CPU. The image is mirrored beyond its border, so it must have more than 5 pixels a side. Only
-    `first` gets gradients.
+    convolutions on a CPU. Images are mirrored at their borders, so sides exceed 5 pixels. Only `first` gets gradients.
     """
     images = max(1, VALUES_AT_ONCE // first.shape[1:].numel()) if first.device.type == "cpu" else max(1, len(first))
     parts = zip(torch.split(first, images), torch.split(second.detach(), images), strict=True)

@@ -15,6 +15,13 @@ class MeanSquaredError:
         return nn.functional.mse_loss(prediction.images, truth.images)
 
 
+class MeanAbsoluteError:
+    """Mean over all pixels, channels and views (3DGS's loss, first term)."""
+
+    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        return nn.functional.l1_loss(prediction.images, truth.images)
+
+
 class StructuralDissimilarity:
     """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term; the paper may mean half of it)."""
 
@@ -27,8 +34,7 @@ class KullbackLeibler:
 
     Stable Diffusion adds 1e-6 times the KL of a latent to the *sum* of the errors over the 3 * H * W values of its
     image (CompVis `ldm/modules/losses/contperceptual.py`). The other terms here are means over values, so the KL is
-    divided by 3 * H * W too: its weight means the same as Stable Diffusion's at every image size. The KL is 0 for a
-    model without a posterior.
+    divided by 3 * H * W too: its weight means the same as Stable Diffusion's at every size. Without posterior it is 0.
     """
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:

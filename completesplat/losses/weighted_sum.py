@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple, Protocol, TypedDict
+from typing import Annotated, Protocol, TypedDict
 
 import torch
 from jaxtyping import Float
@@ -31,16 +31,8 @@ class LossTerm(Protocol):
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]: ...
 
 
-class Weighted(NamedTuple):
-    """Loss term, its weight in the sum, and the optimizer step from which on it counts."""
-
-    weight: float
-    term: LossTerm
-    start_step: int = 0
-
-
 class Term(TypedDict, total=False):
-    """Options of a `Weighted`."""
+    """Loss term, its weight in the sum, and the optimizer step from which on it counts (by default 0)."""
 
     weight: Annotated[float, Range(0)]
     term: LossTerm
@@ -51,16 +43,15 @@ class WeightedSum:
     """Weighted sum of named loss terms.
 
     Args:
-        terms: name -> {weight, term, start_step (default 0)}; an entry is left out if it is None (as in an
-            ablation) or has weight 0.
+        terms: name -> {weight, term, start_step (default 0)}; None (an ablation) or weight 0 leaves it out.
 
     Raises:
         CompleteSplatError: no term counts at step 0.
     """
 
     def __init__(self, terms: Mapping[str, Term | None]) -> None:
-        self.terms = {name: Weighted(**entry) for name, entry in terms.items() if entry and entry["weight"]}
-        if all(entry.start_step > 0 for entry in self.terms.values()):
+        self.terms = {name: entry for name, entry in terms.items() if entry and entry["weight"]}
+        if all(entry.get("start_step", 0) > 0 for entry in self.terms.values()):
             raise CompleteSplatError("no loss at step 0: loss.terms needs a term with start_step=0")
 
     def __call__(
@@ -70,7 +61,7 @@ class WeightedSum:
 
         A term is not computed before its `start_step`.
         """
-        active = {name: entry for name, entry in self.terms.items() if step >= entry.start_step}
-        values = {name: entry.term(prediction, truth) for name, entry in active.items()}
-        total = torch.stack([self.terms[name].weight * value for name, value in values.items()]).sum()
+        active = {name: entry for name, entry in self.terms.items() if step >= entry.get("start_step", 0)}
+        values = {name: entry["term"](prediction, truth) for name, entry in active.items()}
+        total = torch.stack([self.terms[name]["weight"] * value for name, value in values.items()]).sum()
         return total, {name: value.detach() for name, value in values.items()}

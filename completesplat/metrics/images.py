@@ -12,7 +12,7 @@ from completesplat.errors import WeightsError
 from completesplat.losses.lpips import PerceptualDistance, load_heads, load_vgg16
 from completesplat.losses.ssim import structural_similarity
 
-Metric = TypeVar("Metric")
+T = TypeVar("T")
 Images = Float[Tensor, "image 3 height width"]
 PerImage = Float[Tensor, " image"]
 
@@ -32,9 +32,7 @@ class Missing:
         return f"missing: {self.reason}"
 
 
-def unless_missing(
-    weights: str | None, load: Callable[[str], Metric], advice: str, names: tuple[str, ...]
-) -> Metric | Missing:
+def unless_missing(weights: str | None, load: Callable[[str], T], advice: str, names: tuple[str, ...]) -> T | Missing:
     """Load a metric; return `Missing` with `advice` if `weights` is None, or with the error if they are unusable."""
     if weights is None:
         return Missing(advice, names)

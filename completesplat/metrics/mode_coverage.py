@@ -1,7 +1,5 @@
 """Mode coverage of samples, for scenes in which every possible mode is known."""
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
@@ -10,23 +8,6 @@ Samples = Float[Tensor, "sample pixel 3"]
 Modes = Float[Tensor, "mode pixel 3"]
 Probabilities = Float[Tensor, " mode"]
 REJECTED = -1
-
-
-@dataclass(frozen=True)
-class HiddenModeScores:
-    """Scores of one scene's samples.
-
-    `coverage`: share of the modes (of positive probability) that at least one sample belongs to. `total_variation`:
-    half the sum of absolute differences between the samples' shares and the modes' probabilities. Rejected samples are
-    a class of probability 0, so 1 is the worst. A perfect sampler with few samples does not reach 0, so compare with
-    draws from the true distribution. `sharpness`: mean distance of a sample to its nearest mode, divided by that of
-    the modes' mean to its nearest mode (0: exactly modes). `rejected`: share of rejected samples.
-    """
-
-    coverage: float
-    total_variation: float
-    sharpness: float
-    rejected: float
 
 
 def distances(samples: Samples, modes: Modes) -> Float[Tensor, "sample mode"]:
@@ -49,19 +30,26 @@ def mean_of(modes: Float[Tensor, "mode *image _"], probabilities: Float[Tensor, 
     return mean
 
 
-def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> HiddenModeScores:
-    """Score one scene; samples and modes are the region's pixels of all views in one row."""
+def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> dict[str, float]:
+    """Score one scene; samples and modes are the region's pixels of all views in one row.
+
+    `coverage`: share of the modes (of positive probability) that at least one sample belongs to. `total_variation`:
+    half the sum of absolute differences between the samples' shares and the modes' probabilities. Rejected samples are
+    a class of probability 0, so 1 is the worst. A perfect sampler with few samples does not reach 0, so compare with
+    draws from the true distribution. `sharpness`: mean distance of a sample to its nearest mode, divided by that of
+    the modes' mean to its nearest mode (0: exactly modes). `rejected`: share of rejected samples.
+    """
     classes = classify(samples, modes, probabilities)
     shares = torch.stack([(classes == mode).float().mean() for mode in range(len(modes))])
     rejected = (classes == REJECTED).float().mean()
     possible = probabilities > 0
     from_mean = distances(mean_of(modes, probabilities)[None], modes).min()
-    return HiddenModeScores(
-        coverage=(shares[possible] > 0).float().mean().item(),
-        total_variation=0.5 * ((shares - probabilities).abs().sum() + rejected).item(),
-        sharpness=(distances(samples, modes).min(dim=1).values.mean() / from_mean).item(),
-        rejected=rejected.item(),
-    )
+    return {
+        "coverage": (shares[possible] > 0).float().mean().item(),
+        "total_variation": 0.5 * ((shares - probabilities).abs().sum() + rejected).item(),
+        "sharpness": (distances(samples, modes).min(dim=1).values.mean() / from_mean).item(),
+        "rejected": rejected.item(),
+    }
 
 
 def draw_modes(

@@ -38,8 +38,7 @@ class Evaluation:
     """Scores of several predictors over a test set.
 
     Every metric scores each predictor on all pixels (`full`) and on true object pixels (`object`), for the reference
-    view and the novel views apart (CO3D protocol, paper Section 4 and supplement). A scene counts once, even if
-    several processes scored it.
+    view and the novel views apart (CO3D protocol, paper Section 4 and supplement). A scene counts once.
 
     Args:
         samples: number of samples per scene. With more than one, the rows are `model` (the first sample), two oracles
@@ -214,9 +213,7 @@ def proper_scores(images: Samples, truth: Views) -> tuple[Scores, dict[str, list
     return scores, ranks
 
 
-def novel_values(
-    images: Samples, truth: Views
-) -> dict[str, tuple[Float[Tensor, "sample value"], Float[Tensor, " value"]]]:
+def novel_values(images: Samples, truth: Views) -> dict[str, tuple[Float[Tensor, "sample n"], Float[Tensor, " n"]]]:
     """Return the values of the samples and the true values by region; the first view of `truth` is the reference.
 
     Regions are all pixels (`full`) and, if true depth is known, those that the reference view does not show (`hidden`).
@@ -233,9 +230,7 @@ def _region(images: Tensor, truth: Views, region: str) -> Tensor:
     return object_only(images, truth.masks) if region == "object" else images
 
 
-def depth_errors(
-    predicted: Depths, true: Depths, valid: Bool[Tensor, "image 1 height width"]
-) -> list[dict[str, float] | None]:
+def depth_errors(predicted: Depths, true: Depths, valid: Bool[Tensor, "image 1 _ _"]) -> list[dict[str, float] | None]:
     """Return each image's errors over valid pixels with finite, positive true depth, without aligning the scale.
 
     `abs_rel`: mean of |predicted - true| / true; `rmse`: in the depth's unit; `delta1`: share of pixels where

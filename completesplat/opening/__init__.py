@@ -44,8 +44,7 @@ from completesplat.weights import (
 )
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
-SECTIONS = ["model", "data"]
-"""Sections of a run's config that are read."""
+SECTIONS = ["model", "data"]  # sections of a run's config that are read
 ONLY_FOR_TRAINING = (
     "model.autoreconstructor_checkpoint",
     "model.checkpoint",
@@ -139,11 +138,7 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
 
 
 def architecture_of_run(checkpoint: Path) -> tuple[dict[str, Any], str]:
-    """Return the config of a run's model, and the prefix of its tensors in the run's checkpoints.
-
-    Raises:
-        WeightsError: the config cannot be read, its model makes no scene from an image, or `check_architecture` fails.
-    """
+    """Return a run's model config, and its tensors' prefix in checkpoints; raise WeightsError if it cannot be used."""
     path, config = _read(checkpoint)
     plain = _plain(config)
     model, target = plain["model"], str(plain["model"].get("_target_"))

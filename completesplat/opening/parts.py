@@ -47,8 +47,7 @@ PARTS: dict[str, tuple[type, ...]] = {
     "scheduler": (DDIMScheduler, DPMSolverMultistepScheduler, FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler),
 }
 NETWORKS = ("autoreconstructor", "conditioning", "denoiser", "network")
-PartConfig = Mapping[str, object]
-"""Config of a part: `_target_`, and arguments."""
+PartConfig = Mapping[str, object]  # config of a part: `_target_`, and arguments
 
 
 class TrainingImages(TypedDict, total=False):
@@ -122,11 +121,7 @@ def settings_of(kind: Any) -> dict[str, Any]:
 
 
 def read_architecture(path: Path) -> dict[str, Any]:
-    """Read the `config.json` of weights.
-
-    Raises:
-        WeightsError: the config cannot be read, or `check_architecture` refuses it.
-    """
+    """Read the `config.json` of weights; raise WeightsError if this fails or `check_architecture` refuses it."""
     try:
         architecture = json.loads(read_small(path))
     except (ValueError, RecursionError) as error:
@@ -143,11 +138,7 @@ def untrained(part: Any) -> Any:
 
 
 def check_architecture(architecture: object, file: Path | None = None) -> None:
-    """Check a config against `PARTS`, the signatures of these classes, and the bounds in their annotations.
-
-    Raises:
-        WeightsError: a setting does not fit; the message names the file, if it is given, and the first such setting.
-    """
+    """Raise WeightsError, naming `file`, for the first setting that `PARTS` or the signatures of its classes refuse."""
     settings = architecture if isinstance(architecture, Mapping) else {}
     hints = ONE_ANSWER if "network" in settings else DRAWING
     try:
@@ -189,11 +180,7 @@ def build(part: PartConfig) -> Any:
 
 
 def check_sizes(architecture: Mapping[str, PartConfig], tensors: Mapping[str, Tensor], files: tuple[str, str]) -> None:
-    """Compare the networks' tensors with those in a file; `files` names the tensors' file and the config's.
-
-    Raises:
-        WeightsError: a tensor is missing, or has another size.
-    """
+    """Raise WeightsError if a tensor is missing or has another size; `files` names the tensors' and the config's."""
     with torch.device("meta"):  # tensors with sizes but without memory
         networks = nn.ModuleDict({name: build(architecture[name]) for name in NETWORKS if name in architecture})
     for name, value in networks.state_dict().items():

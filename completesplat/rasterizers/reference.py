@@ -20,8 +20,7 @@ class ReferenceRasterizer:
     """Rasterizer that evaluates every Gaussian at every pixel, which suits tests and small scenes only.
 
     Gradients reach all parameters of the Gaussians and the cameras. Gaussians that are culled, not finite, or so
-    large or far aside that their projection overflows are left out before anything is computed, so their
-    gradients are zero, never NaN.
+    large or far aside that their projection overflows are left out first, so their gradients are zero.
     """
 
     def __init__(self, constants: RenderingConstants | None = None) -> None:
@@ -39,7 +38,7 @@ class ReferenceRasterizer:
         The backward pass computes intermediate results again. Memory thus does not grow with the number of pixels, and
         computing results twice in the cache is faster than reading them from memory once.
         """
-        visible, depth_order = visible_in_depth_order(gaussians, camera, self.constants)
+        visible, depth_order = visible_by_depth(gaussians, camera, self.constants)
         chosen = gaussians[visible][depth_order]
         centers, depths, covariances = project_gaussians(chosen, camera, self.constants)
         values = torch.cat([chosen.colors, depths[:, None], torch.ones_like(depths)[:, None]], dim=-1)
@@ -55,9 +54,7 @@ class ReferenceRasterizer:
         return composite(alphas, self.constants).mT @ values
 
 
-def visible_in_depth_order(
-    gaussians: Gaussians, camera: Cameras, constants: RenderingConstants
-) -> tuple[Tensor, Tensor]:
+def visible_by_depth(gaussians: Gaussians, camera: Cameras, constants: RenderingConstants) -> tuple[Tensor, Tensor]:
     """Return a mask of the Gaussians that can be drawn, and the order of those by depth (ties keep their order)."""
     with torch.no_grad():
         centers, depths, covariances = project_gaussians(gaussians, camera, constants)

@@ -90,12 +90,10 @@ class _Rasterize(torch.autograd.Function):
     """Map (size, constants, means, quaternions, scales, opacities, colors, world_to_camera, intrinsics) to images."""
 
     @staticmethod
-    def forward(
-        ctx: Any, image_size: tuple[int, int], constants: RenderingConstants, *tensors: Tensor
-    ) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, size: tuple[int, int], constants: RenderingConstants, *tensors: Tensor) -> tuple[Tensor, ...]:
         parameters = Parameters(*_arrays([tensor.detach().contiguous() for tensor in tensors[:5]]))
-        cameras = pack_cameras(Cameras(tensors[5], tensors[6], image_size), constants.frustum_margin)
-        drawing = Drawing(parameters, cameras, image_size, constants, keep=any(ctx.needs_input_grad))
+        cameras = pack_cameras(Cameras(tensors[5], tensors[6], size), constants.frustum_margin)
+        drawing = Drawing(parameters, cameras, size, constants, keep=any(ctx.needs_input_grad))
         images = tuple(torch.from_numpy(image) for image in drawing.draw())
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*tensors, *images)

@@ -31,7 +31,7 @@ ALIKE = ["name", "data_set", "subset", "split", "resolution", "crop", "backgroun
 ALIKE += ["views", "protocol_views", "scene_list"]
 """Entries of the protocol that are equal in all rows of a table, as are the data and the settings of the metrics."""
 DESCRIBED = [*ALIKE, "image_size", "scenes_listed", "samples", "criterion", "seed", "sampler", "steps", "skip_weight"]
-DESCRIBED += ["guidance_weight", "color_fits", "ema", "commit", "frame", "align"]
+DESCRIBED += ["guidance_weight", "color_fits", "ema", "commit", "frame", "align", "fitted_to"]
 """Entries of the protocol that the note on a row states."""
 COLUMNS = [f"full_novel_{name}" for name in METRICS]
 COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips")] + ["full_reference_psnr"]

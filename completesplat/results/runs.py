@@ -115,11 +115,7 @@ def find(folder: Path) -> RunTree:
 
 
 def _result(path: Path, root: Path) -> Result:
-    """Read a file of results.
-
-    Raises:
-        ValueError: the file is unusable, with the reason.
-    """
+    """Read a file of results; raise ValueError, with the reason, if it is unusable."""
     content = read_mapping(path)
     if not content:
         raise ValueError("it cannot be read as a mapping in JSON")

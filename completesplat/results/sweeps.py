@@ -37,7 +37,6 @@ CAPTION = (
     "Mean ± sample standard deviation over seeds; PSNR in dB. "
     f"The best of our rows is in bold, the second best underlined. {SSIM_NOTE}"
 )
-NOTHING = "No job of this sweep has finished."
 PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
 IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
 ALWAYS = ["full_novel_psnr", "full_novel_ssim", "object_novel_psnr", "object_novel_ssim", "full_reference_psnr"]
@@ -151,7 +150,7 @@ def summarize(*folders: Path) -> tuple[list[SweepRow], Table]:
         identity = [Cell("" if value is None else str(value)) for value in (row.label, row.seeds, row.scenes)]
         body.append(TableRow("naive" if row.seeds is None else "ours", [*identity, *cells]))
     headings = [Heading("ablation", figures=False), Heading("seeds"), Heading("scenes"), *map(score_heading, names)]
-    remarks = [CAPTION if rows else NOTHING, *_remarks(jobs, rows)]
+    remarks = [CAPTION if rows else "No job of this sweep has finished.", *_remarks(jobs, rows)]
     return rows, Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
 
 

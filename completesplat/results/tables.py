@@ -179,6 +179,8 @@ def _written(value: object) -> str:
 
 def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
     """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks."""
+    from completesplat.metrics.images import PSNR_LIMIT
+
     records: list[Mapping[str, object]] = []
     for predictor, entry in results.items():
         scores = flat(entry)
@@ -194,7 +196,10 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
         columns.append((f"{LABELS[region]}\n{view}\n{METRICS[kind]}", name, FORMATS[kind]))
     first = records[0]
     result = table(f"{first['scenes']} scenes, {first['views']} novel views", columns, records)
-    return replace(result, remarks=[SSIM_NOTE])
+    fitted = [f"{name}: fitted to {entry['fitted_to']}." for name, entry in results.items() if entry.get("fitted_to")]
+    same = format(PSNR_LIMIT, FORMATS["psnr"])
+    rows = [[Cell("the same image") if cell.text == same else cell for cell in row.cells] for row in result.rows]
+    return replace(result, rows=[TableRow("", cells) for cells in rows], remarks=[*fitted, SSIM_NOTE])
 
 
 def show(*tables: Table, width: int = 120) -> None:

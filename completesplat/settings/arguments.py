@@ -16,8 +16,8 @@ EXPORT = "--export"
 WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--info", "-i", "--config-dir", "-cd")
 """Hydra's flags that take the next argument as their value."""
 SWEEP = ("-m", "--multirun")
-WORDS = {"predict": ("image",), "view": ("path",), "new": ("kind", "name")}
-"""By verb, the settings whose values are given as words without `=`."""
+WORDS = {"predict": ("image",), "view": ("path",), "new": ("kind", "name"), "data import": ("folder",)}
+"""By verb, or verb and task, the settings whose values are given as words without `=`."""
 MOST_SHOWN = 120  # characters of a value
 
 
@@ -58,8 +58,8 @@ def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
     """Return flags and settings as Hydra reads them, the flags first.
 
-    `data TASK` is short for `data_task=TASK`, `predict A B` for `image=[A,B]`, `view PATH` for `path=PATH`, and
-    `new KIND NAME` for `kind=KIND name=NAME`. The name of an existing file or folder is taken literally: `a,b.jpg`.
+    `data import DIR` is short for `data_task=import folder=DIR`, `predict A B` for `image=[A,B]`, `view PATH` for
+    `path=PATH`, and `new KIND NAME` for `kind=KIND name=NAME`. An existing file's name is taken literally: `a,b.jpg`.
 
     Raises:
         CompleteSplatError: a flag lacks its value, there are too many words, a setting is given as a word and by `=`, a
@@ -69,7 +69,8 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
     if verb in WORDS:
         others = _with_words(verb, others)
     elif verb in TASKS and others and "=" not in others[0]:
-        others = [f"{verb}_task={others[0]}", *others[1:]]
+        task, words = f"{verb} {others[0]}", others[1:]
+        others = [f"{verb}_task={others[0]}", *(_with_words(task, words) if task in WORDS else words)]
     settings = [_with_file(argument) for argument in others]
     for argument in settings:
         _refuse_unreadable(argument, any(flag in SWEEP for flag in flags))

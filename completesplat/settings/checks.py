@@ -133,7 +133,7 @@ def check_verb(verb: str, config: DictConfig) -> None:
 
 def check_parts(config: Container, place: str = "") -> None:
     """Check each mapping with a `_target_`, and all below it, against the arguments of that class or function."""
-    hints, complete = _arguments(config)
+    hints, complete = part_arguments(config)
     name: Any
     for name in config if isinstance(config, DictConfig) else range(len(config)):
         if OmegaConf.is_missing(config, name):
@@ -154,7 +154,7 @@ def check_parts(config: Container, place: str = "") -> None:
             check_parts(value, key)
 
 
-def _arguments(config: Container) -> tuple[Mapping[str, object], bool]:
+def part_arguments(config: Container) -> tuple[Mapping[str, object], bool]:
     """Return a part's `arguments_of`, or none if it cannot be imported, because building the part reports that."""
     try:
         target = config.get("_target_") if isinstance(config, DictConfig) else None

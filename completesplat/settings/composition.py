@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import cast
 
@@ -21,7 +22,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.arguments import for_hydra
-from completesplat.settings.options import conf_folder, did_you_mean, gsplat_constants, options
+from completesplat.settings.checks import part_arguments
+from completesplat.settings.options import LEAST_LIKE, conf_folder, did_you_mean, gsplat_constants, options, search
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 NOT_THERE = re.compile(r"Could not override '([^']+)'")
@@ -98,10 +100,25 @@ def _misspelt(error: Exception, verb: str, arguments: Sequence[str]) -> str | No
         config = _composed(verb, settings)
     except Exception:  # another argument is wrong, too
         config = _composed(verb)
-    names = set(_keys(config))
-    nearest = did_you_mean(key, {name for name in names if name.count(".") == key.count(".")})
-    hint = f"; completesplat {verb} --help shows those that there are, and +{key}=VALUE adds one"
-    return f"no setting {key!r} of completesplat {verb}{nearest or did_you_mean(key, names) or hint}"
+    nearest = _nearest(verb, key, [name for name in _keys(config) if not name.startswith("task.")])
+    above, _, last = key.rpartition(".")
+    parent = OmegaConf.select(config, above, throw_on_resolution_failure=False) if above else None
+    if isinstance(parent, DictConfig) and (last in part_arguments(parent)[0] or not (nearest or "_target_" in parent)):
+        nearest = f"; +{key}=VALUE adds it"
+    hint = f"; completesplat {verb} --help shows those that there are, --help WORD searches them"
+    return f"no setting {key!r} of completesplat {verb}{nearest or hint}"
+
+
+def _nearest(verb: str, key: str, names: Sequence[str]) -> str:
+    """Return an ending for a message about an unknown key: settings near its last name, or that `search` finds."""
+    top, last, lasts = key.partition(".")[0], key.rpartition(".")[2], {name: name.rpartition(".")[2] for name in names}
+    known = set(lasts.values())
+    close = [last] if last in known else get_close_matches(last, known, cutoff=LEAST_LIKE)
+    likely = [name for near in close for name in names if lasts[name] == near]
+    likely = likely or [setting.key for setting, _, _ in search(verb, None, [last]) if setting.key in lasts]
+    likely = [name for name in likely if name.startswith(f"{top}.")] or likely
+    nearest = get_close_matches(key, likely, cutoff=LEAST_LIKE) or likely[:3]
+    return f"; did you mean {' or '.join(nearest)}?" if nearest else ""
 
 
 def _keys(config: DictConfig, place: str = "") -> Iterator[str]:

@@ -4,6 +4,7 @@ import inspect
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from importlib import import_module
 
 from omegaconf import OmegaConf
@@ -11,6 +12,7 @@ from omegaconf import OmegaConf
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.checks import VERBS
 from completesplat.settings.options import (
+    REFERRING,
     TASKS,
     Choice,
     Setting,
@@ -20,6 +22,7 @@ from completesplat.settings.options import (
     did_you_mean,
     options,
     read,
+    search,
     settings_of_option,
     settings_of_verb,
     with_bases,
@@ -35,10 +38,10 @@ ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {6,}\S.*)*)", re.MULTILINE)
 
 
 def page(verb: str, arguments: Sequence[str]) -> str:
-    """Return the help text of a verb, of one of its tasks (`data toy --help`) or groups (`fit --help data`).
+    """Return the help text of a verb, a task (`data toy --help`), a group (`fit --help data`), or of words to search.
 
     Raises:
-        CompleteSplatError: there is no such task or group.
+        CompleteSplatError: no setting has the words in its name or comment.
     """
     words = [argument for argument in arguments if argument not in FLAGS and not argument.startswith("-")]
     task = None
@@ -50,9 +53,8 @@ def page(verb: str, arguments: Sequence[str]) -> str:
         group, _, option = word.partition("=")
         if group in groups and group != "hydra":
             return part_page(verb, groups[group], option or groups[group].option)
-        if "=" not in word:
-            tasks = options(f"{verb}_task") if verb in TASKS else []
-            raise CompleteSplatError(f"nothing to say on {word!r}{did_you_mean(word, [*groups, *tasks])}")
+    if wanted := [word for word in words if "=" not in word]:
+        return search_page(verb, task, wanted)
     header = str(OmegaConf.load(conf_folder() / f"{verb}.yaml").hydra.help.header).strip()
     return "\n\n".join([header, *_body(verb, task)])
 
@@ -70,15 +72,25 @@ def _body(verb: str, task: str | None) -> Iterator[str]:
         keys = [entry.place if entry.option == "null" else f"{entry.place}={entry.option}" for entry in choices]
         rows = [(key, _about(choice, about)) for key, choice in zip(keys, choices, strict=True)]
         yield _table(f"Parts (group=option chooses; completesplat {command} --help GROUP shows one):", rows)
-    yield "A sweep over values: -m key=a,b. Lists and values with spaces want the shell's quotes: 'key=[a,b]'."
+    yield f"A setting by its name or comment: completesplat {command} --help WORD. A sweep over values: -m key=a,b."
+    yield "Lists and values with spaces want the shell's quotes: 'key=[a,b]'."
+
+
+def search_page(verb: str, task: str | None, words: Sequence[str]) -> str:
+    """Return the help text of the settings that `search` finds; raise CompleteSplatError if there are none."""
+    own, rows = _hints(verb, task), []
+    for setting, part, option in search(verb, task, words):
+        key, text = _part_line(setting, part) if part else _line(setting, own.get(setting.key), {}, verb)
+        rows.append((key, text + option))
+    if not rows:
+        known = {setting.key.rpartition(".")[2] for setting, _, _ in search(verb, task, [])}
+        known |= {choice.place for choice in choices_of_verb(verb, task)} | set(options(f"{verb}_task"))
+        raise CompleteSplatError(f"nothing to say on {' '.join(words)!r}{did_you_mean(words[0], sorted(known))}")
+    return _table(f"Settings of completesplat {verb} on {' '.join(words)} (key=value):", rows)
 
 
 def part_page(verb: str, choice: Choice, option: str) -> str:
-    """Return the help text of one option of a group.
-
-    Raises:
-        CompleteSplatError: the group has no option of this name.
-    """
+    """Return the help text of one option of a group; raise CompleteSplatError if the group has no such option."""
     known = options(choice.group)
     if option == "null":
         message = f"{choice.place}: {_about(choice, about_groups())}"
@@ -88,16 +100,9 @@ def part_page(verb: str, choice: Choice, option: str) -> str:
         raise CompleteSplatError(f"no {choice.group} {option!r}: there are {', '.join(known)}{nearest}")
     place = None if choice.place == choice.group else choice.place
     settings = settings_of_option(choice.group, option, place)
-    targets = {key.removesuffix("._target_"): value for key, value, _ in settings if key.endswith("._target_")}
-    arguments = {key: _of_target(target) for key, target in targets.items()}
-    rows = []
-    for setting in settings:
-        above, _, name = setting.key.rpartition(".")
-        if not name.startswith("_") and not re.fullmatch(r"\$\{\w+\}", setting.value):
-            hints, documented = arguments.get(above, ({}, {}))
-            rows.append(_line(setting, hints.get(name), documented))
+    rows = [_part_line(each, settings) for each in settings if not REFERRING.search(f"{each.key}={each.value}")]
     about = with_bases(choice.group, option).about.strip()
-    made = [f"Made by {target}." for key, target in targets.items() if key == choice.place]
+    made = [f"Made by {value}." for key, value, _ in settings if key == f"{choice.place}._target_"]
     parts = [_table(f"{choice.place}={option}" + (f"\n{_wrapped(about)}" if about else ""), rows), *made]
     return "\n\n".join([*parts, _wrapped(f"Others: {', '.join(known)}")])
 
@@ -120,6 +125,7 @@ def _hints(verb: str, task: str | None) -> Mapping[str, object]:
     return _of_target(named.get("task._target_", ""))[0]
 
 
+@cache
 def _of_target(target: str) -> tuple[Mapping[str, object], Mapping[str, str]]:
     """Return annotations and descriptions (from docstrings) of a class's or function's arguments, by name."""
     module, _, name = target.rpartition(".")
@@ -133,6 +139,14 @@ def _of_target(target: str) -> tuple[Mapping[str, object], Mapping[str, str]]:
         for names, text in ENTRY.findall(inspect.cleandoc(kind.__doc__ or "")):
             descriptions = {argument: " ".join(text.split()) for argument in names.split(", ")} | descriptions
     return hints, descriptions
+
+
+def _part_line(setting: Setting, settings: Iterable[Setting]) -> tuple[str, str]:
+    """Return the line of a setting of a part, whose `settings` name the class or function that takes it."""
+    above, _, name = setting.key.rpartition(".")
+    target = next((value for key, value, _ in settings if key == f"{above}._target_"), "")
+    hints, documented = _of_target(target)
+    return _line(setting, hints.get(name), documented)
 
 
 def _line(setting: Setting, hint: object, documented: Mapping[str, str], verb: str = "") -> tuple[str, str]:

@@ -5,8 +5,9 @@ A comment above a key or behind its value explains the key; the first comment of
 
 import re
 import runpy
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from difflib import get_close_matches
+from functools import cache
 from importlib.util import find_spec
 from itertools import takewhile
 from pathlib import Path
@@ -17,9 +18,9 @@ import yaml
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 NAMED = re.compile(r"^\| (`[^|]*`) \| ([^|]*) \|$", re.MULTILINE)
 PACKAGE = "# @package "
-TASKS = ("data", "bench", "report")
-"""Verbs with several tasks: `data toy` is short for `data data_task=toy`."""
+TASKS = ("data", "bench", "report")  # verbs with several tasks: `data toy` is short for `data data_task=toy`
 LEAST_LIKE = 0.7
+REFERRING = re.compile(r"\._\w+_=|=\$\{\w+\}$")  # `_target_` and the like, or a reference to a part
 
 
 class Setting(NamedTuple):
@@ -78,17 +79,14 @@ def about_groups() -> dict[str, str]:
 
 
 def read(name: str) -> ConfFile:
-    """Read a file of `conf/` by its name without suffix: `fit`, `data/toy_objects`.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-    """
+    """Read a file of `conf/` by its name without suffix (`data/toy_objects`); raise FileNotFoundError if missing."""
     for folder in folders():
         if (folder / f"{name}.yaml").is_file():
             return parse((folder / f"{name}.yaml").read_text(encoding="utf-8"))
     raise FileNotFoundError(name)
 
 
+@cache
 def parse(text: str) -> ConfFile:
     """Parse the text of a file."""
     lines = text.splitlines()
@@ -150,6 +148,23 @@ def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
     settings = [*own_settings(with_bases("", verb), without)]
     settings += [] if task is None else own_settings(with_bases(f"{verb}_task", task), without)
     return list({setting.key: setting for setting in settings}.values())
+
+
+def search(verb: str, task: str | None, words: Sequence[str]) -> list[tuple[Setting, list[Setting], str]]:
+    """Return settings with all the words, those with the words in their names first.
+
+    Each entry has the settings of its part, and ends with its option, unless that is the default.
+    """
+    entries = [(setting, list[Setting](), "") for setting in settings_of_verb(verb, task)]
+    for group, place, default, _ in choices_of_verb(verb, task):
+        for option in sorted(options(group), key=lambda name: name != default):
+            if with_bases(group, option).package != "_global_":  # else it sets what others define
+                part = settings_of_option(group, option, None if place == group else place)
+                entries += [(setting, part, "" if option == default else f" ({place}={option})") for setting in part]
+    once = {entry[0].key: entry for entry in entries[::-1] if not REFERRING.search(f"{entry[0].key}={entry[0].value}")}
+    patterns = [re.compile(rf"(?<![^\W_]){re.escape(word).replace('_', '[_ ]')}", re.IGNORECASE) for word in words]
+    found = [e for e in reversed(once.values()) if all(x.search(f"{e[0].key}: {e[0].comment}") for x in patterns)]
+    return sorted(found, key=lambda entry: not all(x.search(entry[0].key) for x in patterns))
 
 
 def with_bases(group: str, option: str) -> ConfFile:

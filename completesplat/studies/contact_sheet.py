@@ -179,8 +179,7 @@ def _extent(points: Points) -> float:
 def show(sequences: Sequence[PosedSequence], path: Path, images: int, title: str) -> None:
     """Write a PNG with a row for each sequence: some images, and its cameras from above and from the side.
 
-    The images are evenly spaced from the first to the last frame. An unreadable image becomes a grey cell with the
-    kind of its `DataError`.
+    The images are evenly spaced from first to last frame. An unreadable image is a grey cell with the error's kind.
     """
     rows = [_row(sequence, images) for sequence in sequences]
     header = Image.new("RGB", (rows[0].width, MARGIN + 100), PAPER)

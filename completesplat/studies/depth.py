@@ -14,8 +14,7 @@ from completesplat.studies.samples import SampleRenderer, farthest, near
 def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tensor, "*view 1 height width"]:
     """Return the standard deviation of the depth over those samples that have one (more than 0) at a pixel.
 
-    Its square is the unbiased variance, so pixels with different numbers of samples compare. It is NaN where fewer
-    than two samples have a depth.
+    Its square is the unbiased variance, so pixels with different counts compare. It is NaN with fewer than two depths.
     """
     known = depth > 0
     count = known.sum(0)
@@ -82,11 +81,9 @@ def strips(renderer: SampleRenderer, scenes: Scenes, skip_weight: float, guidanc
     return rows
 
 
-def color_deviation(
-    deviation: Float[Tensor, "view 1 height width"],
-) -> tuple[Float[Tensor, "view 3 height width"], float]:
+def color_deviation(maps: Float[Tensor, "view 1 height width"]) -> tuple[Float[Tensor, "view 3 height width"], float]:
     """Return colours (dark for 0, grey for NaN, one scale for all views) and the scale's end, the 98 % quantile."""
-    known = deviation.isfinite()
-    end = deviation[known].quantile(0.98).item() if known.any() else 0.0
-    colors = ramp(torch.where(known, deviation, 0) / max(end, 1e-12))
+    known = maps.isfinite()
+    end = maps[known].quantile(0.98).item() if known.any() else 0.0
+    colors = ramp(torch.where(known, maps, 0) / max(end, 1e-12))
     return torch.where(known, colors, NOTHING), end

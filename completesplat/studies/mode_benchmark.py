@@ -1,7 +1,7 @@
 """Benchmark of content that the reference view hides: samples against all possible modes."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -107,7 +107,7 @@ REGIONS = ("hidden", "visible")
 class Measured:
     """Measurements of the scenes so far, in the views that show the modes.
 
-    `scores` has each scene's `HiddenModeScores` and energy scores (of pixels that the reference hides, and of the
+    `scores` has each scene's `mode_coverage.scores` and energy scores (of pixels that the reference hides, and of the
     others) by method, `classes` the modes of all samples by method and probabilities, `rows` the rows of the figure.
     """
 
@@ -119,7 +119,7 @@ class Measured:
     def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
         """Add the scores of renders of the views that show the modes."""
         pixels, modes = in_region(images, scene.region), in_region(scene.truths, scene.region)
-        figures: dict[str, float | None] = asdict(scores(pixels, modes, scene.probabilities))
+        figures: dict[str, float | None] = dict(scores(pixels, modes, scene.probabilities))
         alike = self.classes.setdefault(method, {}).setdefault(tuple(scene.probabilities.tolist()), [])
         alike.append(classify(pixels, modes, scene.probabilities))
         unseen, truth = scene.unseen[list(scene.views)], scene.truths[scene.true_mode]
@@ -185,8 +185,7 @@ def measure(
     """Score all predictors on all scenes; the seed of a scene is that of the scene before it plus one.
 
     Two predictors that know all modes are added: `true_sampler` draws by their probabilities, `mean_predictor` repeats
-    their mean. The other scene for a predictor is the previous one (for the first, the last). The figure shows samples
-    of `model`.
+    their mean. The other scene for a predictor is the previous one (for the first, the last). The figure shows `model`.
     """
     measured = Measured()
     for index, scene in enumerate(progress(scenes)):

@@ -44,8 +44,8 @@ def rows(model: CompleteSplat, scenes: Sequence[SceneBatch], draws: int, seed: i
     modes: with four modes, 0.25 in pure noise and 1 without noise. The denoiser's clean estimate is projected onto
     combinations of the modes' latents with weights of sum 1; `denoiser_share` is the true mode's weight. Where it is
     lower than `best_share`, the denoiser blends the modes.
-    `training_share` is the share of training's timesteps between the previous level and this one, `steps` the number of
-    the sampler's timesteps there.
+    `training_share` is the share of training's timesteps from the previous level to this one, `steps` the sampler's
+    there.
     """
     total = model.sampler.training_timesteps
     timesteps = [round(level * total) for level in LEVELS]
@@ -69,9 +69,8 @@ def rows(model: CompleteSplat, scenes: Sequence[SceneBatch], draws: int, seed: i
 
 def standardised(model: CompleteSplat, versions: SceneBatch) -> Posterior:
     """Return the posteriors [mode] of a scene in all its modes, given all views, in the denoiser's units."""
-    posterior, _ = model.autoreconstructor.posterior(
-        versions.reference.images, versions.all_views(), versions.depth_range
-    )
+    images, views = versions.reference.images, versions.all_views()
+    posterior, _ = model.autoreconstructor.posterior(images, views, versions.depth_range)
     return Posterior(model.standardised(posterior.mean), posterior.log_variance - 2 * model.latent_std.log())
 
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import DataError
-from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.images import PSNR_LIMIT
@@ -41,18 +40,11 @@ class SampleRenderer:
         """Composite a rendering over the background and clip it to [0, 1]."""
         return rendering.over(self.background).clamp(0, 1)
 
+    @torch.no_grad()
     def render(self, scene: SceneBatch, **settings: Any) -> Rendering:
         """Render colour, depth and opacity [sample view] of one scene (a batch of one); settings are `generate`'s."""
-        return self.rasterize(self.generate(scene, **settings), scene)
-
-    def generate(self, scene: SceneBatch, **settings: Any) -> Gaussians:
-        """Draw samples of one scene; a `seed` in the settings replaces the renderer's."""
         inputs = scene.reference.images, scene.reference.cameras, scene.depth_range
-        return self.model.generate(*inputs, **{"samples": self.samples, "seed": self.seed, **settings})
-
-    @torch.no_grad()
-    def rasterize(self, gaussians: Gaussians, scene: SceneBatch) -> Rendering:
-        """Render the samples of one scene in the reference view and all targets."""
+        gaussians = self.model.generate(*inputs, **{"samples": self.samples, "seed": self.seed, **settings})
         cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(len(gaussians.means), *tensor.shape[1:]))
         return self.rasterizer(gaussians, cameras)
 

@@ -55,8 +55,7 @@ class BadSteps(Callback):
 
     A skipped step does not change weights, their averages or the optimizer's state. It counts as a step of the run, so
     the schedule and the order of the data continue. All processes skip the same steps. Progress bar and loggers get the
-    number of skipped steps as `train/bad_steps`. With `trainer.precision=16-mixed` it includes the first steps, which
-    search for the scale of the loss.
+    number of skipped steps as `train/bad_steps`. With 16-mixed, it includes the first ones, which find the loss scale.
 
     Args:
         most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row, or if it skips all steps.

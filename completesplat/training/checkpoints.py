@@ -60,13 +60,10 @@ class Checkpoints(Checkpoint):
     hard link). A run that is killed at any moment leaves a whole `last.ckpt`. The checkpoint before it stays as
     `previous.ckpt` until the end of training.
 
-    Loggers get the rows of a step and of its validation after the last callback of the step. The file is therefore
-    written before the next batch, with the loops' state at the end of the step (also at the end of training, which
-    Lightning counts as the end of an epoch), so that a resumed run lacks no row. The file also holds the figures that
-    were logged so far, because the end of a run reports them.
+    Loggers get the rows of a step after its last callback, so the file is written before the next batch, with the
+    loops' state at the end of the step. It also holds the figures so far, because the end of a run reports them.
 
-    During training, signals are only recorded. After the step in which any process got one, all processes save and end
-    with `Interrupted`.
+    During training, signals are only recorded. After the step in which a process got one, all end with `Interrupted`.
 
     Args:
         every_n_train_steps, every_minutes: optimizer steps or minutes between checkpoints; None: ignored.

@@ -20,7 +20,7 @@ from torch import nn
 from completesplat import __version__
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.data.loading.distributed import gathered, is_first, processes
+from completesplat.data.loading.distributed import gathered, processes
 from completesplat.data.loading.latent_cache import (
     CHECKSUMS,
     ArrayWriter,
@@ -60,11 +60,9 @@ def fingerprint(module: nn.Module) -> str:
     return digest.hexdigest()
 
 
-def fingerprints(
-    autoreconstructor: VariationalAutoReconstructor, conditioning: nn.Module | None
-) -> tuple[str, str | None]:
+def fingerprints(model: VariationalAutoReconstructor, conditioning: nn.Module | None) -> tuple[str, str | None]:
     """Return the fingerprint of all weights that latents depend on, and that of a frozen conditioning, else None."""
-    encoder, views = autoreconstructor.encoder, autoreconstructor.view_encoder
+    encoder, views = model.encoder, model.view_encoder
     latents = fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
     return latents, fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
 
@@ -164,7 +162,7 @@ def encode_training_set(
     _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
     sequences: list[CachedSequence] = []
     batches = _encoded_batches(_references(source, frames, sequences, progress), load, encode, batch_size)
-    if is_first():
+    if processes()[0] == 0:
         _write_store(out, origin, blank, batches, sequences)
     else:
         deque(batches, maxlen=0)
@@ -185,7 +183,7 @@ def _references(
 ) -> Iterator[Reference]:
     """Yield all references in the order of rows; append each sequence to `sequences` before its references."""
     rows = 0
-    for name in track(source.names, "encoding sequences", disable=not (progress and is_first())):
+    for name in track(source.names, "encoding sequences", disable=not progress or processes()[0] > 0):
         sequence = source.read(name)
         places = spread_places(len(sequence.frames), frames)
         sequences.append(CachedSequence(name, len(sequence.frames), rows, tuple(places)))

@@ -156,7 +156,7 @@ def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBat
     entries = []
     for index, name in enumerate(scenes.names):
         scene, camera = gaussians[index].to("cpu", torch.float32), scenes.reference.cameras[index].to("cpu")
-        selected = scene.keep(storable(scene))
+        selected = scene[storable(scene)]
         if selected.count:
             file = f"scene_{index}.ply"
             write_ply(folder / file, with_screen_space_dilation(selected, camera), [f"scene {name}", f"step {step}"])
@@ -202,6 +202,8 @@ def layer_figures(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, float]:
     layer whose opacity goes to zero is dead: it adds no hidden surfaces.
     """
     size, on_object = scenes.reference.images.shape[-2:], scenes.reference.masks[:, 0]
+    if gaussians.count % size.numel():
+        return {}  # no layers, but Gaussians that were fitted to a capture
     layers = gaussians.map(lambda tensor: tensor.view(len(tensor), -1, *size, *tensor.shape[2:]))  # by pixels
     figures = {}
     for layer in range(layers.opacities.shape[1]):
@@ -217,15 +219,9 @@ def gaussian_figures(gaussians: Gaussians) -> dict[str, float]:
 
     Keys are `gaussians/opacity_p10`, `gaussians/log10_scale_p50` and so on; depths are in scene units.
     """
-    tensors = {
-        "opacity": gaussians.opacities,
-        "log10_scale": gaussians.scales.log10(),
-        "depth": gaussians.means[..., 2],
-    }
-    values = {name: tensor.float().flatten().cpu().numpy() for name, tensor in tensors.items()}
-    return {
-        f"gaussians/{name}_p{p}": float(np.percentile(array, p)) for name, array in values.items() for p in PERCENTILES
-    }
+    parts = {"opacity": gaussians.opacities, "log10_scale": gaussians.scales.log10(), "depth": gaussians.means[..., 2]}
+    values = {name: tensor.float().flatten().cpu().numpy() for name, tensor in parts.items()}
+    return {f"gaussians/{name}_p{p}": float(np.percentile(x, p)) for name, x in values.items() for p in PERCENTILES}
 
 
 class Samples(DrawsFixedScenes):

@@ -151,11 +151,9 @@ class LatentDiffusion(Stage):
             raise CompleteSplatError("the latents do not vary: no training images, or an encoder that ignores them")
         moments = (mean.tolist(), std.tolist()) if cache is None else (cache.mean, cache.std)
         self.completesplat.set_latent_moments(*moments)
-        values = {
-            f"latents/{n}_{i}": x for n, xs in zip(("mean", "std"), moments, strict=True) for i, x in enumerate(xs)
-        }
+        logs = {f"latents/{n}_{i}": x for n, xs in zip(("mean", "std"), moments, strict=True) for i, x in enumerate(xs)}
         for logger in self.trainer.loggers:
-            logger.log_metrics(values, step=self.trainer.global_step)
+            logger.log_metrics(logs, step=self.trainer.global_step)
 
     def inputs(
         self, batch: SceneBatch | CachedScene
@@ -180,11 +178,8 @@ class LatentDiffusion(Stage):
         noise = torch.randn(latent.shape, device=self.device)  # `randn_like` would depend on the memory layout
         timestep = parts.sampler.draw_timesteps(len(latent), self.device)
         noisy = parts.sampler.add_noise(latent, noise, timestep)
-        predicted = parts.denoiser(
-            noisy.contiguous(memory_format=self.memory_format),
-            timestep,
-            conditioning.contiguous(memory_format=self.memory_format),
-        )
+        noisy, conditioning = (x.contiguous(memory_format=self.memory_format) for x in (noisy, conditioning))
+        predicted = parts.denoiser(noisy, timestep, conditioning)
         errors: Tensor = (predicted - target(parts.sampler.scheduler, latent, noise, timestep)).square().mean((1, 2, 3))
         self.log_loss(errors.detach(), timestep)
         return errors.mean()
@@ -219,9 +214,7 @@ class LatentDiffusion(Stage):
         )
 
 
-def losses_by_timestep(
-    errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"], timesteps: int
-) -> dict[str, float]:
+def losses_by_timestep(errors: Float[Tensor, " n"], timestep: Int64[Tensor, " n"], timesteps: int) -> dict[str, float]:
     """Return the mean loss of the samples in each of four equal ranges of timesteps that has samples."""
     buckets = timestep.clamp(max=timesteps - 1) * LOSS_BUCKETS // timesteps
     return {f"train/loss_t{i}": errors[buckets == i].mean().item() for i in sorted(set(buckets.tolist()))}

@@ -1,4 +1,4 @@
-"""Muon, and learning-rate schedules that step once per optimizer step. `total_steps` is the length of the run."""
+"""Muon, and learning-rate schedules that step once per optimizer step. `steps` is the length of the run."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -52,37 +52,41 @@ def _orthogonal(group: Mapping[str, Any], updates: Sequence[Tensor]) -> list[Ten
     return [zero_power_via_gram_newton_schulz(x.flatten(1), **settings, reset_steps=()) for x in updates]
 
 
-def exponential(
-    optimizer: Optimizer, total_steps: float, warmup_steps: Natural = 100, final_ratio: Share = 0.01
-) -> LambdaLR:
+class Schedule(LambdaLR):
+    """Learning-rate schedule that takes only its step from a checkpoint; rates and end are those of the config."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict | {"base_lrs": self.base_lrs})
+        self._last_lr = [rate * at(self.last_epoch) for rate, at in zip(self.base_lrs, self.lr_lambdas, strict=True)]
+        for group, rate in zip(self.optimizer.param_groups, self._last_lr, strict=True):
+            group["lr"] = rate
+
+
+def exponential(optimizer: Optimizer, steps: float, warmup_steps: Natural = 100, final_ratio: Share = 0.01) -> LambdaLR:
     """Build linear warm-up, then exponential decay to `final_ratio` at the end (Marigold, `src/util/lr_scheduler.py`).
 
     The paper follows Marigold without giving numbers; warm-up and ratio are Marigold's.
     """
-    return _after_warmup(optimizer, lambda x: math.exp(math.log(final_ratio) * x), total_steps, warmup_steps)
+    return _after_warmup(optimizer, lambda x: math.exp(math.log(final_ratio) * x), steps, warmup_steps)
 
 
-def cosine(
-    optimizer: Optimizer, total_steps: float, warmup_steps: Natural = 100, final_ratio: Share = 0.01
-) -> LambdaLR:
+def cosine(optimizer: Optimizer, steps: float, warmup_steps: Natural = 100, final_ratio: Share = 0.01) -> LambdaLR:
     """Build linear warm-up, then half a cosine down to `final_ratio` at the end."""
     half_a_cosine = lambda x: final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * x))  # noqa: E731
-    return _after_warmup(optimizer, half_a_cosine, total_steps, warmup_steps)
+    return _after_warmup(optimizer, half_a_cosine, steps, warmup_steps)
 
 
-def constant(optimizer: Optimizer, total_steps: float) -> LambdaLR:
+def constant(optimizer: Optimizer, steps: float) -> LambdaLR:
     """Keep the optimizer's learning rate throughout, as in the paper's first stage."""
-    return LambdaLR(optimizer, lambda step: 1.0)
+    return Schedule(optimizer, lambda step: 1.0)
 
 
-def _after_warmup(
-    optimizer: Optimizer, decay: Callable[[float], float], total_steps: float, warmup_steps: int
-) -> LambdaLR:
+def _after_warmup(optimizer: Optimizer, decay: Callable[[float], float], steps: float, warmup_steps: int) -> LambdaLR:
     """Build a linear rise, then `decay` of the completed share of the remaining steps (0 in a run without an end)."""
 
     def factor(step: int) -> float:
         if step < warmup_steps:
             return (step + 1) / warmup_steps
-        return decay(min(1.0, (step - warmup_steps) / max(1, total_steps - warmup_steps)))
+        return decay(min(1.0, (step - warmup_steps) / max(1, steps - warmup_steps)))
 
-    return LambdaLR(optimizer, factor)
+    return Schedule(optimizer, factor)

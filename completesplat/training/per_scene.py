@@ -45,15 +45,13 @@ class PerScene(Stage):
     """
 
     upper_bound = True
+    fitted_to = "each scene's test views, the ones that it is scored on"
+    without_effect: tuple[str, ...] = ("optimizer", "schedule", "trainer.max_", "trainer.val_check")
 
     def __init__(
-        self,
-        loss: WeightedSum,
-        fitting: FittingSettings,
-        scenes_folder: str | None = None,
-        **rendering_and_optimization: Any,
+        self, loss: WeightedSum, fitting: FittingSettings, scenes_folder: str | None = None, **others: Any
     ) -> None:
-        super().__init__(**rendering_and_optimization)
+        super().__init__(**others)
         self.loss = loss
         self.fitting = fitting
         self.scenes_folder = None if scenes_folder is None else Path(scenes_folder)
@@ -64,7 +62,10 @@ class PerScene(Stage):
             return
         folder, seed = self.scenes_folder / safe_name(name), self.evaluation.scene_seed(name)
         try:
-            write_fitted_scene(folder, name, gaussians[0], cameras, images[0], truth.images, seed)
+            make_folder(self.scenes_folder)
+            make_folder(folder)
+            title = f"{name}: fitted to these views"
+            write_fitted_scene(folder, name, title, gaussians[0], cameras, images[0], truth.images, seed)
         except CompleteSplatError as error:
             logger.warning("%s: %s", folder, error)
 
@@ -118,8 +119,7 @@ class Preoptimized(PerScene):
 class FittedScenes:
     """Store of Gaussians that are fitted to all images of a sequence when they are first needed.
 
-    One sequence at a time is in memory: its images and masks (16 bytes a pixel) and its Gaussians. A file takes 56
-    bytes for each Gaussian, so 1,000 sequences with 4,000 Gaussians each take 224 MB.
+    One sequence at a time is in memory. A file takes 56 bytes for each Gaussian.
 
     Args:
         folder: folder of the files, which several processes may share; scenes in it are not fitted again.
@@ -170,8 +170,7 @@ class PreoptimizedVAE(Preoptimized):
 
     Before training, Gaussians are fitted to each training sequence and stored in files (`FittedScenes`). Validation
     sequences are fitted when they are first used. A training step projects these Gaussians into the Splatter Images of
-    its reference views, so image augmentation has no effect. Test scenes are fitted when they are tested, to the views
-    that they are scored on.
+    its reference views, so image augmentation has no effect. Test scenes are fitted to the views they are scored on.
 
     The paper does not state the loss. Here it is the mean error of depth, offset, scale, rotation and colour, plus the
     weighted error of the opacity (`SparseVAE.errors`), plus the weighted KL. The KL is divided by the number of raw
@@ -183,6 +182,8 @@ class PreoptimizedVAE(Preoptimized):
         opacity_weight, kl_weight: weights in the loss.
         **preoptimized: see `Preoptimized`.
     """
+
+    without_effect = ()
 
     def __init__(
         self,
@@ -206,7 +207,7 @@ class PreoptimizedVAE(Preoptimized):
         data = self.data
         if data.latent_cache is not None:
             raise CompleteSplatError("data.latent_cache is for model=latent_diffusion: set it to null")
-        terms = {name: term.weight for name, term in self.loss.terms.items()}
+        terms = {name: term["weight"] for name, term in self.loss.terms.items()}
         settings = f"{self.fitting} {terms} {self.background} {data.image_size}"
         stores = [data.store("val"), data.store("train")]
         self._stored = FittedScenes(self.folder, stores, super().fitted, settings)

@@ -93,13 +93,9 @@ class ReconstructionModule(Stage):
             return
         data = self.data
         if self.sees_views and data.targets < 2:
-            raise CompleteSplatError(
-                "posterior=views needs targets to see and others to predict: data.targets of 2 or more"
-            )
+            raise CompleteSplatError("posterior=views needs targets to see and to predict: data.targets of 2 or more")
         if data.latent_cache is not None:
-            raise CompleteSplatError(
-                "data.latent_cache is for latent diffusion (model=latent_diffusion): set it to null"
-            )
+            raise CompleteSplatError("data.latent_cache is for model=latent_diffusion: set it to null")
         if isinstance(self.model, PublishedSplatterImage) and data.image_size != self.model.image_size:
             message = f"{self.model.file.name} needs {self.model.image_size}"
             raise CompleteSplatError(f"data.image_size={data.image_size}: {message}")
@@ -199,10 +195,8 @@ class ReconstructorOnly(ReconstructionModule):
 
     model: AutoDecoder
 
-    def __init__(
-        self, model: AutoDecoder, loss: WeightedSum, code_steps: int, code_rate: float, **reconstruction: Any
-    ) -> None:
-        super().__init__(model, loss, **reconstruction)
+    def __init__(self, model: AutoDecoder, loss: WeightedSum, code_steps: int, code_rate: float, **others: Any) -> None:
+        super().__init__(model, loss, **others)
         self.code_steps = code_steps
         self.code_rate = code_rate
 

@@ -78,6 +78,12 @@ class Stage(LightningModule):
     upper_bound = False
     """Whether the model has seen the views that it is scored on."""
 
+    fitted_to: str | None = None
+    """What Gaussians are fitted to, if scenes are fitted rather than predicted; for tables."""
+
+    without_effect: tuple[str, ...] = ()
+    """Beginnings of the names of settings that this model does not use, which are refused where a user gives them."""
+
     draws_samples = False
     """Whether the model has several answers for one image."""
 
@@ -132,19 +138,15 @@ class Stage(LightningModule):
         """Build the model of a checkpoint from the config in it (`hyper_parameters`), with its weights.
 
         Args:
-            trust: the checkpoint names modules of your own, and you trust its author; not needed below the working
-                folder.
+            trust: the checkpoint names your own modules, and you trust its author; not needed below the working folder.
 
         Raises:
-            WeightsError: the checkpoint is missing, damaged, without a config, names what `check_names` refuses, or is
-                of another class.
+            WeightsError: the checkpoint is damaged, missing, of another class, has no config, or `check_names` fails.
         """
         path = Path(checkpoint_path)
         config = read_checkpoint(path).get("hyper_parameters")
         if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
-            raise WeightsError(
-                f"{path}: holds no config; train with `fit`, or with what completesplat.instantiate gives"
-            )
+            raise WeightsError(f"{path}: has no config; train with `fit`, or with what completesplat.instantiate gives")
         check_names(config, path, path.resolve().parent.parent, trust)
         module = instantiate(without_training(OmegaConf.create(config)).model, _convert_="all")
         if not isinstance(module, cls):
@@ -260,7 +262,7 @@ class Stage(LightningModule):
         # The first duration includes work that is done once.
         seconds = {name: statistics.median(values[1:] or values) for name, values in self.seconds.items()}
         results = self.evaluation.results()
-        results["model"] |= {"upper_bound": self.upper_bound, "seconds": seconds}
+        results["model"] |= {"upper_bound": self.upper_bound, "fitted_to": self.fitted_to, "seconds": seconds}
         return results
 
     def predict_step(self, scenes: SceneBatch, index: int) -> Gaussians:
@@ -289,9 +291,7 @@ class Stage(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def upsampled(
-    images: Float[Tensor, "sample view 3 _ _"], size: tuple[int, int]
-) -> Float[Tensor, "sample view 3 height width"]:
+def upsampled(images: Float[Tensor, "batch view 3 _ _"], size: tuple[int, int]) -> Renders:
     """Resize images to the size (height, width) of true images (paper, Table 3: "by upsampling")."""
     if images.shape[-2:] == size:
         return images

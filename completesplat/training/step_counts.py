@@ -25,6 +25,7 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.losses.ssim import blur_matrix
 from completesplat.rasterizers import Rendering
 from completesplat.scene import Batch, CachedScene, SceneBatch
+from completesplat.training.capture import CaptureFit
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stage import Stage
@@ -179,6 +180,8 @@ def count_step(
             module = build()
         if not any(parameter.requires_grad for parameter in module.parameters()):
             raise CompleteSplatError(f"{type(module).__name__} has nothing to train in steps: nothing to plan")
+        if isinstance(module, CaptureFit):
+            raise CompleteSplatError("CaptureFit fits Gaussians, not a network: nothing to plan")
         if gpu:
             normalize_in_float32(module)
         if isinstance(module, ReconstructionModule):

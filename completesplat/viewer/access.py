@@ -1,4 +1,4 @@
-"""Access control of the page: browsers on this machine need its token, and their uploads are limited.
+"""Access control of the page: browsers on this machine need its token.
 
 viser itself answers everyone who reaches its port, and a web page of any site, opened on the same machine, reaches it.
 This module does not need torch, so that the page opens before torch is imported.
@@ -9,7 +9,6 @@ import io
 import logging
 import re
 import secrets
-import threading
 from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
@@ -19,28 +18,21 @@ from urllib.parse import parse_qs, quote
 
 import numpy as np
 import viser
-from viser._messages import FileTransferPart, FileTransferPartAck, FileTransferStartUpload
-from viser.infra import ClientId
 from websockets.asyncio import server as websockets_server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from completesplat.errors import CompleteSplatError
-from completesplat.files import printable
 
 # viser has no settings for these. The page stays as viser made it if another version of viser has other texts.
-TITLE = "completesplat"
+TITLE, LOADING = "completesplat", "loading the model or scene"
 ICON, CORRECTIONS = (Path(__file__).with_name(name) for name in ("icon.svg", "corrections.js"))
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost", "[::1]")
 MOST_FRAME = 2**20  # bytes of one websocket message; the page sends files in parts of half of that
-MOST_BYTES = 32 * 2**20  # of all images that are being received
-MOST_PARTS = 2**10
 
 Answer = Callable[[ServerConnection, Request], Response | None]
-
-_starting = threading.Lock()
 
 
 class GuardedServer(viser.ViserServer):
@@ -49,7 +41,7 @@ class GuardedServer(viser.ViserServer):
     A request or websocket handshake is answered if its `Host` is a loopback name with the server's port, its `Origin`
     is that host too (only a handshake must have one), and it has the token; otherwise the answer is 403. The token is
     in the address, or in the page's cookie, because viser's page drops the query of its address when it opens the
-    websocket. Websocket messages and uploads are refused by their announced sizes, before they are received.
+    websocket. Longer websocket messages than the page sends are refused before they are received.
 
     Raises:
         CompleteSplatError: this version of viser starts its websocket server without our checks.
@@ -59,17 +51,15 @@ class GuardedServer(viser.ViserServer):
         self.token = secrets.token_urlsafe(32)
         self._guarded = False
         # viser's constructor starts the websocket server in a thread and waits for it, and has no options for it.
-        with _starting:
-            serve = websockets_server.serve
-            websockets_server.serve = partial(self._serve, serve)  # type: ignore[assignment, misc]
-            try:
-                super().__init__(HOST, port, verbose=False)
-            finally:
-                websockets_server.serve = serve  # type: ignore[misc]
+        serve = websockets_server.serve
+        websockets_server.serve = partial(self._serve, serve)  # type: ignore[assignment, misc]
+        try:
+            super().__init__(HOST, port, verbose=False)
+        finally:
+            websockets_server.serve = serve  # type: ignore[misc]
         if not self._guarded:
             self.stop()
-            raise CompleteSplatError(f"the viewer cannot guard viser {viser.__version__}: pip install viser==1.1.1")
-        self._limit_uploads()
+            raise CompleteSplatError(f"viser {viser.__version__}: cannot be guarded; pip install viser==1.1.1")
 
     @property
     def address(self) -> str:
@@ -113,35 +103,6 @@ class GuardedServer(viser.ViserServer):
             return "Open the address that completesplat view has printed: its token is missing here, or wrong."
         return None
 
-    def _limit_uploads(self) -> None:
-        gui, connection = self.gui, self._websock_server
-        connection.unregister_handler(FileTransferStartUpload, gui._handle_file_transfer_start)
-        connection.register_handler(FileTransferStartUpload, self._upload_starts)
-        connection.unregister_handler(FileTransferPart, gui._handle_file_transfer_part)
-        connection.register_handler(FileTransferPart, self._upload_goes_on)
-        # viser drops the uploads only of browsers that have sent a camera.
-        connection.on_client_disconnect(lambda client: gui._drop_uploads_from_client(ClientId(client.client_id)))
-
-    def _upload_starts(self, client_id: ClientId, message: FileTransferStartUpload) -> None:
-        taken = sum(upload["total_bytes"] for upload in self.gui._current_file_upload_states.values())
-        if 0 <= message.size_bytes <= MOST_BYTES - taken and 0 <= message.part_count <= MOST_PARTS:
-            return self.gui._handle_file_transfer_start(client_id, message)
-        client = self.get_clients().get(client_id)
-        if client is not None:
-            # Its page waits for this before it accepts another file; the parts that it sends meanwhile are dropped.
-            source, size = message.source_component_uuid, message.size_bytes
-            client.gui._websock_interface.queue_message(FileTransferPartAck(source, message.transfer_uuid, size, size))
-            most = f"at most {MOST_BYTES // 2**20} MiB are taken at a time"
-            text = f"{printable(message.filename)}: {size / 2**20:.0f} MiB; {most}"
-            client.add_notification("Not possible", text, color="red")
-
-    def _upload_goes_on(self, client_id: ClientId, message: FileTransferPart) -> None:
-        uploads = self.gui._current_file_upload_states
-        upload = uploads.get(message.transfer_uuid)
-        if upload is not None and upload["transferred_bytes"] + len(message.content) > upload["total_bytes"]:
-            del uploads[message.transfer_uuid]  # more than it announced
-        self.gui._handle_file_transfer_part(client_id, message)
-
 
 def start_server(port: int, background: float = 0.5) -> GuardedServer:
     """Start a server with a grey background on the port or, if that is taken, the next free one (0: any)."""
@@ -150,9 +111,14 @@ def start_server(port: int, background: float = 0.5) -> GuardedServer:
         server = GuardedServer(port)
     server.scene.set_background_image(np.full((1, 1, 3), round(255 * background), np.uint8), format="png")
     server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would use the internet
-    server.gui.set_panel_label("completesplat")
+    say(server, LOADING)
     server.gui.main_panel.dock_right()
     return server
+
+
+def say(server: viser.ViserServer, text: str) -> None:
+    """Show what the page does or did as its panel's title, all that narrow windows first show."""
+    server.gui.set_panel_label(f"{TITLE}: {text}" if text else TITLE)
 
 
 def stop_server(server: viser.ViserServer) -> None:
@@ -175,8 +141,9 @@ def tokens(request: Request, port: int) -> list[bytes]:
 
 
 def with_head(page: str) -> str:
-    """Return viser's HTML with our title, icon and corrections."""
+    """Return viser's HTML with our title, icon and corrections, and a line until its program has started."""
     icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON.read_text())}" />'
     page = re.sub(r'<link\s+rel="icon"\s+href="[^"]*"\s*/>', icon, page, count=1)
     page = re.sub(r"<title>[^<]*</title>", f"<title>{TITLE}</title>", page, count=1)
+    page = page.replace('<div id="root"></div>', f'<div id="root">{TITLE}: starting the page</div>', 1)
     return page.replace("<head>", f"<head><script>{CORRECTIONS.read_text()}</script>", 1)

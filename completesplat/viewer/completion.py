@@ -1,6 +1,5 @@
 """Completion of photos on the page: the loaded image, its samples, and how they form."""
 
-import tempfile
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -10,12 +9,12 @@ from typing import Any
 import viser
 
 from completesplat.data.images.photograph import Photograph
-from completesplat.errors import CompleteSplatError, ImageError
+from completesplat.errors import CompleteSplatError
 from completesplat.export.images import to_bytes
-from completesplat.files import printable
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
+from completesplat.viewer.access import say
 from completesplat.viewer.page import Page
 from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps, preview_of
 from completesplat.viewer.sample import Sample
@@ -30,7 +29,7 @@ class Completion:
         self.page, self.model = page, model
         self.photograph: tuple[str, Photograph] | None = None
         self.controls = add_drawing(page.server.gui, model, start)
-        self.controls.upload.on_upload(self._upload)
+        page.complete = self.complete
         self.controls.draw.on_click(lambda event: self.request(event.client))
         for name in SLIDERS:
             getattr(self.controls, name).on_update(self._moved)
@@ -40,7 +39,7 @@ class Completion:
         self.photograph = name, photograph
         label = f"{name}, field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"
         self.controls.preview.content = preview_of(to_bytes(photograph.image), label)
-        self.page.view.forget_view()
+        self.page.view.set_up(self.model.up.tolist())
         self.request(client)
 
     def request(self, client: viser.ClientHandle | None = None) -> None:
@@ -48,15 +47,11 @@ class Completion:
         if self.photograph is None:
             return self.page.tell(CompleteSplatError("load an image first"), client)
         settings = {name: getattr(self.controls, name).value for name in SLIDERS}
-        job = partial(self._draw, *self.photograph, settings, client)
-        self.page.worker.submit("draw", job)
+        self.page.worker.submit("draw", partial(self._draw, *self.photograph, settings, client))
 
-    def _upload(self, event: viser.GuiEvent[Any]) -> None:
-        file, remove = self.controls.upload.value, self.controls.remove_background.value
-        try:
-            self.load(file.name, read_upload(self.model, file.name, file.content, remove), event.client)
-        except CompleteSplatError as error:
-            self.page.tell(error, event.client)
+    def complete(self, image: Path, name: str, client: viser.ClientHandle | None) -> None:
+        """Load an image file; raise a `CompleteSplatError` if it is none, or its background cannot be removed."""
+        self.load(name, self.model.read(image, remove_background=self.controls.remove_background.value), client)
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
         if not isinstance(self.model, CompleteSplat):
@@ -92,6 +87,7 @@ class Completion:
                 self.page.show(arranged([estimate[i] for i in range(settings["samples"])], finished=False), "drawing")
                 last_shown = time.monotonic()
 
+        say(self.page.server, f"drawing from {name}")
         progress.animated, progress.visible, progress.value = not forming, True, 0.0 if forming else 100.0
         try:
             scenes = self.model(photograph, on_step=formed if forming else None, **settings)
@@ -100,19 +96,3 @@ class Completion:
             self.page.tell(error, client)
         finally:
             progress.visible = False
-
-
-def read_upload(model: SceneModel, name: str, content: bytes, remove_background: bool = False) -> Photograph:
-    """Read an image at the model's size with `SceneModel.read`; `name` is only used in errors, never as a path.
-
-    Raises:
-        ImageError: the file is not an image.
-        CompleteSplatError: the background cannot be removed.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "upload"
-        file.write_bytes(content)
-        try:
-            return model.read(file, remove_background=remove_background)
-        except ImageError as error:
-            raise ImageError(str(error).replace(str(file), printable(name))) from error

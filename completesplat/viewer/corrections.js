@@ -10,3 +10,12 @@ document.head.appendChild = function (node) {
       .replace(/(\{toggle:\w+\}\]=\w+\()!0(\);return\(0,\w+\.jsx\)\(\w+\.Provider,\{value:\{wrapperRef:)/, "$1!1$2");
   return Node.prototype.appendChild.call(this, node);
 };
+// A file that is dropped on the page goes to its upload button.
+addEventListener("dragover", (event) => event.preventDefault());
+addEventListener("drop", (event) => {
+  const input = document.querySelector("input[type=file]");
+  event.preventDefault();
+  if (!input || !event.dataTransfer.files.length) return;
+  input.files = event.dataTransfer.files;
+  input.dispatchEvent(new Event("change", { bubbles: true }));
+});

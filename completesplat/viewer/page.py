@@ -1,8 +1,9 @@
 """The viewer's page: its controls, its worker thread, and the files that it saves."""
 
 import logging
+import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -11,16 +12,16 @@ import torch
 import viser
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import CONVERTED, FORMATS, write_formats
+from completesplat.export.formats import CONVERTED, FORMATS, suffix, write_formats
 from completesplat.export.images import to_bytes
 from completesplat.export.splat_transform import PageView, find_splat_transform
 from completesplat.export.video import orbit_views, render_views, write_video
-from completesplat.files import write_text
+from completesplat.files import SPLATS, printable, write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer
-from completesplat.viewer.access import GuardedServer, stop_server, with_head
-from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Pixels, add_looking, add_saving, thumbnail_row
-from completesplat.viewer.sample import Sample
+from completesplat.viewer.access import GuardedServer, say, stop_server, with_head
+from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Pixels, add_looking, add_opening, add_saving, thumbnail_row
+from completesplat.viewer.sample import Sample, read_scene
 from completesplat.viewer.splat_view import SplatView
 
 Job = Callable[[], None]
@@ -42,8 +43,7 @@ class Worker:
         self._waiting: dict[str, Job] = {}
         self._changed = threading.Condition()
         self._busy = self._closed = False
-        self._thread = threading.Thread(target=self._run, name="completesplat-viewer", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._run, name="completesplat-viewer", daemon=True).start()
 
     def submit(self, kind: str, job: Job) -> None:
         """Add a job after the waiting ones, or replace the waiting job of the same kind."""
@@ -85,7 +85,7 @@ class Worker:
 class Saver:
     """Writer of numbered files in a folder; nothing is overwritten.
 
-    `make_rasterizer` is called for the first video or thumbnail. Videos have `frames` frames and a grey background.
+    `make_rasterizer` is called for the first rendering. Videos have `frames` frames and a grey background.
     """
 
     def __init__(
@@ -96,11 +96,7 @@ class Saver:
         self._converter = cache(find_splat_transform)
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
-        """Write samples in one of the formats or as videos; the kind `html` saves the current page.
-
-        Raises:
-            CompleteSplatError: there are no samples, or `write_formats` fails.
-        """
+        """Write samples in a format, as videos, or the page (`html`); raise CompleteSplatError if there are none."""
         if not samples:
             raise CompleteSplatError("there is nothing to save yet: draw samples first")
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -120,20 +116,21 @@ class Saver:
 
     def _scene(self, kind: str, sample: Sample) -> Path:
         """Write all layers of a sample, in its reference camera's frame."""
-        path = self._next("sample", f".{kind}")
+        path = self._next("sample", suffix(kind))
         comments = [f"{name} {value}" for name, value in sample.settings.items()]
         converter = self._converter() if kind in CONVERTED else None
         front = PageView(sample.reference, sample.pivot(), torch.tensor(self.view.up), self.background)
-        write_formats(self.folder, path.stem, sample.for_viewers(), [kind], front, converter, comments)
+        rasterizer = self.rasterizer() if kind == "mesh" else None
+        name = path.name.removesuffix(suffix(kind))
+        write_formats(self.folder, name, sample.for_viewers(), [kind], front, converter, comments, rasterizer)
         return path
 
     def _video(self, sample: Sample) -> Path:
         """Write a video of a full turn around a sample."""
         path = self._next("orbit", ".mp4")
-        camera = sample.reference
-        up = camera.intrinsics.new_tensor(self.view.up.tolist())
-        scene, pivot = sample.gaussians, sample.pivot()
-        frames, _ = orbit_views(self.rasterizer(), scene, camera, pivot, self.frames, self.background, up)
+        up = sample.reference.intrinsics.new_tensor(self.view.up.tolist())
+        seen = sample.gaussians, sample.reference, sample.pivot()
+        frames, _ = orbit_views(self.rasterizer(), *seen, self.frames, self.background, up)
         write_video(path, frames)
         return path
 
@@ -143,13 +140,19 @@ class Saver:
 
 
 class Page:
-    """Controls and scene of one server, with a switch for each of `layers` layers. Its worker does the slow work."""
+    """Controls and scene of one server. Its worker does the slow work.
 
-    def __init__(self, server: GuardedServer, view: SplatView, saver: Saver, layers: int) -> None:
-        self.server, self.view, self.saver = server, view, saver
+    `scenes` are files and folders to choose from, by name. `complete` is called with an uploaded image and its name.
+    """
+
+    def __init__(self, server: GuardedServer, view: SplatView, saver: Saver, scenes: Mapping[str, Path]) -> None:
+        self.server, self.view, self.saver, self.scenes = server, view, saver, scenes
+        self.complete: Callable[[Path, str, viser.ClientHandle | None], None] | None = None
         self.worker = Worker(self.tell)
-        self.status = server.gui.add_markdown("", order=0)
-        self.looking = add_looking(server.gui, layers)
+        self.opening = add_opening(server.gui, [*scenes])
+        self.opening.upload.on_upload(self._upload)
+        self.opening.chosen.on_update(self._choose)
+        self.looking = add_looking(server.gui)
         self._connect_looking()
         self.saving = add_saving(server.gui, FORMATS)
         self.saving.save.on_click(self._save)
@@ -162,9 +165,49 @@ class Page:
         options = (*(f"sample {i + 1}" for i in range(max(1, len(samples)))), SIDE_BY_SIDE)
         if self.looking.chosen.options != options:
             self.looking.chosen.options = options
-        self.status.content = status
+        layers = max((sample.layers for sample in samples), default=0)
+        for i, box in enumerate(self.looking.layers):
+            box.visible = i < layers
+        say(self.server, status)
         if all(sample.finished for sample in samples):
             self.worker.submit("thumbnails", partial(self._draw_thumbnails, samples))
+
+    def open(self, path: Path, name: str) -> None:
+        """Show what `read_scene` reads instead of the samples, from the front."""
+        say(self.server, f"reading {name}")
+        samples, up = read_scene(path)
+        self.view.set_up(up)
+        self.show(samples, name)
+
+    def _choose(self, _: viser.GuiEvent[Any]) -> None:
+        name = self.opening.chosen.value
+        if name in self.scenes:
+            self.opening.chosen.options = (*self.scenes,)
+            self.worker.submit("open", partial(self.open, self.scenes[name], name))
+
+    def _upload(self, event: viser.GuiEvent[Any]) -> None:
+        """Show an uploaded scene, or complete an uploaded image; its name is never used as a path."""
+        file, name = self.opening.upload.value, printable(self.opening.upload.value.name)
+        suffix = Path(name).suffix.lower()
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"upload{suffix if suffix in SPLATS else ''}"
+            path.write_bytes(file.content)
+            try:
+                if suffix in SPLATS:
+                    self.open(path, name)
+                    self._let_choose_another(name)
+                elif self.complete is None:
+                    raise CompleteSplatError(f"{name}: not {', '.join(SPLATS)}; images need completesplat view IMAGE")
+                else:
+                    self.complete(path, name, event.client)
+            except CompleteSplatError as error:
+                self.tell(CompleteSplatError(str(error).replace(str(path), name)), event.client)
+
+    def _let_choose_another(self, name: str) -> None:
+        """Name an uploaded scene in the choice, so that each of `scenes` can be chosen next."""
+        chosen, uploaded = self.opening.chosen, f"loaded: {name}"
+        chosen.options, chosen.visible = (uploaded, *self.scenes), bool(self.scenes)
+        chosen.value = uploaded
 
     def _draw_thumbnails(self, samples: Sequence[Sample]) -> None:
         """Render thumbnails in the worker's thread; a single sample needs none."""
@@ -179,6 +222,7 @@ class Page:
 
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
         """Show an error in one browser or in all; log it as well if it is a fault of the program."""
+        say(self.server, "")  # what was waited for
         text = str(error)
         if not isinstance(error, CompleteSplatError):
             text = f"{type(error).__name__}: {text}"
@@ -226,7 +270,7 @@ class Page:
                 return self.tell(error, client)
             for file in files:
                 client.send_file_download(file.name, file.read_bytes())
-            self.status.content = f"saved {', '.join(file.name for file in files)} in {self.saver.folder}"
+            client.add_notification("Saved", f"{', '.join(file.name for file in files)} in {self.saver.folder}")
 
         self.worker.submit(kind, save)
 

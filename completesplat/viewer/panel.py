@@ -15,13 +15,17 @@ from PIL import Image
 
 from completesplat.data.images.files import image_bytes
 from completesplat.diffusion.sampling import Sampler
+from completesplat.files import SPLATS
 from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
 
-MOST_SAMPLES, MOST_STEPS, MOST_SEED = 8, 100, 99
+MOST_SAMPLES, MOST_STEPS, MOST_SEED, MOST_LAYERS = 8, 100, 99, 16
 SLIDERS = ("samples", "skip_weight", "guidance_weight", "color_fits", "steps", "seed")  # settings of `CompleteSplat`
 SIDE_BY_SIDE = "all, side by side"
-CUT_OUT = "of the next images: only the object, before what the weights know (needs completesplat[background])"
+CUT_OUT = (
+    "of the next images: only the object, on the weights' background (needs completesplat[background] or [grabcut])"
+)
+FILES = f"an image to complete, or a scene ({', '.join(SPLATS)}); or drop the file anywhere on the page"
 KEYS = 9  # keys 1 to 9 choose a sample; 0 shows all
 ONE_ANSWER = "One answer for each image: these weights draw no samples."
 VIDEO = "video"
@@ -41,7 +45,6 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
         most_steps = possible_steps(model.sampler)[-1]
         first_steps = nearest_steps(model.sampler, start["steps"] or model.sampler.steps)
     with gui.add_folder("Photograph", order=1):
-        upload = gui.add_upload_button("Load an image", mime_type="image/*", hint="completes the scene that it shows")
         preview = gui.add_html("")
         remove = gui.add_checkbox("Cut the object out", start["remove_background"], hint=CUT_OUT)
     with gui.add_folder("Completion", order=2):
@@ -50,7 +53,6 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
         free, diverse = "1: most faithful, 0: most free", "more: more diverse"
         slider: Any = partial(gui.add_slider, visible=draws)
         return SimpleNamespace(
-            upload=upload,
             preview=preview,
             remove_background=remove,
             samples=slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
@@ -67,12 +69,19 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
         )
 
 
-def add_looking(gui: viser.GuiApi, layers: int) -> SimpleNamespace:
+def add_opening(gui: viser.GuiApi, scenes: Sequence[str]) -> SimpleNamespace:
+    """Add what loads files, and return handles of `upload` and of `chosen`, which chooses one of several scenes."""
+    return SimpleNamespace(
+        chosen=gui.add_dropdown("Scene", scenes or [""], visible=len(scenes) > 1, order=0.2),
+        upload=gui.add_upload_button("Load a file", mime_type=f"image/*,{','.join(SPLATS)}", hint=FILES, order=0.3),
+    )
+
+
+def add_looking(gui: viser.GuiApi) -> SimpleNamespace:
     """Add the folder `View`; return handles of the `chosen` sample, of `layers` by number, and of `cameras` by name.
 
     The handles also include `thumbnails` above all folders, filled by `thumbnail_row`, and `keys`, commands by digit.
     """
-    names = ["reference", "orbit"]
     commands = {str(i): f"Show sample {i}" for i in range(1, KEYS + 1)} | {"0": "Show all samples side by side"}
     key: Any = gui.add_command
     thumbnails = gui.add_html("", order=0.5)
@@ -81,9 +90,9 @@ def add_looking(gui: viser.GuiApi, layers: int) -> SimpleNamespace:
             thumbnails=thumbnails,
             keys={digit: key(label, hotkey=digit) for digit, label in commands.items()},
             chosen=gui.add_dropdown("Show", ("sample 1", SIDE_BY_SIDE), hint="keys 1 to 9 choose, 0 shows all"),
-            layers=[gui.add_checkbox(f"Layer {i + 1}", True) for i in range(layers)],
+            layers=[gui.add_checkbox(f"Layer {i + 1}", True, visible=False) for i in range(MOST_LAYERS)],
             depth=gui.add_checkbox("Depth as colours", False, hint="near bright, far dark"),
-            cameras={name: gui.add_checkbox(f"Cameras: {name}", False) for name in names},
+            cameras={name: gui.add_checkbox(f"Cameras: {name}", False) for name in ("reference", "orbit")},
             front=gui.add_button("Look from the front"),
         )
 
@@ -91,7 +100,7 @@ def add_looking(gui: viser.GuiApi, layers: int) -> SimpleNamespace:
 def add_saving(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
     """Add the folder `Save`; return handles of the file's `kind` (a format or a video) and of the button `save`."""
     with gui.add_folder("Save", order=4):
-        kind = gui.add_dropdown("Format", (*formats, VIDEO), hint="spz and sog need Node.js")
+        kind = gui.add_dropdown("Format", (*formats, VIDEO), hint="spz and sog need Node.js, mesh completesplat[mesh]")
         return SimpleNamespace(kind=kind, save=gui.add_button("Save what is shown"))
 
 
@@ -122,9 +131,8 @@ def _source(image: Pixels) -> str:
 
 def possible_steps(sampler: Sampler) -> list[int]:
     """Return the sampler's default steps and all others up to 100; those of DDIM divide the number of noise levels."""
-    numbers = range(1, min(MOST_STEPS, sampler.training_timesteps) + 1)
-    divides = isinstance(sampler.scheduler, DDIMScheduler)
-    possible = {n for n in numbers if not (divides and sampler.training_timesteps % n)}
+    levels, divides = sampler.training_timesteps, isinstance(sampler.scheduler, DDIMScheduler)
+    possible = {n for n in range(1, min(MOST_STEPS, levels) + 1) if not (divides and levels % n)}
     return sorted(possible | {sampler.steps})
 
 

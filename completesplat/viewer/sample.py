@@ -13,7 +13,7 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import with_screen_space_dilation
-from completesplat.export.ply import read_ply
+from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 
@@ -47,7 +47,7 @@ class Sample:
 
     def pivot(self) -> Float[Tensor, "3"]:
         """Return the point on the optical axis at the median depth, by opacity, of the image's central ninth."""
-        finite = self.gaussians.keep(self.gaussians.finite())
+        finite = self.gaussians[self.gaussians.finite()]
         pixels, depths = project(self.reference, finite.means)
         height, width = self.reference.image_size
         offset = pixels / torch.tensor([width, height], device=pixels.device) - 0.5
@@ -61,7 +61,7 @@ class Sample:
 
 
 def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
-    """Read a `.ply`, or all samples in the folder of a prediction or fitted scene; return them and the direction up.
+    """Read a file of Gaussians, or all samples of a prediction or fitted scene; return them and the direction up.
 
     A file without `scene.json` beside it is seen by its `framing_camera`.
 
@@ -71,20 +71,21 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     files = [path] if path.is_file() else sorted([*path.glob("sample_*.ply"), *path.glob("scene.ply")])
     if not files:
         raise CompleteSplatError(f"{path}: no sample_*.ply or scene.ply in this folder")
-    scenes = [read_ply(file) for file in files]
+    scenes = [read_gaussians(file) for file in files]
     description = (path.parent if path.is_file() else path) / "scene.json"
     if not description.is_file() or not all(file.name.startswith(("sample_", "scene.")) for file in files):
         return [Sample(scene, 1, framing_camera(scene)) for scene in scenes], UP
-    reference, settings = _read_description(description)
-    return [Sample(scene, _layers(scene, reference), reference, settings) for scene in scenes], _up(settings)
+    try:
+        data = json.loads(description.read_text(encoding="utf-8"))
+        reference, settings = _camera(data["reference_camera"]), dict(data["settings"])
+        up = _up(settings)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CompleteSplatError(f"{description}: not the description of a prediction") from error
+    return [Sample(scene, _layers(scene, reference), reference, settings) for scene in scenes], up
 
 
 def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
-    """Read the fixed scenes that a run has written last (`write_newest`); return the step, them and the direction up.
-
-    Raises:
-        CompleteSplatError: the scenes cannot be read.
-    """
+    """Return a run's newest step, scenes and direction up (`write_newest`); raise CompleteSplatError if unreadable."""
     path = folder / NEWEST_FILE
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
@@ -94,7 +95,7 @@ def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
         raise CompleteSplatError(f"{path}: not the newest scenes of a run") from error
     samples = []
     for file, name, camera in described:
-        scene = read_ply(folder / Path(file).name)
+        scene = read_gaussians(folder / Path(file).name)
         samples.append(Sample(scene, _layers(scene, camera), camera, {"scene": name, "step": step}))
     return step, samples, up
 
@@ -108,8 +109,7 @@ def framing_camera(gaussians: Gaussians) -> Cameras:
     radius = distances[int(0.9 * (len(distances) - 1))].clamp(min=1e-3)
     back = 1.1 * radius / torch.tensor(FRAMING_FOV / 2).deg2rad().sin()
     eye = center - torch.tensor([0.0, 0.0, 1.0]) * back
-    intrinsics = pinhole(FRAMING_FOV, FRAMING_SIZE)
-    return Cameras(look_at(eye, center, torch.tensor(UP)), intrinsics, (FRAMING_SIZE, FRAMING_SIZE))
+    return Cameras(look_at(eye, center, torch.tensor(UP)), pinhole(FRAMING_FOV, FRAMING_SIZE), (FRAMING_SIZE,) * 2)
 
 
 def _layers(gaussians: Gaussians, reference: Cameras) -> int:
@@ -129,13 +129,3 @@ def _camera(plain: Mapping[str, Any]) -> Cameras:
     if (pose.shape, intrinsics.shape) != ((4, 4), (3, 3)):
         raise ValueError("matrices of other sizes")
     return Cameras(pose, intrinsics, (int(height), int(width)))
-
-
-def _read_description(path: Path) -> tuple[Cameras, dict[str, Any]]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        camera, settings = _camera(data["reference_camera"]), dict(data["settings"])
-        _up(settings)
-        return camera, settings
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CompleteSplatError(f"{path}: not the description of a prediction") from error

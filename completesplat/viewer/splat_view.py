@@ -3,19 +3,19 @@
 import math
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 import viser
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.export.formats import rounded
 from completesplat.export.images import color_depth
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.rotations import matrix_to_quaternion
 from completesplat.geometry.trajectories import orbit
 from completesplat.viewer.sample import Sample
@@ -64,7 +64,7 @@ class Arrangement:
         if len(self.pivots) == 1:
             return part
         reach = (part.means - self.pivots[index].to(part.means)).norm(dim=-1) + 2 * part.scales.amax(-1)
-        return part.keep(reach <= self.spacing / 2)
+        return part[reach <= self.spacing / 2]
 
     def looks_like(self, other: "Arrangement") -> bool:
         """Return whether a camera placed for `other` may stay: equal number of samples, nearly equal camera."""
@@ -107,12 +107,11 @@ class SplatView:
         self.hidden_layers: set[int] = set()
         self.depth = False
         self.cameras: set[str] = set()
-        self._arrangement: Arrangement | None = None
         self._splats: dict[str, viser.GaussianSplatHandle] = {}
         self._frusta: list[viser.CameraFrustumHandle] = []
         self._lock = threading.RLock()
-        self.up = np.asarray(up, float)
-        server.scene.set_up_direction(self.up)
+        self._arrangement: Arrangement | None = None
+        self.set_up(up)
         server.on_client_connect(self._welcome)
 
     @property
@@ -120,6 +119,11 @@ class SplatView:
         """The samples on the page: the chosen one (or the first, if its number does not exist), or all."""
         samples, chosen = self.samples, self.chosen
         return samples if chosen is None or not samples else [samples[chosen if chosen < len(samples) else 0]]
+
+    def set_up(self, up: Sequence[float]) -> None:
+        """Set the direction up, and make the next drawing be seen from the front, because it shows another scene."""
+        self.up, self._arrangement = np.asarray(up, float), None
+        self.server.scene.set_up_direction(self.up)
 
     def show(self, samples: Sequence[Sample]) -> None:
         """Replace the samples, and draw the new ones."""
@@ -140,11 +144,6 @@ class SplatView:
                 self._arrangement = arrangement
                 self.look_from_the_front()
 
-    def forget_view(self) -> None:
-        """Make the next drawing be seen from the front, because it shows another image."""
-        with self._lock:
-            self._arrangement = None
-
     def look_from_the_front(self, client: viser.ClientHandle | None = None) -> None:
         """Move a browser's camera (None: those of all present and future browsers) to where the photo was taken."""
         with self._lock:
@@ -160,7 +159,7 @@ class SplatView:
                     camera.fov = view.fov_in(camera.image_width / camera.image_height)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """Let narrow windows of a new browser (a phone's, upright) show the whole image, as wide ones do."""
+        """Fit the view to a new browser's window, even a phone's; show a notice until it has drawn an image."""
         last_aspect: float | None = None
 
         def fit(camera: viser.CameraHandle) -> None:
@@ -172,6 +171,10 @@ class SplatView:
 
         client.camera.on_update(fit)
         fit(client.camera)
+        with suppress(RuntimeError):  # it has left
+            drawing = client.add_notification("Drawing the first image", "", loading=True, with_close_button=False)
+            client.get_render(height=1, width=1)  # returns when the browser has drawn it
+            drawing.remove()
 
     def _draw_splats(self, samples: Sequence[Sample], arrangement: Arrangement) -> None:
         scenes = [sample.for_viewers() for sample in samples]
@@ -186,14 +189,13 @@ class SplatView:
         for name in self._splats.keys() - wanted.keys():
             self._splats.pop(name).remove()
         for name, (gaussians, shift, layer) in wanted.items():
-            splats = to_splats(gaussians)
-            arrays = splats.centers, splats.covariances, splats.colors, splats.opacities
+            arrays, scale = to_splats(gaussians)
             handle = self._splats.get(name)
             if handle is None:
-                handle = self._splats[name] = self.server.scene.add_gaussian_splats(name, *arrays)
+                handle = self._splats[name] = self.server.scene.add_gaussian_splats(name, **arrays)
             else:
-                handle.set_gaussians(*arrays)
-            handle.scale, handle.position = splats.scale, shift
+                handle.set_gaussians(**arrays)
+            handle.scale, handle.position = scale, shift
             handle.visible = layer not in self.hidden_layers
 
     def _draw_cameras(self, samples: Sequence[Sample], arrangement: Arrangement) -> None:
@@ -207,58 +209,30 @@ class SplatView:
                 "reference": (reference[None], REFERENCE_COLOR),
                 "orbit": (orbit(reference, arrangement.pivots[i], up, ORBIT_CAMERAS), ORBIT_COLOR),
             }
-            for name, (cameras, color) in groups.items():
-                if name in self.cameras:
-                    self._add_frusta(f"/cameras/{i}/{name}", cameras, color, arrangement, i)
-
-    def _add_frusta(
-        self, name: str, cameras: Cameras, color: tuple[int, int, int], arrangement: Arrangement, index: int
-    ) -> None:
-        height, width = cameras.image_size
-        poses = cameras.camera_to_world
-        for i, (pose, intrinsics) in enumerate(zip(poses, cameras.intrinsics, strict=True)):
-            self._frusta.append(
-                self.server.scene.add_camera_frustum(
-                    f"{name}/{i}",
-                    fov=2 * math.atan(height / 2 / intrinsics[1, 1].item()),
-                    aspect=width / height,
-                    scale=0.08 * arrangement.distance,
-                    thickness=1.5,
-                    thickness_units="screen",
-                    color=color,
-                    wxyz=matrix_to_quaternion(pose[:3, :3]).cpu().numpy(),
-                    position=(pose[:3, 3].cpu().numpy() + arrangement.shift(index)),
-                )
-            )
+            look: Any = {"scale": 0.08 * arrangement.distance, "thickness": 1.5, "thickness_units": "screen"}
+            for name in self.cameras & groups.keys():
+                cameras, color = groups[name]
+                height, width = cameras.image_size
+                for j, (pose, intrinsics) in enumerate(zip(cameras.camera_to_world, cameras.intrinsics, strict=True)):
+                    place, fov = f"/cameras/{i}/{name}/{j}", 2 * math.atan(height / 2 / intrinsics[1, 1].item())
+                    frustum = self.server.scene.add_camera_frustum(place, fov, width / height, color=color, **look)
+                    frustum.wxyz = matrix_to_quaternion(pose[:3, :3]).cpu().numpy()
+                    frustum.position = pose[:3, 3].cpu().numpy() + arrangement.shift(i)
+                    self._frusta.append(frustum)
 
 
-class ViserSplats(NamedTuple):
-    """Arguments of `add_gaussian_splats`, in units of `scale` scene units.
+def to_splats(gaussians: Gaussians) -> tuple[dict[str, Any], float]:
+    """Return arguments of `add_gaussian_splats` for the finite Gaussians of an unbatched set, and their unit's length.
 
     viser stores covariances as float16, which ends at 65504 and has few digits below 6e-5. In this unit, the largest
     covariance is just below that end, and thin Gaussians keep their shape.
     """
-
-    centers: Float[np.ndarray, "gaussian 3"]
-    covariances: Float[np.ndarray, "gaussian 3 3"]
-    colors: UInt8[np.ndarray, "gaussian 3"]
-    opacities: UInt8[np.ndarray, "gaussian 1"]
-    scale: float
-
-
-def to_splats(gaussians: Gaussians) -> ViserSplats:
-    """Convert one unbatched set; leave out Gaussians that are not finite, and clamp colours to [0, 1]."""
-    finite = gaussians.keep(gaussians.finite()).detach().to("cpu")
+    finite = gaussians[gaussians.finite()].detach().to("cpu")
     largest = finite.scales.max().item() if finite.count else 1.0
     scale = max(largest, 1e-12) / math.sqrt(LARGEST_COVARIANCE)
     unit = replace(finite, means=finite.means / scale, scales=finite.scales / scale)
-    return ViserSplats(
-        unit.means.float().numpy(),
-        unit.covariances().float().numpy(),
-        rounded(finite.colors * 255),
-        rounded(finite.opacities[:, None] * 255),
-        scale,
-    )
+    arrays = {"centers": unit.means.float().numpy(), "covariances": unit.covariances().float().numpy()}
+    return arrays | {"rgbs": rounded(finite.colors * 255), "opacities": rounded(finite.opacities[:, None] * 255)}, scale
 
 
 def depth_colored(scenes: Sequence[Gaussians]) -> list[Gaussians]:

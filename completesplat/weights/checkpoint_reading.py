@@ -26,8 +26,7 @@ END, END_BYTES = b"PK\5\6", 22
 """First bytes of a zip archive's last record, and the record's length without the comment at its end."""
 CHECKSUM, DIGEST_BYTES = b"sha256:", 64
 ZIP = b"PK\3\4"
-MOST_REPEATED = 2**22
-"""Largest number of elements of a tensor that has more of them than its file, because it repeats them."""
+MOST_REPEATED = 2**22  # elements of a tensor that has more of them than its file, because it repeats them
 PLAIN = re.compile(
     r"torch (\w+Storage|Size|device|[a-z]\w*)|torch\._utils _rebuild_(tensor(_v[23])?|parameter)"
     r"|collections (OrderedDict|Counter)|_codecs encode"

@@ -54,7 +54,7 @@ def test_the_full_size_is_upstreams_but_for_the_differences_it_states():
     with torch.device("meta"):
         model = instantiate(config.regressor, _convert_="all")
         defaults = SplatterImageUNet(Parameterization(layers=1))
-        upstream = SongUNet(128, 3, 15, width=128, blocks=4, attention_sizes=[16])
+        upstream = SongUNet(128, 3, 15, width=128, blocks=4, attention=[16])
     count, same, upstreams = (sum(p.numel() for p in net.parameters()) for net in (model, defaults, upstream))
     assert count == same
     time = sum(p.numel() for name, p in model.named_parameters() if "time_emb" in name)

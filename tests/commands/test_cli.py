@@ -52,10 +52,16 @@ def test_help_shows_all_verbs_and_the_settings_of_each(command):
     for verb in VERBS:
         assert f"  {verb} " in helped.out
         finished = command(verb, "--help")
-        needed = [f"completesplat {verb}: ", "\n  out=outputs/"]
+        needed = [f"completesplat {verb}: ", "\n  kind" if verb == "new" else "\n  out=outputs/"]
         needed += [f"\n  {group}" for group in ("experiment", "model=var", "rasterizer=")] if verb == "fit" else []
         assert finished.status == 0
         assert all(text in finished.out for text in needed)
+
+
+def test_bench_alone_lists_what_it_can_time_and_times_nothing(command, tmp_path):
+    listed = command("bench")
+    assert (listed.status, list(tmp_path.iterdir())) == (0, [])
+    assert all(f"\n  {task} " in listed.out for task in ("paper", "rasterizers"))
 
 
 @pytest.mark.parametrize(

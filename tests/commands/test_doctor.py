@@ -51,7 +51,7 @@ def test_failing_imports_and_packages_that_are_missing_or_of_another_version_are
 
 def test_the_packages_of_extras_are_listed_and_may_be_missing():
     present, missing = doctor.check_extras(["numpy; extra == 'view'", "no-such-package; extra == 'colmap'", "torch>=2"])
-    assert (present.name, present.state, missing.state) == ("numpy", "yes", "no")
+    assert (present.name, present.state, missing.state) == ("view: numpy", "yes", "no")
     assert 'pip install "completesplat[colmap]"' in missing.details
 
 

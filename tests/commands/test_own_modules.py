@@ -97,16 +97,18 @@ def test_modules_of_the_working_folder_stand_in_for_no_others(own, name):
 @pytest.mark.processes
 def test_what_is_begun_runs_as_it_is_written(command, own):
     for kind in KINDS:
-        finished = command("new", kind, f"my_{kind}", "out=OUT")
+        finished = command("new", kind, f"my_{kind}")
         assert finished.status == 0, finished.err
-        written = [line for line in finished.out.splitlines()[:-1] if not line.startswith("next: ")]
+        *written, following = finished.out.splitlines()
         assert all((own / name).is_file() for name in written)
+        assert following == f"next: {sys.executable} -m pytest test_{kind}_my_{kind}.py"
+    assert not (own / "outputs").exists()
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     program = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *sorted(own.glob("test_*.py"))]
     done = subprocess.run(program, cwd=own, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
     assert "6 passed" in done.stdout
-    again = command("new", "loss", "my_loss", "out=OUT")
+    again = command("new", "loss", "my_loss")
     assert (again.status, again.err.count("\n")) == (2, 1)
     assert "exists already" in again.err
 
@@ -123,10 +125,10 @@ def test_what_is_begun_runs_as_it_is_written(command, own):
     ],
 )
 def test_what_cannot_be_begun_is_refused(command, own, given, message):
-    refused = command("new", *given, "out=OUT")
+    refused = command("new", *given)
     assert refused.status == 2
     assert refused.err.startswith(f"error: {message}")
-    assert {path.name for path in own.iterdir()} <= {"mine.py", "conf", "OUT"}
+    assert {path.name for path in own.iterdir()} == {"mine.py", "conf"}
 
 
 @pytest.mark.slow

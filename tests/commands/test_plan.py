@@ -80,6 +80,7 @@ def test_it_takes_what_fit_takes():
         ("trainer.max_steps=-1", "give trainer.max_steps=N or trainer.max_epochs=N"),
         ("model=per_scene", "PerScene has nothing to train"),
         ("model=reconstructor_only", "this model cannot be planned"),
+        ("model=capture", "CaptureFit fits Gaussians, not a network: nothing to plan"),
     ],
 )
 def test_unfit_settings_are_refused(setting, message):

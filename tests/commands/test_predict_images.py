@@ -15,7 +15,7 @@ from fake_converter import calls, install
 from PIL import Image
 from support import compose_config, some_gaussians, strict_json
 
-from completesplat.commands.predict import find_images, remarks, run, unusual_field_of_view
+from completesplat.commands.predict import find_images, remarks, run, unusual_field_of_view, wanted_files
 from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, concatenate
@@ -60,6 +60,11 @@ def test_a_folder_is_its_images_sorted(tmp_path):
     images = [folder / name for name in ("a.PNG", "b.jpg", "same.png")]
     assert find_images(str(folder)) == images
     assert find_images([str(single), str(folder)]) == [single, *images]
+    assert find_images(f"{folder}/*") == find_images(f"{tmp_path}/**/[ab]*.*") + images[2:] == images
+    (folder / "[a].png").symlink_to("a.PNG")
+    assert find_images(f"{folder}/[a].png") == [folder / "[a].png"]  # a file's own name is no pattern
+    with pytest.raises(CompleteSplatError, match=r"\*\.gif: no image fits"):
+        find_images(f"{folder}/*.gif")
     with pytest.raises(CompleteSplatError, match="no image in this folder"):
         find_images(str(folder / "c.png"))
     with pytest.raises(CompleteSplatError, match="at least one"):
@@ -127,7 +132,7 @@ def test_a_name_that_is_too_long_is_refused_in_a_short_line(predict):
     finished = predict("a" * 5000)
     assert (finished.status, finished.err.count("\n")) == (2, 1)
     assert len(finished.err) < 600
-    assert "File name too long" in finished.err
+    assert finished.err.endswith("aaa: no such file\n")
 
 
 def model_with(tiny_weights: Path, **facts: object) -> CompleteSplat:
@@ -174,9 +179,15 @@ def test_shipped_weights_that_are_nearer_to_a_photo_are_named(tiny_weights, tmp_
     assert unlike.endswith("; weights=blues were trained on images that are nearer (0.0)")
     assert remarks(red, model, whole=True) == []
     monkeypatch.setattr("completesplat.commands.predict.shipped", lambda: {"reds": folders["reds"]})
-    assert remarks(blue, model, whole=True)[0].endswith(
-        "expect little of it in the scenes; weights=reds were trained on images that are nearer (4.8)"
-    )
+    (unlike,) = remarks(blue, model, whole=True)
+    near, elsewhere = unlike.partition("expect little of it in the scenes; ")[2].split("; ", 1)
+    assert near == "weights=reds were trained on images that are nearer (4.8)"  # but not near
+    for name in (
+        "weights=splatter_image:objaverse background=remove (MIT, ",
+        "TripoSplat",
+        "github.com/apple/ml-sharp",
+    ):
+        assert name in elsewhere
 
 
 def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
@@ -209,7 +220,20 @@ def test_an_image_that_fails_is_named_and_does_not_stop_the_others(predict, tmp_
     assert (tmp_path / "out/a/sample_00.ply").read_bytes() != (tmp_path / "out/a_2/sample_00.ply").read_bytes()
 
 
+def test_missing_images_are_refused_before_the_model_is_loaded(command, monkeypatch):
+    monkeypatch.setattr(CompleteSplat, "from_pretrained", lambda *_: pytest.fail("loaded"))
+    for given, message in (
+        (["nofile.jpg"], "nofile.jpg: no such file"),
+        (["*.png"], "*.png: no image fits (.jpg, "),
+    ):
+        refused = command("predict", *given)
+        assert (refused.status, refused.err.count("\n")) == (2, 1)
+        assert refused.err.startswith(f"error: {message}")
+
+
 def test_if_all_fail_nothing_is_said_to_be_left(predict, tmp_path):
+    for name in ("x.png", "y.png"):
+        (tmp_path / name).write_text("no image")
     assert predict("[x.png,y.png]").err.splitlines()[-1] == "error: 2 of 2 images failed (x.png, y.png)"
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 truncated")
     finished = predict(tmp_path / "broken.jpg")
@@ -244,15 +268,22 @@ def test_a_converter_that_is_missing_is_told_before_the_model_is_loaded(predict,
     assert finished.err.startswith("error: formats spz, sog and html need Node.js")
 
 
-def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_path):
+def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "skimage", None)
     for setting, message in (
-        ("formats=[ply,obj]", "formats=obj: choose from ply, splat, glb, spz, sog, html"),
+        ("formats=[ply,obj]", "formats=obj: choose from ply, splat, glb, mesh, spz, sog, html"),
+        ("formats=mesh", 'formats=[mesh] needs scikit-image: pip install "completesplat[mesh]"'),
+        ("formats=[]", "formats=[] video=[]: choose a format (ply, splat, glb, mesh, spz, sog, html) or a video"),
         ("video=zoom", "video=zoom: choose from orbit, swipe, wobble"),
         ("mask=x.png", "mask=FILE belongs to one image"),
     ):
-        config = compose_config("predict", "image=[a.png,b.png]", "weights=nowhere", setting)
+        images = f"image=[{save(tmp_path / 'a.png')},{save(tmp_path / 'b.png')}]"
+        video = ["video=[]"] if setting == "formats=[]" else []
+        config = compose_config("predict", images, "weights=nowhere", setting, *video)
         with pytest.raises(CompleteSplatError, match=re.escape(message)):
             run(config, tmp_path)
+    only_videos = wanted_files(compose_config("predict", "image=a.png", "formats=[]"))
+    assert (only_videos.formats, only_videos.videos) == ((), ("orbit",))
 
 
 @pytest.mark.parametrize("broken", ["some", "all"])

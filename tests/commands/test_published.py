@@ -105,7 +105,7 @@ def test_what_is_hidden_counts_as_background(tmp_path):
     changed = replace(photograph, image=photograph.image.clone())
     changed.image[..., 8:] = 1
     assert torch.equal(model(photograph, visible)[0].means, model(changed)[0].means)
-    assert not model.knows_hidden
+    assert not model.architecture.get("training", {}).get("box_masks")
 
 
 def test_a_test_sees_objects_only_at_their_depths_and_its_figures_stand_apart(command, pipeline, tmp_path):

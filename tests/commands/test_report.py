@@ -51,19 +51,6 @@ def test_calibration_of_weights_has_both_regions_and_a_figure(report, pipeline, 
     assert "0.25 of the true values below" in message
 
 
-def test_front_of_one_scene_has_all_rungs_but_that_of_another_scene(report, tmp_path):
-    message, results = report("front")
-    rows = {row["rung"]: row for row in results["rows"]}
-    assert list(rows) == ["posterior_mean", "posterior_samples", "samples", "samples_fitted", "samples_without_skips"]
-    fitted, plain = (rows[name]["reference_psnr"] for name in ("samples_fitted", "samples"))
-    assert fitted > plain
-    assert rows["posterior_mean"]["reference_difference"] == rows["posterior_mean"]["far_difference"] == 0
-    assert all(row["reference_difference"] > 0 for name, row in rows.items() if name != "posterior_mean")
-    assert all(row["reference_psnr"] > 0 and row["reference_object_psnr"] > 0 for row in rows.values())
-    assert imageio.imread(tmp_path / "out/front.png").ndim == 3
-    assert "mean absolute difference of two samples" in " ".join(message.split())
-
-
 @pytest.mark.parametrize(
     ("task", "setting", "message"),
     [

@@ -1,5 +1,6 @@
 """One process at a time in a run's folder, and a run goes on with the data that it began with."""
 
+import json
 import os
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 from support import SMALL, strict_json
 
+from completesplat.commands import jobs
 from completesplat.commands.jobs import alone_in
 from completesplat.data.toy import write_objects
 from completesplat.errors import CompleteSplatError
@@ -103,6 +105,39 @@ def test_links_in_a_run_s_folder_are_not_followed(command, toy_root, tmp_path):
     assert command(*given).status == 0
     assert kept.read_text() == "kept"
     assert not any((run / name).is_symlink() for name in written)
+
+
+def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp_path):
+    """In the folder of a run that trained 20 steps; for what then is trained, see the slow test of exact resuming."""
+    for name, content in (("run.json", {"started": "then", "command": ["first"]}), ("metrics.json", {"steps": 20})):
+        (tmp_path / name).write_text(json.dumps(content))
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / jobs.LAST).touch()
+
+    def config(rate=1, **end):
+        return {"ckpt_path": "last", "optimizer": {"lr": rate}, "trainer": {"max_steps": 20, "max_time": None} | end}
+
+    OmegaConf.save(config(), tmp_path / "config.yaml")
+    assert jobs.is_finished(tmp_path, config())
+    for longer in ({"max_steps": 40}, {"max_steps": -1}, {"max_time": {"hours": 1}, "max_steps": 21}):
+        assert not jobs.is_finished(tmp_path, config(**longer))
+    with pytest.raises(CompleteSplatError, match=r"max_steps=10: .* has 20 steps; give more"):
+        jobs.is_finished(tmp_path, config(max_steps=10))
+    with pytest.raises(CompleteSplatError, match="max_epochs=3 may end before the run in"):
+        jobs.is_finished(tmp_path, config(max_steps=40, max_epochs=3))
+    again = f"completesplat fit optimizer.lr=2 ckpt_path={tmp_path}/checkpoints/last.ckpt out=MORE"
+    with pytest.raises(CompleteSplatError, match=f"another optimizer.lr: continue in another folder: {again}$"):
+        jobs.is_finished(tmp_path, config(rate=2, max_steps=40), ["out=R", "optimizer.lr=2", "ckpt_path=last"])
+    jobs._record(tmp_path, ["second"], [], config(max_steps=40))
+    record = strict_json(tmp_path / "run.json")
+    assert (record["started"], record["command"], len(record["continued"])) == ("then", ["second"], 1)
+    (earlier,) = record["earlier_ends"]
+    assert (earlier["command"], earlier["trainer.max_steps"]) == (["first"], 20)
+    assert {path.name for path in tmp_path.glob("metrics*")} == {"metrics_20_steps.json"}
+    (tmp_path / "metrics_20_steps.json").rename(tmp_path / "metrics.json")
+    (tmp_path / jobs.LAST).unlink()
+    with pytest.raises(CompleteSplatError, match=r"has no checkpoints/last\.ckpt to continue from: choose another out"):
+        jobs.is_finished(tmp_path, config(max_steps=40))
 
 
 FIT = [*SMALL, "experiment=toy_var", "test=false", "trainer.max_steps=2", "trainer.log_every_n_steps=1"]

@@ -19,11 +19,10 @@ from completesplat.training.stage import Stage
 
 @pytest.fixture
 def scored(command, pipeline, tmp_path):
-    """Run the command on a stage of the pipeline: what it printed, and its metrics."""
+    """Run the command on a stage's folder of the pipeline: what it printed, and its metrics."""
 
     def run(stage, *settings, out="out"):
-        checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
-        given = [f"ckpt={checkpoint}", "trainer.accelerator=cpu", *settings, f"out={tmp_path / out}"]
+        given = [f"ckpt={getattr(pipeline, stage)}", "trainer.accelerator=cpu", *settings, f"out={tmp_path / out}"]
         finished = command("test", *given)
         assert (finished.status, finished.out.splitlines()[-1]) == (0, str(tmp_path / out)), finished.err
         return finished.out, strict_json(tmp_path / out / "metrics.json")
@@ -43,7 +42,9 @@ def test_scores_stand_beside_the_naive_predictors(scored):
             assert -1 <= values["ssim"] <= 1
         assert 0 < scores["scenes"] == scores["views"] / 2
     assert metrics["copy_reference"]["full"]["reference"]["psnr"] == 100
-    assert "copy_reference" in printed
+    (copied,) = [line for line in printed.splitlines() if "copy_reference" in line]
+    assert (copied.count("the same image"), "100.00" in printed) == (2, False)
+    assert described["checkpoint"]["path"].endswith("var/checkpoints/last.ckpt")
 
 
 def test_data_without_training_images_have_no_mean_image(scored):

@@ -15,17 +15,17 @@ from viewer_scenes import balls
 from written_commands import ROOT
 
 from completesplat.commands.jobs import alone_in
-from completesplat.commands.view import LOADING, newest_scenes, settings_of, show_newest
+from completesplat.commands.view import newest_scenes, scenes_in, settings_of, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.training.fixed_scenes import write_newest
-from completesplat.viewer.sample import UP
+from completesplat.viewer.sample import UP, Sample
 
 
 def folder(path, *names: str):
     path.mkdir()
     for name in names:
-        (path / name).parent.mkdir(exist_ok=True)
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
         (path / name).write_bytes(b"")
     return path
 
@@ -36,20 +36,32 @@ def test_what_a_path_stands_for(tmp_path):
     prediction = folder(tmp_path / "p", "sample_00.ply", "scene.json")
     outer = folder(tmp_path / "o", "photo/sample_00.ply", "run.json")
     files = folder(tmp_path / "f", "A.PLY", "photo.jpg")
+    fitted = folder(tmp_path / "c", "checkpoints/last.ckpt", "config.yaml", "scene.ply")
+    assert settings_of(fitted) == {"scene": str(fitted)}
     assert settings_of(weights) == {"weights": str(weights)}
     assert settings_of(run) == {"weights": str(run / "weights")}
     assert settings_of(prediction) == {"scene": str(prediction)}
-    assert settings_of(outer) == {"scene": str(outer / "photo")}
+    assert settings_of(outer) == {"scene": str(outer)}
     assert settings_of(files / "A.PLY") == {"scene": str(files / "A.PLY")}
+    assert settings_of(files) == {"scene": str(files)}
     assert settings_of(files / "photo.jpg") == {"image": str(files / "photo.jpg")}
 
 
+def test_the_scenes_of_a_folder_can_be_chosen(tmp_path):
+    several = folder(
+        tmp_path / "s", "b/sample_00.ply", "a/scene.ply", "scenes/c/scene.ply", "A.PLY", "b.splat", "c.jpg"
+    )
+    names = ["A.PLY", "a", "b", "b.splat", "scenes/c"]
+    assert scenes_in(several) == {name: several / name for name in names}
+    assert scenes_in(several / "b") == {"b": several / "b"}  # whose files are samples of one scene
+    assert scenes_in(several / "b.splat") == {"b.splat": several / "b.splat"}
+    assert scenes_in(tmp_path / "nowhere") == {}
+
+
 def test_what_cannot_be_shown_is_refused(tmp_path):
-    folder(tmp_path / "several", "a/sample_00.ply", "b/sample_00.ply")
     for path, message in (
         ("nowhere.ply", "nowhere.ply: no such file or folder"),
-        (".", "neither weights (config.json, model.safetensors, here or in weights/) nor a prediction"),
-        ("several", "2 predictions: give one of them"),
+        (".", "neither weights nor scenes in it (config.json, model.safetensors, .ply, .splat, .spz)"),
     ):
         with pytest.raises(CompleteSplatError, match=re.escape(message)):
             settings_of(tmp_path / path)
@@ -84,18 +96,20 @@ def test_a_run_is_watched_while_a_process_is_at_work_in_it(tmp_path):
 
 def test_what_a_run_writes_is_shown_when_it_is_new(tmp_path, capsys):
     run, shown = run_in_training(tmp_path / "run"), []
-    view = SimpleNamespace(samples=newest_scenes(run)[0])
+    view = SimpleNamespace(samples=newest_scenes(run)[1])
     page = SimpleNamespace(
         view=view, show=lambda samples, message: (shown.append(message), setattr(view, "samples", samples))
     )
-    show_newest(page, run)
-    assert shown == []
+    last = show_newest(page, run, None)
+    assert (last, shown) == (2, [])
     for step in (4, 4, 6):
         run_in_training(run, step)
-        show_newest(page, run)
+        last = show_newest(page, run, last)
     assert shown == ["step 4 of the training", "step 6 of the training"]
+    view.samples = [Sample(balls(points=5), 1, view.samples[0].reference)]  # a file that somebody loads meanwhile
+    assert show_newest(page, run, last) == 6
     (run / "images/newest/scenes.json").write_text("{")
-    show_newest(page, run)
+    assert show_newest(page, run, last) == 6
     assert len(shown) == 2
     with pytest.raises(CompleteSplatError, match=r"no images/ here, which fit fills"):
         newest_scenes(tmp_path)
@@ -104,7 +118,7 @@ def test_what_a_run_writes_is_shown_when_it_is_new(tmp_path, capsys):
 def test_a_run_without_scenes_is_waited_for(tmp_path, capsys, monkeypatch):
     (tmp_path / "run/images").mkdir(parents=True)
     monkeypatch.setattr("completesplat.commands.view.time.sleep", lambda _: run_in_training(tmp_path / "run"))
-    samples, up = newest_scenes(tmp_path / "run")
+    _, samples, up = newest_scenes(tmp_path / "run")
     assert (len(samples), up) == (2, UP)
     assert "no scenes yet; waiting" in capsys.readouterr().out
 
@@ -139,7 +153,10 @@ def test_the_page_is_there_before_torch_and_says_that_it_is_loading(tmp_path):
             )
             with socket:
                 page = socket.recv(timeout=LIMIT)  # behind its size, before and after compression
-            assert LOADING.encode() in _infra.zstandard.ZstdDecompressor().decompressobj().decompress(page[16:])
+            assert (
+                b"completesplat: loading the model or scene"
+                in _infra.zstandard.ZstdDecompressor().decompressobj().decompress(page[16:])
+            )
         finally:
             process.kill()
 

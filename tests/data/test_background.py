@@ -9,7 +9,7 @@ import skimage
 import torch
 from PIL import Image
 
-from completesplat.data.images.photograph import image_features, read_photograph
+from completesplat.data.images.photograph import image_features, read_photograph, without_background
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.errors import CompleteSplatError, ImageError
 
@@ -56,18 +56,45 @@ def test_an_object_as_long_as_an_image_may_be_is_reduced_before_its_square_is_ma
     assert read_photograph(tmp_path / "deep.png", 16, object_share=0.5).image.min() == 1
 
 
-def test_without_rembg_or_its_network_it_is_said_what_to_do(rembg, tmp_path, monkeypatch):
+def test_without_rembg_or_its_network_it_is_said_what_to_do(rembg, tmp_path, monkeypatch, caplog):
+    pytest.importorskip("cv2")
     photo(tmp_path / "a.png")
 
     def offline(name):
         raise OSError("no route to host\nand more")
 
     monkeypatch.setattr(rembg, "new_session", offline)
-    with pytest.raises(CompleteSplatError, match=r"fails with its network u2net \(no route to host\)$"):
+    with caplog.at_level("INFO"):
         read_photograph(tmp_path / "a.png", 16, remove_background=True)
+    assert "rembg fails with its network u2net (no route to host)\n" in caplog.text
+    assert "removed by GrabCut" in caplog.text
+    for name in ("rembg", "cv2"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(
+        CompleteSplatError, match=r'needs rembg or OpenCV: .* "completesplat\[background\]", or .*grabcut'
+    ):
+        read_photograph(tmp_path / "a.png", 16, remove_background=True)
+
+
+def test_without_rembg_grabcut_keeps_the_largest_piece_that_differs_from_the_border(tmp_path, monkeypatch, caplog):
+    pytest.importorskip("cv2")
     monkeypatch.setitem(sys.modules, "rembg", None)
-    with pytest.raises(CompleteSplatError, match=r'needs rembg .* pip install "completesplat\[background\]"'):
-        read_photograph(tmp_path / "a.png", 16, remove_background=True)
+    rows, columns = np.mgrid[:90, :120]
+    object_mask = ((columns - 55) / 40) ** 2 + ((rows - 45) / 30) ** 2 < 1
+    speck = (columns > 105) & (columns < 112) & (abs(rows - 12) < 4)
+    pixels = np.where((object_mask | speck)[..., None], [200, 90, 30], [60, 110, 160])
+    noisy = Image.fromarray(
+        (pixels + np.random.default_rng(0).normal(0, 20, pixels.shape)).clip(0, 255).astype(np.uint8)
+    )
+    with caplog.at_level("INFO"):
+        alpha = np.array(without_background(noisy).getchannel("A")) > 127
+    assert (alpha & object_mask).sum() > 0.97 * (alpha | object_mask).sum()
+    assert not alpha[speck].any()
+    assert "removed by GrabCut" in caplog.text
+    assert "rembg is better" in caplog.text
+    thin = Image.new("RGB", (3000, 8), "red")
+    with pytest.raises(ImageError, match="no object is found"):
+        without_background(thin)
 
 
 def test_features_are_colours_their_spread_and_how_fine_they_are():

@@ -17,7 +17,7 @@ from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no playwright")
-CHROMIUM = shutil.which("chromium")
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")  # which GitHub's machines have
 NODE = shutil.which("npx") or shutil.which("splat-transform")
 missing = CHROMIUM is None or NODE is None
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(missing, reason="no Chromium or no Node.js")]

@@ -101,8 +101,8 @@ def test_stage_two_adds_lpips_to_stage_one_and_nothing_to_the_checkpoint(vgg_fil
     file = [f"loss.terms.lpips.term.vgg_weights={vgg_file}", "loss.terms.lpips.term.vgg_sha256=null"]
     configs = [compose_config("fit", "loss=stage1"), compose_config("fit", "loss=stage2", *file)]
     first, second = (instantiate(config.model, _convert_="all") for config in configs)
-    weights = {name: entry.weight for name, entry in second.loss.terms.items()}
-    assert weights == {name: entry.weight for name, entry in first.loss.terms.items()} | {"lpips": 0.01}
+    weights = {name: entry["weight"] for name, entry in second.loss.terms.items()}
+    assert weights == {name: entry["weight"] for name, entry in first.loss.terms.items()} | {"lpips": 0.01}
     assert (weights["mse"], weights["ssim"]) == (0.8, 0.2)
     assert set(second.state_dict()) == set(first.state_dict())
     assert len(list(second.parameters())) == len(list(first.parameters()))

@@ -23,16 +23,16 @@ def plain(*values: float) -> torch.Tensor:
 
 def test_a_sampler_of_every_mode_in_proportion_is_perfect():
     result = scores(MODES.repeat(8, 1, 1), MODES, EVEN)
-    assert (result.coverage, result.total_variation, result.sharpness, result.rejected) == (1, 0, 0, 0)
+    assert (result["coverage"], result["total_variation"], result["sharpness"], result["rejected"]) == (1, 0, 0, 0)
     uneven = scores(MODES[[0, 0, 1, 2]], MODES, UNEVEN)
-    assert (uneven.coverage, uneven.total_variation) == (1, 0)
+    assert (uneven["coverage"], uneven["total_variation"]) == (1, 0)
 
 
 @pytest.mark.parametrize("probabilities", [EVEN, UNEVEN])
 def test_the_mean_of_the_modes_is_rejected_always(probabilities):
     result = scores(mean_of(MODES, probabilities).expand(5, -1, -1), MODES, probabilities)
-    assert (result.coverage, result.total_variation, result.rejected) == (0, 1, 1)
-    assert result.sharpness == pytest.approx(1)
+    assert (result["coverage"], result["total_variation"], result["rejected"]) == (0, 1, 1)
+    assert result["sharpness"] == pytest.approx(1)
     modes, third = plain(0.0, 0.49, 1.0), torch.full((3,), 1 / 3)  # it lies beside a mode
     assert classify(mean_of(modes, third)[None], modes, third).tolist() == [REJECTED]
     assert classify(modes, modes, third).tolist() == [0, 1, 2]
@@ -59,5 +59,5 @@ def test_draws_follow_the_probabilities():
 def test_rejected_samples_count_as_mass_on_no_mode():
     samples = torch.cat([MODES[:2], MODES[:2].mean(0, keepdim=True).expand(2, -1, -1)])
     result = scores(samples, MODES, EVEN)
-    assert (result.rejected, result.coverage) == (0.5, 0.5)
-    assert result.total_variation == pytest.approx(0.5)  # half of 0 + 0 + 1/4 + 1/4 + 1/2
+    assert (result["rejected"], result["coverage"]) == (0.5, 0.5)
+    assert result["total_variation"] == pytest.approx(0.5)  # half of 0 + 0 + 1/4 + 1/4 + 1/2

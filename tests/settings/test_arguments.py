@@ -68,6 +68,7 @@ def test_numbers_and_lists_stay_what_they_are_beside_files_of_their_names(tmp_pa
         ("data", ["-m", "toy", "seed=0,1"], ["-m", "data_task=toy", "seed=0,1"]),
         ("view", ["--help"], ["--help"]),
         ("data", ["toy", "kind=rooms"], ["data_task=toy", "kind=rooms"]),
+        ("data", ["import", "a b", "frames=3"], ["data_task=import", "folder='a b'", "frames=3"]),
         ("new", ["loss", "mine"], ["kind='loss'", "name='mine'"]),
     ],
 )
@@ -84,6 +85,7 @@ def test_words_and_flags_become_settings(verb, typed, given):
         ("fit", ["--config-dir"], "--config-dir: lacks its value; give --config-dir VALUE"),
         ("new", ["loss", "a", "b"], "give one kind and one name, not loss a b"),
         ("fit", ["nonsense"], "nonsense: no setting, which are given as key=value"),
+        ("data", ["import", "a", "b"], "give one folder, not a b"),
         ("data", ["toy", "rooms"], "rooms: no setting, which are given as key=value"),
         ("fit", ["out=a=b"], "out=a=b: cannot be read; a text with such characters wants quotes: \"out='a=b'\""),
         ("bench", ["settings=[a=b,c]"], "settings=[a=b,c]: cannot be read; a text with such characters wants quotes"),

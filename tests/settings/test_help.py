@@ -25,7 +25,7 @@ WITH_TASKS = [(verb, task) for verb in VERBS for task in (options(f"{verb}_task"
 def test_each_own_setting_is_explained_in_conf(verb, task):
     places = {choice.place.partition(".")[0] for choice in choices_of_verb(verb, task)} | {"stage1", "stage2"}
     settings = [setting for setting in settings_of_verb(verb, task) if setting.key.partition(".")[0] not in places]
-    assert settings[0].key == "out"
+    assert settings[0].key == ("kind" if verb == "new" else "out")  # `new` writes into the working folder
     unexplained = [setting.key for setting in settings if not setting.comment and "." not in setting.key]
     assert unexplained == []
 
@@ -69,8 +69,27 @@ def test_a_part_shows_its_settings_with_the_docstring_of_its_class():
 def test_unknown_parts_are_answered_with_the_nearest():
     with pytest.raises(CompleteSplatError, match=r"no data 'toy_object': there are .*; did you mean toy_objects"):
         page("fit", ["data=toy_object"])
-    with pytest.raises(CompleteSplatError, match=r"nothing to say on 'modle'; did you mean model\?"):
+    with pytest.raises(CompleteSplatError, match=r"nothing to say on 'modle'; did you mean mode or model"):
         page("fit", ["modle"])
+    with pytest.raises(CompleteSplatError, match=r"nothing to say on 'batchsize'; did you mean batch_size"):
+        page("fit", ["batchsize"])
+
+
+def found(*words: str) -> list[str]:
+    """The keys that `fit --help WORDS` shows."""
+    return re.findall(r"^  (\w[\w.]*)(?==| |$)", page("fit", [*words]), re.MULTILINE)
+
+
+def test_a_word_is_searched_for_in_the_names_and_comments_of_all_options():
+    assert found("lr") == ["optimizer.lr", "optimizer.adam_lr"]  # not in "already", and not once for each experiment
+    assert "optimizer.adam_lr=3.0e-3" in page("fit", ["lr"])
+    assert "learning rate of biases and norms [number, at least 0] (optimizer=muon)" in page("fit", ["lr"])
+    assert found("trainer.max_steps")[0] == found("max", "steps")[0] == "trainer.max_steps"
+    assert found("batch_size")[0] == "data.batch_size"  # names come before comments
+    assert {"optimizer.lr", "optimizer.adam_lr"} < set(found("learning_rate"))
+    for reference in ("model.loss", "_target_"):
+        with pytest.raises(CompleteSplatError, match="nothing to say on"):
+            found(reference)
 
 
 def test_every_group_is_explained_and_every_option_is_read():

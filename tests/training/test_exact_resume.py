@@ -90,6 +90,29 @@ def test_a_run_that_is_continued_is_bit_equal(settings, whole, tmp_path, monkeyp
     assert any("current_model_state" in name for name in weights(tmp_path / "run")) == (stage != "var")
 
 
+@pytest.mark.slow
+def test_a_finished_run_whose_end_moves_is_the_run_that_had_this_end_from_the_start(settings, whole, tmp_path, command):
+    """The first end is a multiple of the images' interval, because images are also drawn at the end."""
+    run = tmp_path / "run"
+    first = [*settings["var"], "trainer.max_steps=4", f"out={run}"]
+    for given, status in ((first, 0), ([*settings["var"], "optimizer.lr=1", f"out={run}", "ckpt_path=last"], 2)):
+        finished = command(*given)
+        assert finished.status == status, finished.err
+    assert "holds a run with another optimizer.lr: continue in another folder: completesplat fit " in finished.err
+    assert finished.err.endswith(f" ckpt_path={run}/checkpoints/last.ckpt out=MORE\n")
+    went_on = command(*settings["var"], f"out={run}", "ckpt_path=last")
+    assert went_on.status == 0, went_on.err
+    must_be_equal(whole("var"), run)
+    record = strict_json(run / "run.json")
+    (earlier,) = record["earlier_ends"]
+    assert (earlier["trainer.max_steps"], earlier["command"]) == (4, ["completesplat fit", *first[1:]])
+    assert f"trainer.max_steps={STEPS}" in record["command"]
+    assert strict_json(run / "metrics_4_steps.json")["steps"] == 4
+    again = [command(*settings["var"], f"out={run}", "ckpt_path=last", *more) for more in ([], ["trainer.max_steps=5"])]
+    assert "finished before" in again[0].out
+    assert again[1].err.startswith(f"error: trainer.max_steps=5: {run} has {STEPS} steps; give more")
+
+
 def must_be_equal(whole, result) -> None:
     """Weights, the rows of `metrics.csv` and the figures in `metrics.json`."""
     expected, continued = weights(whole), weights(result)

@@ -67,7 +67,7 @@ def test_a_checkpoint_is_held_to_the_rules_of_a_run(pipeline, tmp_path):
             completesplat.ReconstructionModule.load_from_checkpoint(tmp_path / "other.ckpt")
     del contents["hyper_parameters"]
     torch.save(contents, tmp_path / "other.ckpt")
-    with pytest.raises(WeightsError, match="holds no config"):
+    with pytest.raises(WeightsError, match="has no config"):
         completesplat.ReconstructionModule.load_from_checkpoint(tmp_path / "other.ckpt")
 
 

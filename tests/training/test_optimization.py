@@ -10,11 +10,11 @@ from support import SMALL, compose_config
 from completesplat.training.optimization import constant, cosine, exponential, muon
 
 
-def factors(schedule, steps: int, **settings) -> list[float]:
+def factors(schedule, count: int, **settings) -> list[float]:
     optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
     scheduler = schedule(optimizer, **settings)
     values = []
-    for _ in range(steps):
+    for _ in range(count):
         values.append(optimizer.param_groups[0]["lr"])
         optimizer.step()
         scheduler.step()
@@ -22,7 +22,7 @@ def factors(schedule, steps: int, **settings) -> list[float]:
 
 
 def test_exponential_is_a_straight_line_in_the_logarithm_after_the_warm_up():
-    values = factors(exponential, 1201, total_steps=1100, warmup_steps=100, final_ratio=0.01)
+    values = factors(exponential, 1201, steps=1100, warmup_steps=100, final_ratio=0.01)
     assert values[:100] == pytest.approx([(i + 1) / 100 for i in range(100)])
     assert values[600] == pytest.approx(0.1)
     assert values[350] == pytest.approx(math.exp(math.log(0.01) / 4))
@@ -30,9 +30,30 @@ def test_exponential_is_a_straight_line_in_the_logarithm_after_the_warm_up():
 
 
 def test_cosine_ends_at_the_final_ratio_and_constant_stays():
-    values = factors(cosine, 301, total_steps=200, warmup_steps=0, final_ratio=0.1)
+    values = factors(cosine, 301, steps=200, warmup_steps=0, final_ratio=0.1)
     assert (values[0], values[100], values[200], values[300]) == pytest.approx((1.0, 0.55, 0.1, 0.1))
-    assert set(factors(constant, 5, total_steps=3)) == {1.0}
+    assert set(factors(constant, 5, steps=3)) == {1.0}
+
+
+def test_a_schedule_goes_on_with_the_end_and_the_rate_of_its_config():
+    """A training of 100 steps at rate 1 goes on to step 200 at rate 2: it has the rates that it had from the start."""
+
+    def begun(rate, total):
+        optimizer = torch.optim.Adam([torch.zeros(1, requires_grad=True)], lr=rate)
+        return optimizer, cosine(optimizer, total, warmup_steps=10, final_ratio=0.1)
+
+    (optimizer, schedule), (longer, other) = begun(1.0, 100), begun(2.0, 200)
+    for _ in range(100):
+        optimizer.step()
+        schedule.step()
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(0.1)
+    longer.load_state_dict(optimizer.state_dict())
+    other.load_state_dict(schedule.state_dict())
+    expected = [2 * rate for rate in factors(cosine, 201, steps=200, warmup_steps=10, final_ratio=0.1)]
+    for step in range(100, 201):
+        assert longer.param_groups[0]["lr"] == other.get_last_lr()[0] == pytest.approx(expected[step])
+        longer.step()
+        other.step()
 
 
 def test_muon_steps_equally_far_in_all_directions_of_a_kernel_and_adam_moves_the_rest():

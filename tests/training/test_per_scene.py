@@ -34,9 +34,23 @@ def test_a_splatter_image_of_few_gaussians_is_mostly_empty(toy_root, opacity, le
 
 
 def test_fit_goes_straight_to_the_test(command, toy_root, tmp_path):
-    settings = ["experiment=toy_var", "model=preoptimized", f"data.root={toy_root}", *SMALL, *FEW]
+    used = [setting for setting in SMALL if not setting.startswith(("trainer.max_", "trainer.val_check"))]
+    settings = ["experiment=toy_var", "model=preoptimized", f"data.root={toy_root}", *used, *FEW]
     assert command("fit", *settings, "model.fitting.steps=3", f"out={tmp_path / 'run'}").status == 0
     metrics = strict_json(tmp_path / "run/metrics.json")
     assert metrics["steps"] == 0
     assert 0 < metrics["test"]["model"]["full"]["novel"]["psnr"] < 100
     assert 0 < metrics["test"]["model"]["empty_pixels"] <= 1
+
+
+@pytest.mark.parametrize(
+    ("setting", "reason"),
+    [
+        ("test=false", "test=false: PerScene does nothing with it; leave it out"),
+        ("optimizer.lr=1", "optimizer.lr=1: PerScene does nothing with it; leave it out"),
+    ],
+)
+def test_a_fit_that_would_do_nothing_is_refused(command, toy_root, setting, reason):
+    refused = command("fit", "experiment=toy_var", "model=per_scene", f"data.root={toy_root}", setting)
+    assert (refused.status, refused.err.count("\n")) == (2, 1), refused.err
+    assert reason in refused.err

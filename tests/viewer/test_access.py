@@ -4,17 +4,15 @@ import http.client
 import logging
 import socket
 import struct
-import threading
 from contextlib import closing, suppress
 from types import SimpleNamespace
 
 import pytest
-from support import LIMIT, waited_for
+from support import LIMIT
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
 
 import websockets.asyncio.server  # noqa: E402
-from viser import _messages as messages  # noqa: E402
 from viser.infra import _infra  # noqa: E402
 from websockets.exceptions import ConnectionClosed  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
@@ -23,7 +21,6 @@ from completesplat.errors import CompleteSplatError  # noqa: E402
 from completesplat.viewer import access  # noqa: E402
 from completesplat.viewer.access import MOST_FRAME, cookie_name, start_server  # noqa: E402
 
-MIB = 2**20
 EVIL = "evil.example"
 HANDSHAKE = {
     "Connection": "Upgrade",
@@ -166,103 +163,6 @@ def test_too_long_a_message_is_refused_when_it_is_announced(server):
         assert closed_with(opened) == 1009
 
 
-class Uploader:
-    """Sends a file as viser's page does."""
-
-    def __init__(self, server, opened) -> None:
-        self.server, self.opened = server, opened
-        self.button = server.gui.add_upload_button("file")
-        self.received: list[bytes] = []
-        self.arrived = threading.Event()
-        self.button.on_upload(lambda event: (self.received.append(event.target.value.content), self.arrived.set()))
-        camera = {"fov": 1.0, "near": 0.1, "far": 9.0, "image_height": 8, "image_width": 8}
-        three = (0.0, 0.0, 1.0)
-        self.send(messages.ViewerCameraMessage((1.0, 0, 0, 0), three, **camera, look_at=three, up_direction=three))
-        assert waited_for(server.get_clients)
-
-    def send(self, message) -> None:
-        self.opened.send(_infra.msgspec.msgpack.encode(message.as_serializable_dict()))
-
-    def start(self, name: str, size: int, parts: int) -> None:
-        self.send(messages.FileTransferStartUpload(self.button._impl.uuid, name, f"{name}.png", "", parts, size))
-
-    def part(self, name: str, index: int, content: bytes) -> None:
-        self.send(messages.FileTransferPart(self.button._impl.uuid, name, index, content))
-
-    def whole(self, name: str, content: bytes) -> None:
-        """Send a file that is accepted; earlier messages have been received when this returns."""
-        self.arrived.clear()
-        self.start(name, len(content), 1)
-        self.part(name, 0, content)
-        assert self.arrived.wait(LIMIT)
-
-    def uploads(self) -> dict[str, int]:
-        """Return the received bytes of unfinished uploads."""
-        states = self.server.gui._current_file_upload_states
-        return {name: state["transferred_bytes"] for name, state in states.items()}
-
-
-@pytest.fixture
-def uploader(server, monkeypatch):
-    monkeypatch.setattr(access, "MOST_BYTES", 2 * MIB)
-    with own_socket(server) as opened:
-        yield Uploader(server, opened)
-    assert waited_for(lambda: not server.get_clients())
-    assert server.gui._current_file_upload_states == {}  # a browser that leaves takes them with it
-    server.gui.reset()
-
-
-def test_a_file_is_refused_by_its_announced_size(uploader, monkeypatch):
-    notices = []
-    client = next(iter(uploader.server.get_clients().values()))
-    monkeypatch.setattr(type(client), "add_notification", lambda _, title, body, **__: notices.append(body))
-    uploader.start("big", 3 * MIB, 6)
-    uploader.part("big", 0, bytes(MIB // 2))
-    uploader.start("negative", -1, 1)
-    uploader.start("crumbs", 10, 10**9)
-    uploader.whole("good", b"image")
-    assert uploader.received == [b"image"]
-    assert uploader.uploads() == {}
-    assert notices[0] == "big.png: 3 MiB; at most 2 MiB are taken at a time"
-    assert len(notices) == 3
-
-
-def test_no_more_is_received_than_was_announced(uploader):
-    uploader.start("liar", 10, 4)
-    uploader.part("liar", 0, bytes(8))
-    uploader.part("liar", 1, bytes(MIB // 2))
-    uploader.part("liar", 2, bytes(MIB // 2))
-    uploader.whole("good", b"image")
-    assert uploader.uploads() == {}
-    assert uploader.received == [b"image"]
-
-
-def test_uploads_at_the_same_time_share_the_limit(uploader):
-    uploader.start("first", MIB, 2)
-    uploader.part("first", 0, bytes(MIB // 2))
-    uploader.start("second", MIB + 1, 3)
-    uploader.part("second", 0, bytes(MIB // 2))
-    uploader.whole("third", b"image")
-    assert uploader.uploads() == {"first": MIB // 2}
-    uploader.arrived.clear()
-    uploader.part("first", 1, bytes(MIB // 2))
-    assert uploader.arrived.wait(LIMIT)
-    assert [len(content) for content in uploader.received] == [5, MIB]
-
-
-def test_uploads_of_a_browser_without_a_camera_end_with_it(server):
-    """viser knows a browser from its first camera on."""
-    button = server.gui.add_upload_button("file")
-    uploads = server.gui._current_file_upload_states
-    with own_socket(server) as opened:
-        start = messages.FileTransferStartUpload(button._impl.uuid, "early", "a.png", "", 2, MIB)
-        opened.send(_infra.msgspec.msgpack.encode(start.as_serializable_dict()))
-        assert waited_for(lambda: uploads)
-    assert waited_for(lambda: not uploads)
-    assert uploads == {}
-    button.remove()
-
-
 def test_a_viser_without_our_checks_is_not_served(monkeypatch):
     """A future viser may call another function than the replaced one."""
     serve = websockets.asyncio.server.serve
@@ -271,7 +171,7 @@ def test_a_viser_without_our_checks_is_not_served(monkeypatch):
     ports = []
     stop = access.GuardedServer.stop
     monkeypatch.setattr(access.GuardedServer, "stop", lambda self: (ports.append(self.get_port()), stop(self)))
-    with pytest.raises(CompleteSplatError, match="cannot guard viser"):
+    with pytest.raises(CompleteSplatError, match="cannot be guarded"):
         start_server(0)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", ports[0]), timeout=LIMIT).close()

@@ -1,8 +1,11 @@
 """The page in a browser: Debian's Chromium without a screen, which draws WebGL on the CPU (SwiftShader)."""
 
+import base64
 import io
 import os
 import shutil
+import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,18 +14,19 @@ from PIL import Image
 from support import LIMIT, tiny_generator, waited_for
 from viewer_scenes import BALLS, balls_sample
 
+from completesplat.export.formats import write_splat
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
-from completesplat.viewer.access import start_server  # noqa: E402
+from completesplat.viewer.access import say, start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
 from completesplat.viewer.page import Page, Saver, write_page  # noqa: E402
 from completesplat.viewer.splat_view import SplatView  # noqa: E402
 
-CHROMIUM = shutil.which("chromium")
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")  # which GitHub's machines have
 pytestmark = [
     pytest.mark.browser,
     pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (apt-get install chromium)"),
@@ -56,7 +60,7 @@ def page(tmp_path_factory):
     view = SplatView(server, (0.0, -1.0, 0.0))
     view.show([balls_sample()])
     saver = Saver(tmp_path_factory.mktemp("saved"), view, ReferenceRasterizer, 2, 0.5)
-    made = Page(server, view, saver, layers=4)
+    made = Page(server, view, saver, {})
     made.completion = Completion(made, tiny_generator(), START)
     yield made
     made.close()
@@ -83,7 +87,7 @@ def pixels(tab) -> np.ndarray:
     """The scene's part of the window, [height width 3]."""
     tab.locator("canvas").first.wait_for(timeout=1000 * LIMIT)
     canvas = max(tab.locator("canvas").all(), key=lambda c: c.bounding_box()["width"])
-    return np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(float)
+    return np.asarray(Image.open(io.BytesIO(canvas.screenshot(timeout=1000 * LIMIT))).convert("RGB")).astype(float)
 
 
 def settled(tab) -> np.ndarray:
@@ -152,7 +156,7 @@ def test_the_page_has_our_title_and_icon_and_no_errors(tab):
 
 def test_a_phone_shows_the_whole_scene_and_the_panel_when_it_is_wanted(chromium, page):
     phone = open_tab(chromium, page.server.address, {"width": 390, "height": 700})
-    button = phone.get_by_role("button", name="Load an image")
+    button = phone.get_by_role("button", name="Load a file")
     assert not button.is_visible()
     seen = settled(phone)
     assert seen.shape[:2] == (700, 390)
@@ -192,7 +196,7 @@ def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     client = page.server.get_clients()[min(page.server.get_clients())]  # the tab, which came first
     assert abs(client.camera.position).max() > 0.3
     with tab.expect_file_chooser() as chooser:
-        tab.get_by_role("button", name="Load an image").click()
+        tab.get_by_role("button", name="Load a file").click()
     chooser.value.set_files(file)
     tab.get_by_text("1 drawn in").wait_for(timeout=1000 * LIMIT)
     first = changed(tab, turned)
@@ -205,6 +209,43 @@ def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     seed.press("Enter")
     assert waited_for(lambda: page.view.samples[0].settings.get("seed") == 9), "no new sample"
     changed(tab, first)
+
+
+DROP = """([name, content]) => {
+    const data = new DataTransfer();
+    data.items.add(new File([Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0))], name));
+    const drop = new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true });
+    document.querySelector("canvas").dispatchEvent(drop);
+    return drop.defaultPrevented;
+}"""
+
+
+def test_a_scene_that_is_dropped_on_the_page_is_shown(tab, page, tmp_path):
+    page.show([balls_sample()])
+    before = settled(tab)
+    write_splat(tmp_path / "red.splat", replace(balls_sample().gaussians, colors=torch.tensor([[0.9, 0.1, 0.1]] * 600)))
+    content = base64.b64encode((tmp_path / "red.splat").read_bytes()).decode()
+    assert tab.evaluate(DROP, ["red.splat", content]), "the browser would open the file itself"
+    assert waited_for(lambda: page.view.samples[0].layers == 1), "nothing arrives"
+    seen = changed(tab, before)
+    assert place(seen, BALLS["red"][1])
+    assert not (abs(seen - 255 * np.array(BALLS["blue"][1])).max(-1) < 40).any()
+    tab.get_by_text("completesplat: red.splat").wait_for(timeout=1000 * LIMIT)
+
+
+def test_a_phone_says_what_it_waits_for(chromium, page, monkeypatch):
+    waiting = threading.Event()
+    monkeypatch.setattr(viser.ClientHandle, "get_render", lambda *_, **__: waiting.wait(LIMIT))
+    phone = chromium.new_page(viewport={"width": 390, "height": 700})
+    phone.set_default_timeout(1000 * LIMIT)
+    html = phone.goto(page.server.address).text()
+    assert '<div id="root">completesplat: starting the page</div>' in html  # until viser's program has started
+    phone.get_by_text("Drawing the first image").wait_for()
+    say(page.server, "drawing from photo.png")
+    phone.get_by_text("completesplat: drawing from photo.png").wait_for()
+    waiting.set()
+    phone.get_by_text("Drawing the first image").wait_for(state="detached")
+    phone.close()
 
 
 def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):

@@ -16,8 +16,10 @@ from support import LIMIT, tiny_generator
 from viewer_scenes import balls_sample
 
 from completesplat.export.cleaning import with_screen_space_dilation
+from completesplat.export.formats import write_splat
 from completesplat.export.images import to_bytes
-from completesplat.export.ply import read_ply
+from completesplat.export.mesh import Mesh
+from completesplat.export.ply import read_ply, write_ply
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
@@ -66,7 +68,7 @@ def page(server, tmp_path, monkeypatch):
     server.gui.reset()
     view = SplatView(server, (0.0, -1.0, 0.0))
     view.show([balls_sample()])
-    made = Page(server, view, Saver(tmp_path / "out", view, ReferenceRasterizer, 2, 0.5), layers=4)
+    made = Page(server, view, Saver(tmp_path / "out", view, ReferenceRasterizer, 2, 0.5), {})
     yield made
     made.worker.close()
 
@@ -87,14 +89,21 @@ def finish(completion: Completion) -> list:
     return completion.page.view.samples
 
 
+def png(width: int = 40, height: int = 40, mode: str = "RGB") -> bytes:
+    Image.new(mode, (width, height), 1 if mode == "1" else (128, 50, 200)).save(buffer := io.BytesIO(), "PNG")
+    return buffer.getvalue()
+
+
+def load(page: Page, name: str, content: bytes, browser=None) -> list:
+    """Upload a file, and return the samples on the page when no job is left."""
+    page.opening.upload._impl.value = SimpleNamespace(name=name, content=content)
+    press(page.opening.upload, browser or Browser())
+    assert page.worker.wait(LIMIT)
+    return page.view.samples
+
+
 def upload(completion: Completion, name: str = "photo.png", content: bytes | None = None, browser=None) -> list:
-    if content is None:
-        Image.new("RGB", (40, 40), (128, 50, 200)).save(buffer := io.BytesIO(), "PNG")
-        content = buffer.getvalue()
-    button = completion.controls.upload
-    button._impl.value = SimpleNamespace(name=name, content=content)
-    press(button, browser or Browser())
-    return finish(completion)
+    return load(completion.page, name, content or png(), browser)
 
 
 def nodes(page: Page) -> dict[str, object]:
@@ -173,6 +182,82 @@ def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(comple
     assert completion.page.looking.chosen.options == ("sample 1", "sample 2", "all, side by side")
     assert [sample.finished for sample in seen] == [False, False, True]
     assert not torch.equal(seen[0].gaussians.means, seen[-1].gaussians.means)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("notes.txt", png(50, 40)[:60], "notes.txt: "),
+        ("../../\n\x1betc/passwd", b"nothing", "../../\\n\\x1betc/passwd: not an image"),  # no path, no markup
+        ("bomb.png", png(8000, 8000, "1"), "bomb.png: "),  # some kilobytes, 64 million pixels
+        ("a.splat", b"nothing", "a.splat: damaged"),
+        ("a.PLY", b"nothing", "a.PLY: not a .ply file"),
+    ],
+)
+def test_other_files_are_refused_by_their_own_name(completion, name, content, message):
+    browser, before = Browser(), completion.page.view.samples
+    assert upload(completion, name, content, browser) is before
+    assert len(browser.messages) == 1
+    assert browser.messages[0].startswith(message)
+
+
+def test_an_uploaded_scene_is_shown_from_the_front_with_switches_for_its_layers(completion, tmp_path):
+    page, scene = completion.page, balls_sample().gaussians
+    page.view.set_up((0.0, 0.0, -1.0))
+    write_splat(tmp_path / "a.splat", scene)
+    (sample,) = load(page, "some balls.SPLAT", (tmp_path / "a.splat").read_bytes())
+    assert torch.equal(sample.gaussians.means, scene.means)
+    assert page.view.up.tolist() == [0, -1, 0]
+    assert [box.visible for box in page.looking.layers] == [True] + [False] * 15
+    assert upload(completion)[0].settings["image"] == "photo.png"
+    assert page.view.up.tolist() == completion.model.up.tolist()
+
+
+def test_a_page_without_weights_takes_no_image(page):
+    browser = Browser()
+    load(page, "photo.png", png(), browser)
+    assert browser.messages == ["photo.png: not .ply, .splat, .spz; images need completesplat view IMAGE"]
+
+
+def test_one_of_several_scenes_is_chosen(server, tmp_path):
+    server.gui.reset()
+    for name, count in (("a", 2), ("b", 3)):
+        (tmp_path / name).mkdir()
+        for i in range(count):
+            write_ply(tmp_path / name / f"sample_{i:02}.ply", balls_sample().gaussians)
+    view = SplatView(server, (0.0, -1.0, 0.0))
+    made = Page(
+        server, view, Saver(tmp_path, view, ReferenceRasterizer, 2, 0.5), {"a": tmp_path / "a", "b": tmp_path / "b"}
+    )
+    made.saver.thumbnail = lambda *_: np.zeros((2, 2, 3), np.uint8)
+    assert (made.opening.chosen.visible, made.opening.chosen.options) == (True, ("a", "b"))
+    for name, count in (("b", 3), ("a", 2)):
+        made.opening.chosen.value = name
+        assert made.worker.wait(LIMIT)
+        assert len(view.samples) == count
+    write_splat(tmp_path / "c.splat", balls_sample().gaussians)
+    assert len(load(made, "c.splat", (tmp_path / "c.splat").read_bytes())) == 1
+    assert made.opening.chosen.value == "loaded: c.splat"
+    made.opening.chosen.value = "a"
+    assert made.worker.wait(LIMIT)
+    assert (len(view.samples), made.opening.chosen.options) == (2, ("a", "b"))
+    made.worker.close()
+
+
+def titles(page: Page, monkeypatch) -> list[str]:
+    """What the title of the panel says from now on."""
+    said = []
+    monkeypatch.setattr(page.server.gui, "set_panel_label", said.append)
+    return said
+
+
+def test_the_title_says_what_is_waited_for(completion, monkeypatch):
+    """A phone shows nothing else of its folded panel."""
+    said = titles(completion.page, monkeypatch)
+    completion.controls.forming.value = False
+    upload(completion)
+    assert said[0] == "completesplat: drawing from photo.png"
+    assert said[1].startswith("completesplat: 2 drawn in ")
 
 
 def test_a_slider_draws_anew_unless_drawing_is_off(completion):
@@ -259,6 +344,7 @@ def test_files_are_written_and_sent_to_their_browser(page, kind, count, name, tm
     press(page.saving.save, browser)
     assert page.worker.wait(LIMIT)
     assert sorted(browser.files) == [name.format(i) for i in range(count)]
+    assert browser.messages == [f"{', '.join(sorted(browser.files))} in {page.saver.folder}"]
     for file, content in browser.files.items():
         assert (page.saver.folder / file).read_bytes() == content
 
@@ -283,6 +369,17 @@ def test_files_have_the_screen_space_dilation_once_and_videos_none(page, monkeyp
     assert torch.allclose(read_ply(ply).scales, wide.scales, rtol=1e-5)
     assert torch.equal(read_ply(ply).means, sample.gaussians.means)
     assert torch.equal(drawn[0].scales, sample.gaussians.scales)
+
+
+def test_a_mesh_is_saved_beside_the_splats(page, monkeypatch):
+    corners = torch.cat([torch.zeros(1, 3), torch.eye(3)])
+    tetrahedron = Mesh(corners, np.array([[0, 2, 1], [0, 3, 2], [0, 1, 3], [1, 2, 3]]), corners, 0.1)
+    drawn = []
+    monkeypatch.setattr("completesplat.export.formats.mesh_of", lambda *given: drawn.append(given) or tetrahedron)
+    paths = [page.saver.save(kind, [balls_sample()])[0] for kind in ("mesh", "ply", "mesh")]
+    assert [path.name for path in paths] == ["sample_00_mesh.glb", "sample_00.ply", "sample_01_mesh.glb"]
+    assert all(path.is_file() for path in paths)
+    assert drawn[0][0] is page.saver.rasterizer()
 
 
 def test_a_taken_port_leads_to_the_next_one(server):

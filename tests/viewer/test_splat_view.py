@@ -72,39 +72,39 @@ def test_a_camera_stays_while_the_scene_changes_a_little():
 def test_covariances_have_the_rotated_axes_and_squared_scales():
     """The variance along each of a Gaussian's axes, found by rotating unit vectors one by one, is its scale squared."""
     gaussians = balls(points=5)
-    splats = to_splats(gaussians)
-    parts = gaussians.quaternions.numpy(), gaussians.scales.numpy(), splats.covariances
+    splats, unit = to_splats(gaussians)
+    parts = gaussians.quaternions.numpy(), gaussians.scales.numpy(), splats["covariances"]
     for quaternion, scales, covariance in zip(*parts, strict=True):
         w, *xyz = (quaternion / np.linalg.norm(quaternion)).tolist()
         for axis, scale in zip(np.eye(3), scales, strict=True):
             turned = axis + 2 * np.cross(xyz, np.cross(xyz, axis) + w * axis)  # of the quaternion product q v q*
-            assert turned @ covariance @ turned * splats.scale**2 == pytest.approx(scale**2, rel=1e-4)
-            assert covariance @ turned == pytest.approx(turned * (scale / splats.scale) ** 2, rel=1e-3, abs=1e-1)
+            assert turned @ covariance @ turned * unit**2 == pytest.approx(scale**2, rel=1e-4)
+            assert covariance @ turned == pytest.approx(turned * (scale / unit) ** 2, rel=1e-3, abs=1e-1)
 
 
 @pytest.mark.parametrize("size", [1e-4, 1e4])
 def test_half_precision_keeps_the_shapes_at_every_size(size):
     gaussians = balls(points=5)
-    scaled = to_splats(replace(gaussians, scales=gaussians.scales * size))
-    halves = scaled.covariances.astype(np.float16).astype(np.float64)
+    scaled, unit = to_splats(replace(gaussians, scales=gaussians.scales * size))
+    halves = scaled["covariances"].astype(np.float16).astype(np.float64)
     assert np.isfinite(halves).all()
     for half, scales in zip(halves, gaussians.scales.numpy() * size, strict=True):
-        deviations = np.sqrt(np.linalg.eigvalsh(half)) * scaled.scale
+        deviations = np.sqrt(np.linalg.eigvalsh(half)) * unit
         assert deviations == pytest.approx(np.sort(scales), rel=0.01)
 
 
 def test_centers_and_bytes_of_finite_gaussians():
     gaussians = balls(points=2)
     gaussians.colors[0] = torch.tensor([2.0, 0.5, 0.0])
-    splats = to_splats(gaussians)
-    assert splats.centers * splats.scale == pytest.approx(gaussians.means.numpy(), rel=1e-5, abs=1e-5)
-    assert splats.colors[0].tolist() == [255, 128, 0]
-    assert splats.opacities.tolist() == [[204]] * gaussians.count
+    splats, unit = to_splats(gaussians)
+    assert splats["centers"] * unit == pytest.approx(gaussians.means.numpy(), rel=1e-5, abs=1e-5)
+    assert splats["rgbs"][0].tolist() == [255, 128, 0]
+    assert splats["opacities"].tolist() == [[204]] * gaussians.count
     gaussians.means[3, 1], gaussians.scales[5, 0] = torch.nan, torch.inf
-    splats = to_splats(gaussians)
-    assert len(splats.centers) == gaussians.count - 2
-    assert all(np.isfinite(part).all() for part in splats[:4])
-    assert to_splats(gaussians[:0]).centers.shape == (0, 3)
+    splats, _ = to_splats(gaussians)
+    assert len(splats["centers"]) == gaussians.count - 2
+    assert all(np.isfinite(part).all() for part in splats.values())
+    assert to_splats(gaussians[:0])[0]["centers"].shape == (0, 3)
 
 
 def test_depth_colours_brighten_towards_the_camera_on_one_scale():

@@ -132,9 +132,7 @@ def _download(name: str) -> tuple[Path, Path]:
     from huggingface_hub import hf_hub_download
 
     if not re.fullmatch(r"\w+", name):
-        raise WeightsError(
-            f"{PREFIX}{shown(name)}: give the NAME of a config_NAME.yaml at https://huggingface.co/{HUB}"
-        )
+        raise WeightsError(f"{PREFIX}{shown(name)}: give NAME of a config_NAME.yaml at https://huggingface.co/{HUB}")
     files = f"config_{name}.yaml", GENERAL_FILE if name == GENERAL else f"model_{name}.pth"
     try:
         config, model = (Path(hf_hub_download(HUB, file)) for file in files)

@@ -1,8 +1,7 @@
 """Splatter Image with its authors' published weights (Szymanowicz et al., CVPR 2024): one pass, one answer.
 
 It sees an object on a plain background and predicts one Gaussian per pixel. It draws no samples, so hidden parts are
-reconstructed as an average. This is a new implementation after commit 78a6ad0 of szymanowiczs/splatter-image
-(`scene/gaussian_predictor.py`).
+reconstructed as an average. Written after `scene/gaussian_predictor.py` of szymanowiczs/splatter-image at 78a6ad0.
 """
 
 from collections import OrderedDict
@@ -132,8 +131,7 @@ class PublishedSplatterImage(ReconstructionModel):
         depths: depth range of its Gaussians.
 
     Args:
-        weights: `splatter_image:NAME` on the hub, a `.pth` file beside its `config_NAME.yaml`, or a folder with
-            both; see `files.py`.
+        weights: `splatter_image:NAME` on the hub, a `.pth` file beside its `config_NAME.yaml`, or their folder.
 
     Raises:
         WeightsError: the files are missing, unreadable, or have other tensors (name, size, type) than this network.
@@ -174,9 +172,7 @@ class PublishedSplatterImage(ReconstructionModel):
         """Reconstruct from sRGB images in [0, 1] of objects on `background`; there is no posterior."""
         output = self.network_with_offset(images).float()
         raw, harmonics = output.split([CHANNELS, HARMONICS], dim=1)
-        return Reconstruction(
-            DirectionalSplatterImage(raw[:, None], PARAMETERIZATION, harmonics, self.depths), posterior=None
-        )
+        return Reconstruction(DirectionalSplatterImage(raw[:, None], PARAMETERIZATION, harmonics, self.depths), None)
 
     def object_distance(self, image: Float[Tensor, "3 size size"], focal_length: float) -> float:
         """Estimate the distance of an object on `background`, assuming that it is as large as the training objects.
@@ -256,10 +252,8 @@ class PublishedOneAnswer(SceneModel):
         if known is not None and fov_degrees is not None:
             raise CompleteSplatError(f"fov={fov_degrees:g}: these weights take every image as of {known:.0f} degrees")
         share, background = (None if known is None else OBJECT_SHARE), self.network.background
-        photograph = read_photograph(
-            image, self.image_size, fov_degrees, PHONE_FOV, remove_background, background, share
-        )
-        return photograph if known is None else replace(photograph, fov_degrees=known, fov_source="default")
+        photo = read_photograph(image, self.image_size, fov_degrees, PHONE_FOV, remove_background, background, share)
+        return photo if known is None else replace(photo, fov_degrees=known, fov_source="default")
 
     def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
         """Return near and far; for weights trained on captures, around the object's estimated distance."""

@@ -81,16 +81,14 @@ class SongUNet(nn.Module):
         size: side of the images in pixels, a multiple of 8; levels are named after their sizes.
         width: channels of the first level; all others have twice as many.
         blocks: residual blocks per level on the way down; the way up has one more.
-        attention_sizes: sizes of levels with attention: in every block on the way down, in the last on the way up.
+        attention: sizes of levels with attention: in every block on the way down, in the last on the way up.
     """
 
-    def __init__(
-        self, size: int, inputs: int, outputs: int, width: int, blocks: int, attention_sizes: Sequence[int]
-    ) -> None:
+    def __init__(self, size: int, inputs: int, outputs: int, width: int, blocks: int, attention: Sequence[int]) -> None:
         super().__init__()
         self.enc, self.dec = nn.ModuleDict(), nn.ModuleDict()
         levels = [(f"{size >> level}x{size >> level}", width * multiple) for level, multiple in enumerate(MULTIPLES)]
-        attending = [size >> level in attention_sizes for level in range(len(MULTIPLES))]
+        attending = [size >> level in attention for level in range(len(MULTIPLES))]
         self.enc[f"{levels[0][0]}_conv"] = nn.Conv2d(inputs, width, 3, padding=1)
         channels, skips = width, [width]
         for level, (name, outer) in enumerate(levels):

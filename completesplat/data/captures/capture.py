@@ -1,9 +1,12 @@
 """Common form of captures, independent of their files and conventions, and undistorted reading of their images."""
 
 import re
+import signal
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -148,10 +151,8 @@ def undistorted_lens(lens: Lens) -> Lens:
     """
     if not any(lens.distortion):
         return lens
-    camera, (height, width) = _distorted(lens), lens.image_size
-    from pycolmap import UndistortCameraOptions, undistort_camera
-
-    pinhole = undistort_camera(UndistortCameraOptions(), camera)
+    pycolmap, (height, width) = import_pycolmap(), lens.image_size
+    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), _distorted(lens))
     size = pinhole.height, pinhole.width
     sides = size[0] / height, size[1] / width
     if sides[0] * sides[1] < SMALLEST_AREA or max(sides) >= LARGEST_SIDE:
@@ -164,18 +165,25 @@ def undistort(image: Image.Image, lens: Lens) -> Image.Image:
     """Return the image of `undistorted_lens`, resampled bilinearly."""
     if not any(lens.distortion):
         return image
-    camera = _distorted(lens)
-    from pycolmap import Bitmap, UndistortCameraOptions, undistort_image
+    pycolmap = import_pycolmap()
+    options, bitmap = pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(np.array(image))
+    return Image.fromarray(pycolmap.undistort_image(options, bitmap, _distorted(lens))[0].to_array())
 
-    bitmap = Bitmap.from_array(np.array(image))
-    return Image.fromarray(undistort_image(UndistortCameraOptions(), bitmap, camera)[0].to_array())
+
+def import_pycolmap() -> ModuleType:
+    """Import pycolmap without its handler of SIGTERM, which ends a program before it has cleared up."""
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        import pycolmap
+    except ImportError:
+        message = 'lenses with distortion and cameras=colmap need pycolmap: pip install "completesplat[colmap]"'
+        raise CompleteSplatError(message) from None
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
+    return pycolmap
 
 
 def _distorted(lens: Lens) -> "Camera":
-    try:
-        from pycolmap import Camera
-    except ImportError:
-        message = "images of a lens with distortion need pycolmap: pip install completesplat[colmap]"
-        raise CompleteSplatError(message) from None
     (height, width), params = lens.image_size, [*lens.focal, *lens.center, *lens.distortion, 0.0, 0.0, 0.0]
-    return Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+    camera: Camera = import_pycolmap().Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+    return camera

@@ -1,12 +1,15 @@
 """Data module of a user's captures, which are read in place."""
 
 import hashlib
+import shlex
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import torch
 
 from completesplat.data.captures.capture import Capture, CapturedFrame
 from completesplat.data.captures.colmap import read_colmap
@@ -15,6 +18,7 @@ from completesplat.data.images.crop import cut_square
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.placement import (
+    OBJECT_HALF_SIZE,
     ObjectFraming,
     from_cameras,
     from_points,
@@ -105,7 +109,11 @@ class CaptureSource(SequenceSource):
             placement = from_points(near, upright_axes(cameras), "the point cloud")
         numbers = self._members(len(capture.frames))
         read = partial(_read, name, [capture.frames[number] for number in numbers], self.framing.image_size)
-        return placed_sequence(name, numbers, [cameras[number] for number in numbers], placement, self.framing, read)
+        scale = OBJECT_HALF_SIZE / placement.half_size
+        points = None if capture.points is None else torch.from_numpy(scale * capture.points).float()
+        selected = [cameras[number] for number in numbers]
+        sequence = placed_sequence(name, numbers, selected, placement, self.framing, read)
+        return replace(sequence, points=points, scale=scale)
 
 
 def _read(name: str, frames: list[CapturedFrame], size: int, index: int) -> MaskedImage:
@@ -147,6 +155,8 @@ class CaptureDataModule(ObjectDataModule):
 
     def open(self, split: str) -> Mapping[str, CaptureSource]:
         """Read the cameras of all captures; the error of one capture is only raised if no other can be read."""
+        if not self.root.exists():
+            raise MissingFile("no such file or folder", str(self.root))
         captures: dict[str, Capture] = {}
         refused: list[DataError] = []
         folders = [self.root, *sorted(path for path in self.root.glob("*/") if path.is_dir())]
@@ -158,7 +168,9 @@ class CaptureDataModule(ObjectDataModule):
             if folder == self.root and (captures or refused):
                 break
         if not captures:
-            message = "no capture there: neither transforms.json nor sparse/0, nor folders that have one"
+            command = shlex.join(["completesplat", "data", "import", str(self.root), "cameras=colmap"])
+            message = "no cameras there: neither transforms.json nor sparse/0, nor folders that have one; photos or a "
+            message += f"video get cameras by: {command}"
             raise refused[0] if refused else MissingFile(message, str(self.root))
         training, held_out = partial(members, self.hold_out, False), partial(members, self.hold_out, True)
         parts = {"train": training, "val": held_out, "test": held_out}

@@ -3,7 +3,6 @@
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 from os.path import isfile
 from pathlib import Path
 
@@ -121,10 +120,8 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
                 if any(lens.distortion) or not math.isclose(*lens.focal, rel_tol=SAME_FOCAL):
                     raise BadCamera(f"only pinhole cameras are rendered, not {lens.focal}, {lens.distortion}")
                 (height, width), scale = lens.image_size, size / min(lens.image_size)
-                (focal, _), (x, y) = lens.focal, lens.center
-                intrinsics = scale * torch.tensor(
-                    [[focal, 0, x], [0, focal, y], [0, 0, 1 / scale]], dtype=torch.float64
-                )
+                (f, _), (x, y) = lens.focal, lens.center
+                intrinsics = scale * torch.tensor([[f, 0, x], [0, f, y], [0, 0, 1 / scale]], dtype=torch.float64)
                 cameras.append(Cameras(pose, intrinsics, (round(scale * height), round(scale * width))))
         if len(cameras) < FEWEST_CAMERAS:
             raise TooFewFrames(f"{len(cameras)} frames; at least {FEWEST_CAMERAS} are rendered")
@@ -173,7 +170,10 @@ def _read_lens(values: Entry, image: Path) -> Lens:
     others = [key for key in OTHER_LENSES if values.get(key)]
     if not isinstance(model, str) or model not in USED or others:
         raise BadCamera(f"camera model {others[0] if others else model} is not supported; there are: {', '.join(USED)}")
-    number = partial(_number, values)
+
+    def number(key: str, default: float | None = None) -> float:
+        return default if default is not None and key not in values else float(finite_array(values.get(key), (), key))
+
     stored = None if {"w", "h"} <= values.keys() else stored_size(image, str(image))
     height, width = stored or (int(number("h")), int(number("w")))  # instant-ngp writes floats.
     if "fl_x" in values:
@@ -191,10 +191,6 @@ def _read_lens(values: Entry, image: Path) -> Lens:
     k1, k2, p1, p2, k3 = (number(key, 0.0) for key in COEFFICIENTS)
     center = number("cx", width / 2), number("cy", height / 2)
     return Lens((fx, fy), center, (height, width), (k1, k2, p1, p2, k3))
-
-
-def _number(values: Entry, key: str, default: float | None = None) -> float:
-    return default if default is not None and key not in values else float(finite_array(values.get(key), (), key))
 
 
 def _focal(angle: float, side: int) -> float:

@@ -53,8 +53,7 @@ Frames = dict[str, dict[int, CO3DFrame]]
 """Frames by sequence and number."""
 
 
-@dataclass(frozen=True)
-class CO3DVideo:
+class CO3DVideo(NamedTuple):
     """Annotation of a whole sequence; a quality is None if it is missing or NaN."""
 
     point_cloud: Path | None

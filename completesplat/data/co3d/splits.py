@@ -30,8 +30,8 @@ logger = logging.getLogger(__name__)
 class SeededSplit(NamedTuple):
     """Shares of the sequences that are held out by seed, at least one sequence for each share.
 
-    Without a set list, they are shares of all sequences. For a list without validation, `val_fraction` is held out of
-    its training sequences.
+    Without a set list, they are shares of all sequences; without validation in a list, `val_fraction` is taken from
+    training.
     """
 
     val_fraction: float
@@ -116,8 +116,7 @@ class Filters:
 
     Attributes:
         min_frames: a sequence with fewer frames in a split is left out of the split.
-        min_viewpoint_quality, min_point_cloud_quality: smallest CO3D scores; None: any. If one is set, sequences
-            without this score are left out.
+        min_viewpoint_quality, min_point_cloud_quality: smallest CO3D scores, which a sequence then needs; None: any.
         most_training_sequences: largest number, taken by best viewpoint quality (DFM: 500); None: all.
     """
 

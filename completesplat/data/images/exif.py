@@ -43,8 +43,7 @@ def crop_fov(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:
 
     The focal length in pixels is FocalLengthIn35mmFilm / 36 mm * longer side (the longer side of the image corresponds
     to the 36 mm of a full frame), else FocalLength * FocalPlaneXResolution, scaled from the recorded to the actual
-    image size. Then fov = 2 atan(shorter side / (2 focal)). The result is wrong for an image that was cropped or
-    stitched after it was taken.
+    image size. Then fov = 2 atan(shorter side / (2 focal)). The result is wrong for cropped or stitched images.
     """
     equivalent = _positive(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
     focal = equivalent / FULL_FRAME_WIDTH * max(size) if equivalent else _focal_from_sensor(exif, max(size))

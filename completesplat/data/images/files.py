@@ -161,14 +161,14 @@ def deep_grey(image: Image.Image, tiff_tags: Mapping[int, object]) -> np.ndarray
     return values.astype(np.float32)
 
 
-def image_bytes(image: Image.Image, kind: str, **options: int) -> bytes:
+def image_bytes(image: Image.Image, kind: str, **options: int | bytes) -> bytes:
     """Return the content of an image file in Pillow's format `kind`."""
     content = io.BytesIO()
     image.save(content, kind, **options)
     return content.getvalue()
 
 
-def save_image(image: Image.Image, path: Path, **options: int) -> None:
+def save_image(image: Image.Image, path: Path, **options: int | bytes) -> None:
     """Write an image in the format of its path's suffix; a full disk raises, while Pillow would truncate a JPEG."""
     path.write_bytes(image_bytes(image, Image.registered_extensions()[path.suffix], **options))
 

@@ -4,6 +4,7 @@ Also masks of hidden regions, statistics that characterize a set of images, and 
 """
 
 import io
+import logging
 import math
 import os
 from collections.abc import Sequence
@@ -38,6 +39,9 @@ DEEP_GREY_MODES = (*SIXTEEN_BIT_MODES, "I", "F")
 LARGEST_OBJECT = 4096  # pixels; larger ones are reduced before they are padded to a square of unbounded size
 LANCZOS_REACH = 3  # radius of the filter, in pixels of the coarser image
 CUTTER = "u2net"  # rembg's default network has a licence for non-commercial use only
+GRABCUT_SIDE = 400  # pixels; more would take longer than a prediction
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -200,25 +204,52 @@ def _to_srgb(square: Image.Image, background: float) -> Image.Image:
 
 
 def without_background(image: Image.Image) -> Image.Image:
-    """Make the background of an RGB image transparent (RGBA) with U2-Net (Qin et al. 2020) from rembg.
+    """Make the background of an RGB image transparent (RGBA) with U2-Net (Qin et al. 2020) from rembg, or by GrabCut.
 
     Raises:
-        CompleteSplatError: rembg is not installed, or fails; on first use it downloads the network (176 MB).
+        CompleteSplatError: OpenCV is not installed, nor a rembg that works; it downloads its network (176 MB).
         ImageError: the whole image is background.
     """
-    try:
-        import rembg
-    except (ImportError, SystemExit) as error:  # rembg exits if onnxruntime is missing
-        advice = 'pip install "completesplat[background]"'
-        raise CompleteSplatError(f"background=remove needs rembg and onnxruntime: {advice}") from error
     pixels = Image.fromarray(np.array(image))  # without EXIF, because rembg would turn the image again
     try:
+        import rembg
+
         cut: Image.Image = rembg.remove(pixels, session=_session())
+        log.info("background: removed by rembg (%s)", CUTTER)
+    except (ImportError, SystemExit):  # rembg exits if onnxruntime is missing
+        cut = by_grabcut(pixels)
     except Exception as error:  # from the HTTP library, onnxruntime or the file system
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise CompleteSplatError(f"background=remove: rembg fails with its network {CUTTER} ({reason})") from error
+        log.warning("background: rembg fails with its network %s (%s)", CUTTER, reason)
+        cut = by_grabcut(pixels)
     if not cut.getchannel("A").getbbox():
         raise ImageError("background=remove leaves nothing of it: no object is found")
+    return cut
+
+
+def by_grabcut(image: Image.Image) -> Image.Image:
+    """Keep the largest piece of what differs in colour from the image's border (GrabCut, Rother et al. 2004).
+
+    Raises:
+        CompleteSplatError: OpenCV is not installed.
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        extras = 'pip install "completesplat[background]", or "completesplat[grabcut]" (no download, coarser)'
+        raise CompleteSplatError(f"background=remove needs rembg or OpenCV: {extras}") from error
+    width, height = (max(SMALLEST_SIDE, round(side * GRABCUT_SIDE / max(image.size))) for side in image.size)
+    small, labels = np.array(image.resize((width, height))), np.zeros((height, width), np.uint8)
+    x, y = width // 30, height // 30  # at least one of them is above 0
+    models = np.zeros((2, 1, 65))
+    cv2.setRNGSeed(0)
+    cv2.grabCut(small, labels, (x, y, width - 2 * x, height - 2 * y), models[0], models[1], 5, cv2.GC_INIT_WITH_RECT)
+    _, pieces, statistics, _ = cv2.connectedComponentsWithStats(labels & 1)
+    sizes = [0, *statistics[1:, cv2.CC_STAT_AREA]]  # the first piece is the background
+    mask = (pieces == np.argmax(sizes)) & (labels & 1 > 0)
+    log.info('background: removed by GrabCut, from colours; rembg is better: pip install "completesplat[background]"')
+    cut = image.convert("RGBA")
+    cut.putalpha(Image.fromarray(mask).convert("L").resize(image.size, Image.Resampling.BICUBIC))
     return cut
 
 

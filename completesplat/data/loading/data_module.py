@@ -316,8 +316,7 @@ class ObjectDataModule(SceneDataModule):
         validation_targets: the same for a validation scene; None: as for a test scene.
         spread_targets: spread the training targets evenly around the reference (the sequence taken as a ring), in
             random order, for a posterior that sees them; false: draw random targets.
-        depth_before, depth_after: depth range in front of and behind the object's centre; the object's half size is
-            0.57.
+        depth_before, depth_after: depth range in front of and behind the centre of the object, whose half size is 0.57.
         **settings: of `SceneDataModule`.
     """
 

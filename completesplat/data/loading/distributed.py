@@ -18,11 +18,6 @@ def processes() -> tuple[int, int]:
     return 0, 1
 
 
-def is_first() -> bool:
-    """Return whether this is the first process, or the only one."""
-    return processes()[0] == 0
-
-
 def gathered(value: T) -> list[T]:
     """Gather the values of all processes in rank order; every process must call this."""
     count = processes()[1]

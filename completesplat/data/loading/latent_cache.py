@@ -225,8 +225,7 @@ class CachedTrainingScenes(TrainingScenes):
     """Items of `TrainingScenes` without targets, with the same sequence and reference frame for (seed, epoch, index).
 
     If only some frames of a sequence were encoded, the nearest one (the earlier of two) replaces the reference frame.
-    `store` determines the order of items; its images are neither read nor augmented. Box masks hide parts of images
-    as in `augment`.
+    `store` determines the order of items; its images are not read. Box masks hide parts of images as in `augment`.
 
     Raises:
         CompleteSplatError: there are box masks, but the store holds features instead of images.

@@ -144,7 +144,7 @@ def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None)
         frames = tuple(numbers["frames"].tolist())
         world_to_camera = torch.from_numpy(numbers["world_to_camera"]).view(count, 4, 4)
         cameras = Cameras(world_to_camera, torch.from_numpy(numbers["intrinsics"]).view(count, 3, 3), (size, size))
-        wanted = image_size or size
+        side = image_size or size
         depth_ranges = torch.from_numpy(numbers["depth_ranges"]).view(count, 2)
         images, masks = _values(row, "images", count), _values(row, "masks", count)
         checksums = _numbers(row, "picture_checksums", count)
@@ -154,11 +154,9 @@ def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None)
                 image, mask = images[index].as_py(), masks[index].as_py()
                 if image is None or EncodedImage(image, mask).checksum() != checksums[index]:
                     raise BadImage("is no longer what was written")
-                return MaskedImage(
-                    decode(image, 3, size, wanted), None if mask is None else decode(mask, 1, size, wanted)
-                )
+                return MaskedImage(decode(image, 3, size, side), None if mask is None else decode(mask, 1, size, side))
 
-        return PosedSequence(name, frames, crop_resize(cameras, 0, 0, size, wanted), depth_ranges, read)
+        return PosedSequence(name, frames, crop_resize(cameras, 0, 0, size, side), depth_ranges, read)
 
 
 def _values(row: pa.Table, column: str, count: int | None = None) -> pa.Array:

@@ -4,7 +4,7 @@ import hashlib
 import json
 import logging
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -201,9 +201,7 @@ def prepare(
     return out
 
 
-def _plan(
-    writer: ShardWriter, settings: Mapping[str, Scalar], plans: Sequence[ShardPlan]
-) -> dict[str, dict[str, Scalar]]:
+def _plan(writer: ShardWriter, settings: Mapping[str, Scalar], plans: list[ShardPlan]) -> dict[str, dict[str, Scalar]]:
     """Return everything that determines the shards' bytes."""
     shards = json.dumps([[plan.file, *plan.names] for plan in plans])
     return {

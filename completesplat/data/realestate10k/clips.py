@@ -66,14 +66,11 @@ class Clip:
 
     def read(self, frame: int, square: Square, size: int) -> UInt8[Tensor, "3 {size} {size}"]:
         """Return the square part of a frame's image, resized to `size`."""
-        return cut_square(
-            decode(*_stored(self.images[frame], self.source), "RGB", self.cameras.image_size), square, size
-        )
+        stored = _stored(self.images[frame], self.source)
+        return cut_square(decode(*stored, "RGB", self.cameras.image_size), square, size)
 
 
-def make_clip(
-    key: str, source: Path, timestamps: Sequence[int], rows: Float[Tensor, "view 18"], images: Images
-) -> Clip:
+def make_clip(key: str, source: Path, timestamps: Sequence[int], rows: Float[Tensor, "_ 18"], images: Images) -> Clip:
     """Convert stored rows and images to a clip; the first image determines the size.
 
     Raises:

@@ -87,10 +87,8 @@ def run_job(
     separator = () if PYTHON_OPTIONS[0] in blender.command else ("--",)
     with messages.open("wb") as output:
         command = [*blender.command, str(SCRIPT), *separator, str(path)]
-        variables = {**os.environ, "TMPDIR": str(folder)}
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, env=variables
-        )
+        env = {**os.environ, "TMPDIR": str(folder)}
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, env=env)
         while process.poll() is None:
             if stopped.is_set() or time.monotonic() > end:
                 process.kill()

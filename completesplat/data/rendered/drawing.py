@@ -95,8 +95,7 @@ def draw_cameras(
     Args:
         kind: `turn`: around the object at varying heights, as people film for CO3D; `hemisphere`: from random
             directions above the ground; or the path of a `transforms.json`, whose cameras are taken.
-        front: azimuth of the object's front in degrees, from x to y; the first camera is within `ASIDE` of it. None: it
-            is anywhere.
+        front: azimuth of the object's front (degrees, from x to y), at most `ASIDE` from the first camera; None: any.
         fov: smallest and largest field of view in degrees, drawn once for an object.
 
     Raises:

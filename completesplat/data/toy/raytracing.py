@@ -84,10 +84,8 @@ class Room(NamedTuple):
 def compiled(function: F, cache: bool = True, forceinline: bool = False) -> F:
     """Compile a function with numba at its first call."""
     # Unwrapping removes a run-time type checker's wrapper.
-    machine_code: F = njit(
-        inspect.unwrap(function), cache=cache, forceinline=forceinline, nogil=True, error_model="numpy"
-    )
-    return machine_code
+    compiled: F = njit(inspect.unwrap(function), cache=cache, forceinline=forceinline, nogil=True, error_model="numpy")
+    return compiled
 
 
 # Passing a tuple of arrays to a function that is not inlined costs as much as intersecting a sphere.

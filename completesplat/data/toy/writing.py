@@ -52,16 +52,14 @@ Written = tuple[str, list[Annotation], Annotation]
 """Split of a sequence, and annotations of its frames and of itself."""
 
 
-def _write_frame(
-    folder: Path, category: str, name: str, scene: ToyScene, frame: int, size: int, split: str
-) -> Annotation:
+def _write_frame(folder: Path, place: tuple[str, str, int], scene: ToyScene, size: int, split: str) -> Annotation:
+    _, name, frame = place
     # The world has the scene's unit and origin.
     world_to_camera = np.linalg.inv(scene.camera_to_world[frame])
     rotation = world_to_camera[:3, :3]
     translation = scene.unit * world_to_camera[:3, 3] - rotation @ scene.origin
     focal = float(1 / np.tan(np.radians(scene.fov_degrees) / 2))
     seen_from = viewpoint(rotation, translation, [focal, focal], [0.0, 0.0])
-    place = category, name, frame
     annotation = write_frame(folder / name, place, *render_frame(scene, frame, size), seen_from, scene.unit)
     return annotation | {"meta": {"frame_type": f"{split}_known"}}
 
@@ -90,7 +88,7 @@ def _write_scene(
     name = f"{index:05d}_{scene.family}"
     for folder in FOLDERS:
         (root / name / folder).mkdir(parents=True)
-    annotations = [_write_frame(root, category, name, scene, frame, size, split) for frame in range(frames)]
+    annotations = [_write_frame(root, (category, name, frame), scene, size, split) for frame in range(frames)]
     points = scene.unit * scene.points + scene.origin
     write_points(root / name / "pointcloud.ply", points, to_bytes(scene.point_colors))
     hidden = {"family": scene.family, "patch_color": scene.patch_color}

@@ -97,8 +97,7 @@ def inside(root: Path, relative: str) -> Path:
     """Return the path below `root` that an annotation names. Links are followed if they stay below `root`.
 
     Raises:
-        OutsidePath: the path is empty or absolute, has `..`, a backslash, a drive, a scheme or a NUL, or leads out of
-            `root` through a link.
+        OutsidePath: the path is empty or absolute, has `..`, a backslash, drive, scheme or NUL, or a link leads out.
     """
     path, windows = PurePath(relative), PureWindowsPath(relative)
     plain = path.parts and not path.is_absolute() and ".." not in path.parts and not windows.drive

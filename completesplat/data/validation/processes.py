@@ -15,10 +15,8 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def map_in_processes(
-    function: Callable[[Item], Result], items: Sequence[Item], workers: int | None
-) -> Iterator[Result]:
-    """Yield `function` of every item in order, by `workers` processes (None: one for each core) that get it once.
+def map_in_processes(work: Callable[[Item], Result], items: Sequence[Item], workers: int | None) -> Iterator[Result]:
+    """Yield `work` of every item in order, by `workers` processes (None: one for each core) that get it once.
 
     Raises:
         CompleteSplatError: a process ended unexpectedly.
@@ -26,10 +24,10 @@ def map_in_processes(
     """
     workers = min(workers or os.cpu_count() or 1, len(items))
     if workers <= 1:
-        yield from map(function, items)
+        yield from map(work, items)
         return
     # Pickled to bytes, because torch would share each tensor as an open file, and there are too many cameras for that.
-    contents = pickle.dumps(function)
+    contents = pickle.dumps(work)
     with ProcessPoolExecutor(workers, get_context("spawn"), _start, (contents,)) as pool:
         try:
             yield from cast(Iterator[Result], pool.map(_call, items))
@@ -48,7 +46,7 @@ _function: Callable[[object], object]
 
 
 def _start(contents: bytes) -> None:
-    """Prepare a new process and store its function."""
+    """Prepare a new process and store its work."""
     import torch
 
     global _function

@@ -1,0 +1,140 @@
+"""Import of captures: a check of their cameras, or cameras by COLMAP for photos or a video."""
+
+import logging
+import os
+import shlex
+import subprocess
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+from typing import Literal
+
+from PIL import Image, ImageOps
+from rich.progress import Progress, track
+
+from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
+from completesplat.data.captures.module import CaptureDataModule
+from completesplat.data.images.files import FORMATS, check_sums, opened, refused_as_bad, save_image, stored_size
+from completesplat.data.validation import refused_to
+from completesplat.errors import DataError
+from completesplat.files import atomic_folder, folder_names
+from completesplat.settings.schema import Positive
+
+logger = logging.getLogger(__name__)
+leave_out = partial(logger.warning, "left out: %s")
+
+MOST_FEATURES = 4096  # of an image; the time of matching grows with their square
+MOST_WITH_ALL_PAIRS = 100  # photos; of more, as of a video, neighbours are matched
+NEAR = 10  # frames
+
+
+def import_capture(
+    folder: str, cameras: Literal["colmap"] | None, frames: Positive, max_image_size: Positive, out: Path
+) -> str:
+    """Check the cameras of captures, which COLMAP computes first if asked to; return the command that goes on."""
+    root = Path(folder) if cameras is None else _make_capture(Path(folder), frames, max_image_size, out)
+    sources = CaptureDataModule(str(root)).open("train")
+    for error in sources["train"].refused:
+        leave_out(error)
+    for name in sources["train"].names:
+        counts = [len(sources[split].read(name).frames) for split in ("train", "test")]
+        logger.info("%s: %d images with cameras, of which %d are held out", name, sum(counts), counts[1])
+    names = sources["train"].names
+    first = root if len(names) == 1 else root / names[0]  # of several captures
+    return f"go on with: completesplat fit experiment=capture {shlex.quote(f'data.root={first}')}"
+
+
+def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> Path:
+    """Write and return `out`/NAME, whole or not at all, and name the images that have no pose."""
+    if not source.exists():
+        raise DataError("no such file or folder", str(source))
+    pycolmap = import_pycolmap()
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    video, path = source.is_file(), source.resolve()
+    capture = out / (path.stem if video else path.name)
+    if capture.exists():
+        raise DataError("exists already: import it without cameras=colmap, or choose another out=DIR", str(capture))
+    with atomic_folder(capture) as unfinished:
+        (images := unfinished / "images").mkdir()
+        if video:
+            _split_video(source, images, frames)
+        else:
+            _copy_photos(source / "images" if (source / "images").is_dir() else source, images)
+        names = sorted(os.listdir(images))
+        if len(names) < FEWEST_FRAMES:
+            raise DataError(f"{len(names)} usable images; a capture needs {FEWEST_FRAMES}", str(source))
+        posed = _find_cameras(unfinished, names, video or len(names) > MOST_WITH_ALL_PAIRS, max_image_size)
+        result = f"COLMAP finds poses for {len(posed)} of {len(names)} images"
+        if len(posed) < FEWEST_FRAMES:
+            advice = "take more of one still, textured scene, each overlapping the one before"
+            raise DataError(f"{result}; a capture needs {FEWEST_FRAMES}: {advice}", str(source))
+        lost = ", ".join(name for name in names if name not in posed)
+        logger.info("%s%s", result, lost and f", and leaves out: {lost}")
+    return capture
+
+
+def _copy_photos(folder: Path, images: Path) -> None:
+    """Write upright photos, with the rest of their EXIF records, which has the focal length."""
+    suffixes = {suffix for suffix, kind in Image.registered_extensions().items() if kind in FORMATS}
+    photos = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes)
+    stems = folder_names("_".join(path.stem.split()) for path in photos)  # COLMAP lists pairs with a space between
+    for photo, stem in track(list(zip(photos, stems, strict=True)), "photos"):
+        with refused_to(leave_out), refused_as_bad(str(photo)):
+            with opened(photo, FORMATS) as image:
+                check_sums(image, photo)
+                upright = ImageOps.exif_transpose(image)
+            options = {"quality": 95, "subsampling": 0, "exif": upright.info.get("exif", b"")}
+            save_image(upright, images / f"{stem}{photo.suffix.lower()}", **options)
+
+
+def _split_video(video: Path, images: Path, frames: int) -> None:
+    """Write the first frame of each of equal parts of a video, or all frames if there are fewer."""
+    from imageio_ffmpeg import count_frames_and_secs, get_ffmpeg_exe
+
+    try:
+        count, _ = count_frames_and_secs(str(video.absolute()))
+    except RuntimeError:
+        raise DataError("ffmpeg finds no video there", str(video)) from None
+    part = f"{min(frames, count)}/{count}"
+    options = ["-vf", f"select=gt(floor(n*{part})\\,floor((n-1)*{part}))", "-fps_mode", "passthrough", "-q:v", "2"]
+    command = [get_ffmpeg_exe(), "-nostdin", "-v", "error", "-i", str(video.absolute()), *options]
+    if subprocess.run([*command, "%05d.jpg"], cwd=images).returncode:
+        raise DataError("ffmpeg cannot split it; the reason is above", str(video))
+
+
+def image_pairs(images: int, sequential: bool) -> list[tuple[int, int]]:
+    """Return the pairs to match: all, or, in a ring of images, those at most `NEAR` or a power of two apart."""
+    pairs = ((a, b, min(b - a, images - b + a)) for a, b in combinations(range(images), 2))
+    return [(a, b) for a, b, apart in pairs if not sequential or apart <= NEAR or apart.bit_count() == 1]
+
+
+def _find_cameras(folder: Path, names: list[str], sequential: bool, max_image_size: int) -> set[str]:
+    """Write COLMAP's largest model as `folder`/sparse/0; return its images. Images of one size share a lens."""
+    pycolmap = import_pycolmap()
+    images, database, pairs, at_a_time = folder / "images", folder / "db", folder / "pairs", os.cpu_count() or 1
+    pycolmap.Database.open(database).close()
+    sizes = {stored_size(images / name, name) for name in names}
+    mode = pycolmap.CameraMode.SINGLE if len(sizes) == 1 else pycolmap.CameraMode.PER_IMAGE
+    pycolmap.import_images(database, images, mode, names)
+    extraction, pairing = pycolmap.FeatureExtractionOptions(), pycolmap.ImportedPairingOptions()
+    extraction.max_image_size, extraction.sift.max_num_features = max_image_size, MOST_FEATURES
+    for start in track(range(0, len(names), at_a_time), "features"):
+        chunk = names[start : start + at_a_time]
+        pycolmap.extract_features(database, images, chunk, extraction_options=extraction)
+    lines = [f"{names[a]} {names[b]}\n" for a, b in image_pairs(len(names), sequential)]
+    pairing.match_list_path = pairs
+    for start in track(range(0, len(lines), 10 * at_a_time), "matches"):
+        pairs.write_text("".join(lines[start : start + 10 * at_a_time]))
+        pycolmap.match_image_pairs(database, pairing_options=pairing)
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.random_seed = 0
+    (folder / "sparse/0").mkdir(parents=True)
+    with Progress() as progress:
+        bar = progress.add_task("poses", total=len(names))
+        advance = (lambda: progress.advance(bar, 2)), (lambda: progress.advance(bar))
+        models = pycolmap.incremental_mapping(database, images, folder / "sparse", mapping, "", *advance)
+    model = max(models.values(), key=pycolmap.Reconstruction.num_reg_images, default=pycolmap.Reconstruction())
+    model.write_binary(folder / "sparse/0")
+    database.unlink()
+    pairs.unlink()
+    return {image.name for image in model.images.values() if image.has_pose}

@@ -1,0 +1,188 @@
+"""Import of captures: cameras by COLMAP against those that the photos were drawn with, and what is refused."""
+
+import errno
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from PIL import Image
+from support import write_capture
+
+from completesplat.data.captures import importing
+from completesplat.data.captures.capture import CapturedFrame
+from completesplat.data.captures.importing import image_pairs, import_capture
+from completesplat.data.captures.module import read_capture
+from completesplat.errors import CompleteSplatError, DataError
+
+pycolmap = pytest.importorskip("pycolmap")
+
+FOCAL, WIDTH, HEIGHT = 260.0, 256, 192
+PHOTOS = 8
+ANGLES = np.linspace(0.25, 1.3, PHOTOS)
+
+
+def world_to_camera(angle: float) -> np.ndarray:
+    """A camera (OpenCV's axes) that looks into the corner of three walls."""
+    eye, target = np.array([5 * np.cos(angle), 5 * np.sin(angle), 2.5 + angle]), np.array([0.6, 0.6, 0.6])
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = [right, np.cross(forward, right), forward]
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return pose
+
+
+def draw_corner(pose: np.ndarray) -> Image.Image:
+    """Three walls with random textures, by rays through the pixels' centres."""
+    noise = np.random.default_rng(3).uniform(0, 255, (3, 48, 48)).astype(np.float32)
+    walls = [np.asarray(Image.fromarray(wall).resize((480, 480), Image.Resampling.BICUBIC)) for wall in noise]
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+    rays = np.stack([x / FOCAL, y / FOCAL, np.ones_like(x)], axis=-1) @ pose[:3, :3]
+    eye = -pose[:3, :3].T @ pose[:3, 3]
+    depths = np.where(rays < 0, -eye / rays, np.inf)
+    nearest = depths.argmin(axis=-1)
+    hits = eye + np.minimum(depths.min(axis=-1, keepdims=True), 100) * rays
+    pixels = np.zeros((HEIGHT, WIDTH))
+    for axis, wall in enumerate(walls):
+        u, v = (hits[..., [other for other in range(3) if other != axis]] * 96).astype(int).T % 480
+        pixels = np.where(nearest == axis, wall[v.T, u.T], pixels)
+    return Image.fromarray(np.clip(pixels, 0, 255).astype(np.uint8)).convert("RGB")
+
+
+def distances(frames: tuple[CapturedFrame, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """After a similarity: distances of the frames from the true places, and angles from the true views in degrees."""
+    true = np.linalg.inv([world_to_camera(angle) for angle in ANGLES])
+    poses = np.linalg.inv([frame.world_to_camera for frame in frames])
+    similarity = pycolmap.estimate_sim3d(poses[:, :3, 3], true[:, :3, 3])
+    rotation = similarity.rotation.matrix()
+    turns = rotation @ poses[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1)
+    cosines = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
+    places = similarity.scale * poses[:, :3, 3] @ rotation.T + similarity.translation
+    return np.linalg.norm(places - true[:, :3, 3], axis=1), np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
+def test_cameras_are_those_that_the_photos_were_drawn_with_and_a_photo_of_something_else_is_named(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    (tmp_path / "my corner/images").mkdir(parents=True)
+    for number, angle in enumerate(ANGLES):
+        draw_corner(world_to_camera(angle)).save(tmp_path / f"my corner/images/photo {number}.png")
+    Image.effect_noise((WIDTH, HEIGHT), 90).save(tmp_path / "my corner/images/noise.png")
+    given = str(tmp_path / "my corner"), "colmap", 100, 1000, tmp_path / "out"
+    command, capture = import_capture(*given), tmp_path / "out/my corner"
+    assert "COLMAP finds poses for 8 of 9 images, and leaves out: noise.png" in caplog.text
+    assert "my corner: 8 images with cameras, of which 2 are held out" in caplog.text
+    assert command == f"go on with: completesplat fit experiment=capture 'data.root={capture}'"
+    assert sorted(path.name for path in capture.iterdir()) == ["images", "sparse"]
+    frames = read_capture(capture).frames
+    assert [frame.image.name for frame in frames] == [f"photo_{number}.png" for number in range(PHOTOS)]
+    away, angles = distances(frames)
+    assert away.max() < 0.02  # of 5
+    assert angles.max() < 0.5
+    assert frames[0].lens.focal == pytest.approx((FOCAL, FOCAL), rel=0.02)
+    with pytest.raises(DataError, match="my corner: exists already"):
+        import_capture(*given)
+
+
+def test_all_pairs_are_matched_or_those_of_neighbours_in_a_ring():
+    assert image_pairs(6, sequential=False) == [(a, b) for a in range(6) for b in range(a + 1, 6)]
+    assert image_pairs(21, sequential=True) == image_pairs(21, sequential=False)  # all are neighbours
+    pairs = image_pairs(100, sequential=True)
+    assert {(0, 1), (0, 10), (0, 99), (5, 95), (3, 35)} <= set(pairs)
+    assert not {(0, 11), (20, 35), (0, 50)} & set(pairs)
+    assert all(sum(number in pair for pair in pairs) == 2 * (10 + 2) for number in range(100))  # and 16, 32 apart
+
+
+def test_photos_become_upright_keep_their_focal_length_and_the_unreadable_are_named(tmp_path, caplog, monkeypatch):
+    (tmp_path / "images").mkdir()
+    photo, exif = Image.new("RGB", (40, 30)), Image.Exif()
+    photo.paste((255, 255, 255), (0, 0, 20, 30))  # its left half
+    exif[274], exif.get_ifd(0x8769)[41989] = 6, 28  # it is to be turned clockwise; focal length in 35 mm film
+    for name in ("a b.jpg", "c.TIFF", "a_b.png"):
+        photo.save(tmp_path / name, exif=exif)
+    (tmp_path / "cut.jpg").write_bytes((tmp_path / "a b.jpg").read_bytes()[:-200])
+    (tmp_path / "notes.txt").touch()
+    importing._copy_photos(tmp_path, tmp_path / "images")
+    copies = sorted((tmp_path / "images").iterdir())
+    assert [copy.name for copy in copies] == ["a_b.jpg", "a_b_2.png", "c.tiff"]
+    for copy in copies:
+        image = Image.open(copy)
+        assert image.size == (30, 40)
+        upper, lower = (np.asarray(image.crop(box)).mean() for box in ((0, 0, 30, 19), (0, 21, 30, 40)))
+        assert upper > 250 > 5 > lower
+        assert image.getexif().get(274) is None
+        assert copy.suffix == ".tiff" or image.getexif().get_ifd(0x8769)[41989] == 28
+    assert caplog.text.count("left out: ") == 1
+    assert f"left out: {tmp_path / 'cut.jpg'}: cannot be decoded" in caplog.text
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(importing, "save_image", full)
+    with pytest.raises(OSError, match="No space left"):
+        importing._copy_photos(tmp_path, tmp_path / "images")
+
+
+@pytest.mark.parametrize(("asked", "expected"), [(8, range(0, 40, 5)), (100, range(40))])
+def test_a_video_is_split_into_evenly_spread_frames(tmp_path, asked, expected):
+    grey = np.arange(40, dtype=np.uint8) * 6
+    imageio.imwrite(tmp_path / "a.mp4", np.broadcast_to(grey[:, None, None, None], (40, 64, 64, 3)), fps=10)
+    (images := tmp_path / "100%d images").mkdir()
+    importing._split_video(tmp_path / "a.mp4", images, asked)
+    means = [np.asarray(Image.open(path)).mean() for path in sorted(images.iterdir())]
+    np.testing.assert_allclose(means, 6 * np.array(expected), atol=2)
+
+
+def test_what_makes_no_capture_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):
+    def line(path: str, cameras: str | None = "colmap") -> str:
+        with pytest.raises(CompleteSplatError) as caught:
+            import_capture(path, cameras, 100, 1000, Path("out"))
+        return str(caught.value)
+
+    monkeypatch.chdir(tmp_path)
+    Path("blank").mkdir()
+    for number in range(5):
+        Image.new("RGB", (64, 48)).save(f"blank/{number}.png")
+    assert line("blank") == "blank: 5 usable images; a capture needs 6"
+    Image.new("RGB", (64, 48)).save("blank/5.png")
+    assert line("blank").startswith("blank: COLMAP finds poses for 0 of 6 images; a capture needs 6: take more")
+    assert line("blank", None).endswith("get cameras by: completesplat data import blank cameras=colmap")
+    Path("-a.mp4").write_bytes(bytes(1000))
+    assert line("-a.mp4") == "-a.mp4: ffmpeg finds no video there"
+    assert line("typo") == "typo: no such file or folder"
+    assert not list(Path("out").iterdir())
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert line("blank").endswith('cameras=colmap need pycolmap: pip install "completesplat[colmap]"')
+
+
+def test_a_capture_stays_where_it_is_and_the_last_line_goes_on(command, tmp_path):
+    write_capture(tmp_path / "fox", frames=20)
+    for number in (3, 17):
+        (tmp_path / f"fox/frame{number}.png").unlink()
+    finished = command("data", "import", "fox", "out=out")
+    assert finished.status == 0
+    assert "2 of 20 frames have no image and are left out: frame3.png, frame17.png" in finished.out
+    assert "fox: 18 images with cameras, of which 3 are held out" in finished.out
+    last = [str(tmp_path / "out"), "go on with: completesplat fit experiment=capture data.root=fox"]
+    assert finished.out.splitlines()[-2:] == last
+    (tmp_path / "several").mkdir()
+    for name in ("a", "b"):
+        write_capture(tmp_path / "several" / name, frames=20)
+    several = command("data", "import", "several", "out=out")
+    assert several.out.splitlines()[-1].endswith(" data.root=several/a")  # one is fitted at a time
+
+
+@pytest.mark.processes
+def test_pycolmap_leaves_the_signal_that_ends_a_program_to_the_program():
+    lines = [
+        "import os, signal, sys",
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(9))",
+        "from completesplat.data.captures.capture import import_pycolmap",
+        "import_pycolmap()",
+        "os.kill(os.getpid(), signal.SIGTERM)",
+    ]
+    assert subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True).returncode == 9

@@ -1,0 +1,126 @@
+"""Gaussians of a capture: fitted to the training frames alone, written in the capture's axes, continued bit by bit."""
+
+import pytest
+import torch
+from PIL import Image
+from support import strict_json, write_capture
+
+from completesplat.data.captures.capture import CapturedFrame
+from completesplat.data.captures.module import CaptureDataModule
+from completesplat.data.captures.transforms_json import read_transforms
+from completesplat.errors import CompleteSplatError
+from completesplat.export.ply import read_ply
+from completesplat.export.reading import read_gaussians
+from completesplat.training.capture import CaptureFit
+
+FRAMES, STEPS = 9, 8
+FITTING = {"initial": 200, "most": 260, "refine_every": 2}
+QUICK = ["experiment=capture", "data.root=capture", "data.image_size=12", f"trainer.max_steps={STEPS}"]
+QUICK += [
+    "trainer.accelerator=cpu",
+    "trainer.val_check_interval=100",
+    "rasterizer=reference",
+    "callbacks.progress=null",
+]
+QUICK += [
+    *(f"model.fitting.{key}={value}" for key, value in FITTING.items()),
+    "model.formats=[splat,sog]",
+    "model.frames=2",
+]
+QUICK += ["callbacks.checkpoint.every_n_train_steps=4"]
+
+
+@pytest.fixture
+def capture(tmp_path):
+    write_capture(tmp_path / "capture", FRAMES)
+    return tmp_path / "capture"
+
+
+def no_converter() -> None:
+    raise CompleteSplatError("no Node.js")
+
+
+def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, capture, tmp_path, monkeypatch):
+    monkeypatch.setattr("completesplat.training.capture.find_splat_transform", no_converter)
+    read, original, step = [], CapturedFrame.read, CaptureFit.training_step
+    monkeypatch.setattr(CapturedFrame, "read", lambda self: read.append(self.number) or original(self))
+
+    def interrupted_step(self, *inputs):
+        if self.global_step == 6:
+            raise KeyboardInterrupt
+        return step(self, *inputs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CaptureFit, "training_step", interrupted_step)
+        assert command("fit", *QUICK, "out=parts").status != 0
+    assert set(read) == set(range(FRAMES)) - {0, 4, 8}  # At least two of nine are held out, so every fourth is.
+    assert command("fit", *QUICK, "ckpt_path=last", "out=parts").status == 0
+    finished = command("fit", *QUICK, "out=run")
+    assert finished.status == 0, finished.err
+    fitted = "the 6 training frames of the capture, and scored on the 3 held-out ones"
+    assert f"fitted to {fitted}" in finished.out
+    files = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"scene.ply", "scene.splat", "sheet.png", "orbit.mp4", "scene.json"} < files
+    assert finished.out.count("left out: no Node.js") == 1
+    metrics = strict_json(tmp_path / "run/metrics.json")
+    assert metrics["test"]["protocol"]["fitted_to"] == fitted
+    assert metrics["train/gaussians"] == int(int(int(200 * 1.05) * 1.05) * 1.05)  # at steps 2, 4 and 6
+    one, other = (torch.load(tmp_path / run / "checkpoints/last.ckpt", weights_only=True) for run in ("run", "parts"))
+    assert all(tensor.equal(other["state_dict"][name]) for name, tensor in one["state_dict"].items())
+    # The files are in the world and units of transforms.json.
+    scale = CaptureDataModule(str(capture)).source("test").read("capture").scale
+    means = one["state_dict"]["raw.means"][:231] / scale
+    torch.testing.assert_close(read_ply(tmp_path / "run/scene.ply").means, means)
+    splat = read_gaussians(tmp_path / "run/scene.splat").means  # sorted by importance
+    torch.testing.assert_close(splat.sort(0).values, means.sort(0).values)
+    scene, frames = strict_json(tmp_path / "run/scene.json"), read_transforms(capture / "transforms.json").frames
+    poses = torch.stack([torch.from_numpy(frame.world_to_camera).float() for frame in frames[::4]])
+    camera = torch.tensor(scene["reference_camera"]["world_to_camera"])
+    torch.testing.assert_close(camera, poses[0], atol=1e-5, rtol=1e-5)
+    up = torch.nn.functional.normalize(-poses[:, 1, :3].mean(0), dim=0)  # of the held-out cameras
+    torch.testing.assert_close(torch.tensor(scene["settings"]["up"]), up, atol=1e-5, rtol=1e-5)
+    Image.open(tmp_path / "run/sheet.png").verify()
+    # A test of a checkpoint writes no scene into the run.
+    (tmp_path / "run/scene.ply").unlink()
+    tested = command("test", "ckpt=run", "out=EVAL")
+    assert tested.status == 0, tested.err
+    assert not (tmp_path / "run/scene.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ("optimizer.lr=1", "optimizer.lr=1: CaptureFit does nothing with it; leave it out"),
+        ("data.horizontal_flip=true", "data.horizontal_flip: model=capture fits the photos as they are"),
+        ("model.formats=[foo]", "formats=foo: choose from"),
+        ("model.videos=[spin]", "video=spin: choose from"),
+        ("data.root=.", "has 2 sequences; model=capture fits one capture"),
+    ],
+)
+def test_settings_without_effect_and_several_captures_are_refused(command, capture, tmp_path, change, reason):
+    write_capture(tmp_path / "other", FRAMES)
+    refused = command("fit", *QUICK, change)
+    assert (refused.status, refused.err.count("\n")) == (2, 1), refused.err
+    assert reason in refused.err
+
+
+def test_a_prepared_capture_has_lost_its_units_and_is_refused(command, capture):
+    prepared = command("data", "prepare", "data=capture", "data.root=capture", "data.image_size=12", "out=STORE")
+    assert prepared.status == 0, prepared.err
+    refused = command("fit", *QUICK, "data.root=STORE")
+    assert "data.root=STORE is prepared; model=capture fits one capture" in refused.err.replace(str(capture.parent), "")
+
+
+def test_points_of_a_reconstruction_are_in_the_cameras_units(tmp_path):
+    write_capture(tmp_path / "capture", FRAMES)
+    points = [[0.5, 0.25, -0.125], [0, -0.5, 0], [1, 0, 0], [-1, 0, 0.5]]
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    (tmp_path / "capture/points.ply").write_text(header + "".join("{} {} {}\n".format(*point) for point in points))
+    path = tmp_path / "capture/transforms.json"
+    path.write_text(path.read_text().replace('{"camera', '{"ply_file_path": "points.ply", "camera'))
+    sequence = CaptureDataModule(str(tmp_path / "capture"), image_size=12).source("train").read("capture")
+    frame = read_transforms(path).frames[1].camera()
+    torch.testing.assert_close(sequence.points / sequence.scale, torch.tensor(points))
+    torch.testing.assert_close(sequence.cameras[0].centers / sequence.scale, frame.centers)
