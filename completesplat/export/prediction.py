@@ -33,7 +33,6 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.geometry.trajectories import PATHS
-from completesplat.metrics.images import psnr
 from completesplat.rasterizers import Rasterizer
 
 DIRECTIONS = 8
@@ -156,6 +155,8 @@ def write_fitted_scene(
     Raises:
         CompleteSplatError: no Gaussian of the scene can be stored.
     """
+    from completesplat.metrics.images import psnr  # `predict` needs no metrics
+
     stored, reference = in_units(with_screen_space_dilation(cleaned(scene, name), cameras[0]), cameras[0], scale)
     write_ply(folder / "scene.ply", stored, [f"scene {name}"])
     indices = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
