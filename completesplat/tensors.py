@@ -30,7 +30,7 @@ class TensorDataclass:
         return replace(self, **{field.name: apply(getattr(self, field.name)) for field in fields(self)})
 
     def to(self: T, *args: Any, **kwargs: Any) -> T:
-        """Move every tensor as `torch.nn.Module.to` does; integer and boolean tensors keep their dtype."""
+        """Move every tensor to a device or dtype (`non_blocking`); integer and boolean tensors keep their dtype."""
         device, dtype, non_blocking, _ = torch._C._nn._parse_to(*args, **kwargs)
         return self.map(lambda x: x.to(device, dtype if x.is_floating_point() else x.dtype, non_blocking))
 

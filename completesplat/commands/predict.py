@@ -96,15 +96,15 @@ def wanted_files(config: DictConfig) -> Wanted:
     formats, videos = _names(config.formats), _names(config.video)
     if not formats and not videos:
         raise CompleteSplatError(f"formats=[] video=[]: choose a format ({', '.join(FORMATS)}) or a video")
-    return Wanted(
+    wanted = Wanted(
         formats=formats,
         videos=videos,
         frames=config.frames,
         background=Wanted.background if config.background == REMOVE else config.background,
         maps=config.maps,
         screen_space_dilation=config.screen_space_dilation,
-        converter=find_splat_transform() if set(formats) & set(CONVERTED) else None,
     )
+    return replace(wanted, converter=find_splat_transform() if set(formats) & set(CONVERTED) else None)
 
 
 def _names(value: object) -> tuple[str, ...]:

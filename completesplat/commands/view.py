@@ -76,7 +76,8 @@ def settings_of(path: Path) -> dict[str, str]:
         return {"weights": str(path)}
     if scenes_in(path):
         return {"scene": str(path)}
-    raise CompleteSplatError(f"{path}: neither weights nor scenes in it ({', '.join((*WEIGHT_FILES, *SPLATS))})")
+    names = ", ".join((*WEIGHT_FILES, *SPLATS))
+    raise CompleteSplatError(f"{path}: neither weights nor scenes in it or in weights/ ({names})")
 
 
 def scenes_in(path: Path) -> dict[str, Path]:
@@ -157,7 +158,7 @@ def show_newest(page: Any, run: Path, shown: int | None) -> int | None:
         step, samples, _ = read_newest(run / NEWEST)
     except CompleteSplatError:
         return shown  # the scenes are just being written, or were removed: the page stays as it is
-    if step not in {shown, *(sample.settings.get("step") for sample in page.view.samples)}:
+    if samples and step not in {shown, *(sample.settings.get("step") for sample in page.view.samples)}:
         page.show(samples, AT_STEP.format(step))
     return step
 

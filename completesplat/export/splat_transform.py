@@ -47,7 +47,7 @@ class SplatTransform:
 
 
 def find_splat_transform() -> SplatTransform:
-    """Return the program on PATH or npm's, which `npx` downloads once; raise CompleteSplatError if neither works."""
+    """Return the program on PATH or npm's (`npx` downloads 200 MB once); raise CompleteSplatError if neither works."""
     program = shutil.which(PROGRAM)
     if program is None:
         npx = shutil.which("npx")

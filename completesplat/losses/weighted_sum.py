@@ -46,11 +46,15 @@ class WeightedSum:
         terms: name -> {weight, term, start_step (default 0)}; None (an ablation) or weight 0 leaves it out.
 
     Raises:
-        CompleteSplatError: no term counts at step 0.
+        CompleteSplatError: no term counts at step 0, or an entry lacks its term or has other keys.
     """
 
     def __init__(self, terms: Mapping[str, Term | None]) -> None:
         self.terms = {name: entry for name, entry in terms.items() if entry and entry["weight"]}
+        for name, entry in self.terms.items():
+            if "term" not in entry or entry.keys() - Term.__annotations__:
+                given = ", ".join(entry)
+                raise CompleteSplatError(f"loss.terms.{name}: give weight, term and perhaps start_step, not {given}")
         if all(entry.get("start_step", 0) > 0 for entry in self.terms.values()):
             raise CompleteSplatError("no loss at step 0: loss.terms needs a term with start_step=0")
 

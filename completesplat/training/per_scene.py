@@ -119,7 +119,7 @@ class Preoptimized(PerScene):
 class FittedScenes:
     """Store of Gaussians that are fitted to all images of a sequence when they are first needed.
 
-    One sequence at a time is in memory. A file takes 56 bytes for each Gaussian.
+    One sequence at a time is in memory (16 bytes a pixel, and Gaussians). A file takes 56 bytes for each Gaussian.
 
     Args:
         folder: folder of the files, which several processes may share; scenes in it are not fitted again.

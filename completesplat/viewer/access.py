@@ -41,7 +41,8 @@ class GuardedServer(viser.ViserServer):
     A request or websocket handshake is answered if its `Host` is a loopback name with the server's port, its `Origin`
     is that host too (only a handshake must have one), and it has the token; otherwise the answer is 403. The token is
     in the address, or in the page's cookie, because viser's page drops the query of its address when it opens the
-    websocket. Longer websocket messages than the page sends are refused before they are received.
+    websocket. Longer websocket messages than the page sends are refused before they are received. No two servers may
+    be made at the same time.
 
     Raises:
         CompleteSplatError: this version of viser starts its websocket server without our checks.

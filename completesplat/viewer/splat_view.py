@@ -122,8 +122,9 @@ class SplatView:
 
     def set_up(self, up: Sequence[float]) -> None:
         """Set the direction up, and make the next drawing be seen from the front, because it shows another scene."""
-        self.up, self._arrangement = np.asarray(up, float), None
-        self.server.scene.set_up_direction(self.up)
+        with self._lock:
+            self.up, self._arrangement = np.asarray(up, float), None
+            self.server.scene.set_up_direction(self.up)
 
     def show(self, samples: Sequence[Sample]) -> None:
         """Replace the samples, and draw the new ones."""

@@ -101,7 +101,13 @@ def test_a_term_takes_part_from_its_start_step(pair, step, total, names):
     assert late.calls == ("b" in names)
 
 
-@pytest.mark.parametrize("term", [None, {"weight": 0.0}, {"weight": 1.0, "start_step": 1}])
+@pytest.mark.parametrize("entry", [{"weight": 1.0}, {"weight": 1.0, "term": Constant(1.0), "start_setp": 5}])
+def test_an_entry_without_a_term_or_with_another_key_is_refused(entry):
+    with pytest.raises(CompleteSplatError, match=r"loss\.terms\.a: give weight, term and perhaps start_step, not weight"):
+        WeightedSum({"a": entry})
+
+
+@pytest.mark.parametrize("term", [None, {"weight": 0.0}, {"weight": 1.0, "term": Constant(1.0), "start_step": 1}])
 def test_a_sum_with_nothing_at_step_zero_is_refused(term):
     with pytest.raises(CompleteSplatError, match="start_step=0"):
         WeightedSum({"a": term and {"term": Constant(1.0), **term}})

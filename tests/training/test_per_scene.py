@@ -46,7 +46,7 @@ def test_fit_goes_straight_to_the_test(command, toy_root, tmp_path):
 @pytest.mark.parametrize(
     ("setting", "reason"),
     [
-        ("test=false", "test=false: PerScene does nothing with it; leave it out"),
+        ("test=False", "test=false: PerScene only fits the scenes of a test; leave it out"),
         ("optimizer.lr=1", "optimizer.lr=1: PerScene does nothing with it; leave it out"),
     ],
 )
