@@ -103,7 +103,7 @@ def test_a_term_takes_part_from_its_start_step(pair, step, total, names):
 
 @pytest.mark.parametrize("entry", [{"weight": 1.0}, {"weight": 1.0, "term": Constant(1.0), "start_setp": 5}])
 def test_an_entry_without_a_term_or_with_another_key_is_refused(entry):
-    with pytest.raises(CompleteSplatError, match=r"loss\.terms\.a: give weight, term and perhaps start_step, not weight"):
+    with pytest.raises(CompleteSplatError, match=r"loss\.terms\.a: give weight, term and perhaps start_step"):
         WeightedSum({"a": entry})
 
 
