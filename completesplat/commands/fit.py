@@ -2,6 +2,8 @@
 
 import copy
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +86,8 @@ def run(config: DictConfig, out: Path) -> None:
     metrics = {}
     with wandb_runs(loggers, config):
         if any(parameter.requires_grad for parameter in module.parameters()):
-            trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+            with _refusing_other_models(checkpoint):
+                trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
             metrics = _logged(trainer)
             if trainer.is_global_zero:
                 module.save_weights(out / RUN_WEIGHTS)
@@ -108,7 +111,10 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
     """Return the checkpoint that the run continues from, if any, and remove other weights from the config."""
     path = newest_whole(out / LAST) if config.ckpt_path == "last" else config.ckpt_path
     if path is None:
+        if config.ckpt_path == "last":
+            logger.info("ckpt_path=last: there is no checkpoint in %s, so the training begins", out)
         return None
+    path = Path(path, LAST) if Path(path).is_dir() else path
     if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
     check_whole(Path(path))  # now, because data may be made first
@@ -116,6 +122,16 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
         for key in OTHER_WEIGHTS & part.keys():
             part[key] = None
     return str(path)
+
+
+@contextmanager
+def _refusing_other_models(checkpoint: str | None) -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:
+        if checkpoint is None or "loading state_dict" not in str(error):
+            raise
+        raise WeightsError(f"{checkpoint}: of another model; give the settings of its run") from error
 
 
 def refuse_without_effect(config: DictConfig, out: Path) -> None:

@@ -189,10 +189,16 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
         raise CompleteSplatError(f"{out} holds a run: continue it with ckpt_path=last, or choose another out=DIR")
     different = _differences(OmegaConf.to_container(OmegaConf.load(out / CONFIG)), config)
     if others := {key for key in different if not key.startswith((*MAY_CHANGE, *ENDS))}:
-        first = min(others, key=lambda key: (key.count("."), key))  # `model` repeats settings from outside it
+        other_model = "model._target_" in others
+        # `model` repeats settings from outside it.
+        first = "model" if other_model else min(others, key=lambda key: (key.count("."), key))
         same = [argument for argument in overrides if not argument.startswith(("out=", "ckpt_path="))]
         again = shlex.join(["completesplat", "fit", *same, f"ckpt_path={out / LAST}", "out=MORE"])
-        advice = f"continue in another folder: {again}" if (out / LAST).is_file() else "choose another out=DIR"
+        advice = (
+            f"continue in another folder: {again}"
+            if (out / LAST).is_file() and not other_model
+            else "choose another out=DIR"
+        )
         raise CompleteSplatError(f"{out} holds a run with another {first}: {advice}")
     finished, ends, earlier = (out / METRICS).is_file(), _ends(config), _ends(OmegaConf.load(out / CONFIG))
     if not finished or ends == earlier:

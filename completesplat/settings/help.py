@@ -68,7 +68,7 @@ def _body(verb: str, task: str | None) -> Iterator[str]:
     rows = [_line(setting, hints.get(setting.key), {}, verb) for setting in settings_of_verb(verb, task)]
     yield _table(f"Settings{'' if task is None else f' of {command}'} (key=value):", rows)
     about = about_groups()
-    if choices := choices_of_verb(verb, task):
+    if choices := [choice for choice in choices_of_verb(verb, task) if choice.place != "_global_"]:
         keys = [entry.place if entry.option == "null" else f"{entry.place}={entry.option}" for entry in choices]
         rows = [(key, _about(choice, about)) for key, choice in zip(keys, choices, strict=True)]
         yield _table(f"Parts (group=option chooses; completesplat {command} --help GROUP shows one):", rows)

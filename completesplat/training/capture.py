@@ -26,7 +26,7 @@ from completesplat.baselines.fitting import (
     relocate,
 )
 from completesplat.data.packed.manifest import is_packed
-from completesplat.data.sequences import PosedSequence
+from completesplat.data.sequences import PosedSequence, shortened
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED
 from completesplat.export.prediction import Wanted, write_fitted_scene, write_scene
@@ -114,7 +114,7 @@ class CaptureFit(Stage):
         """Return the frames of a split of the capture; raise CompleteSplatError unless there is exactly one capture."""
         names = self.data.store(split).names
         if len(names) != 1 or not self.data.splits_share_sequences or is_packed(self.data.root):
-            found = "is prepared" if is_packed(self.data.root) else f"has {len(names)} sequences"
+            found = "is prepared" if is_packed(self.data.root) else f"has {len(names)} sequences ({shortened(names)})"
             advice = "model=capture fits one capture: give data=capture and its folder, as it was taken"
             raise CompleteSplatError(f"data.root={self.data.root} {found}; {advice}")
         return self.data.store(split).source.read(names[0])

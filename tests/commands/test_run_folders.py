@@ -115,7 +115,8 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     (tmp_path / jobs.LAST).touch()
 
     def config(rate=1, **end):
-        return {"ckpt_path": "last", "optimizer": {"lr": rate}, "trainer": {"max_steps": 20, "max_time": None} | end}
+        trainer, model = {"max_steps": 20, "max_time": None} | end, {"_target_": "a.A"}
+        return {"ckpt_path": "last", "optimizer": {"lr": rate}, "trainer": trainer, "model": model}
 
     OmegaConf.save(config(), tmp_path / "config.yaml")
     assert jobs.is_finished(tmp_path, config())
@@ -128,6 +129,8 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     again = f"completesplat fit optimizer.lr=2 ckpt_path={tmp_path}/checkpoints/last.ckpt out=MORE"
     with pytest.raises(CompleteSplatError, match=f"another optimizer.lr: continue in another folder: {again}$"):
         jobs.is_finished(tmp_path, config(rate=2, max_steps=40), ["out=R", "optimizer.lr=2", "ckpt_path=last"])
+    with pytest.raises(CompleteSplatError, match="another model: choose another out=DIR"):
+        jobs.is_finished(tmp_path, config() | {"model": {"_target_": "a.B"}})
     jobs._record(tmp_path, ["second"], [], config(max_steps=40))
     record = strict_json(tmp_path / "run.json")
     assert (record["started"], record["command"], len(record["continued"])) == ("then", ["second"], 1)

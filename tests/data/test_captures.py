@@ -426,11 +426,14 @@ def test_other_models_of_lenses_are_refused(tmp_path, binary):
         read_colmap(model, tmp_path / "images")
 
 
-def test_missing_images_and_those_outside_and_what_is_no_model_are_refused(tmp_path):
+def test_missing_images_are_left_out_and_those_outside_and_what_is_no_model_are_refused(tmp_path, caplog):
     model, images = write_model(tmp_path, "PINHOLE", binary=False), tmp_path / "images"
-    (images / "left/3.png").unlink()
-    with pytest.raises(MissingFile, match=r"left/3\.png, frame 3: no such file"):
-        read_colmap(model, images)
+    for number in (3, 5):
+        (images / f"left/{number}.png").unlink()
+    assert [frame.number for frame in read_colmap(model, images).frames] == [1, 2, 4, 6, 7, 8]
+    assert "images.txt: 2 of 8 frames have no image and are left out: left/3.png, left/5.png" in caplog.text
+    with pytest.raises(MissingFile, match="nowhere: no such folder"):
+        read_colmap(model, tmp_path / "nowhere")
     text = (model / "images.txt").read_text()
     (model / "images.txt").write_text(text.replace("left/3.png", "../3.png"))
     with pytest.raises(OutsidePath, match=r"frame 3: leads outside"):

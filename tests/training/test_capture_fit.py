@@ -94,7 +94,7 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
         ("data.horizontal_flip=true", "data.horizontal_flip: model=capture fits the photos as they are"),
         ("model.formats=[foo]", "formats=foo: choose from"),
         ("model.videos=[spin]", "video=spin: choose from"),
-        ("data.root=.", "has 2 sequences; model=capture fits one capture"),
+        ("data.root=.", "has 2 sequences (capture, other); model=capture fits one capture"),
     ],
 )
 def test_settings_without_effect_and_several_captures_are_refused(command, capture, tmp_path, change, reason):

@@ -1,5 +1,6 @@
 """Common form of captures, independent of their files and conventions, and undistorted reading of their images."""
 
+import logging
 import re
 import signal
 import threading
@@ -25,9 +26,12 @@ from completesplat.data.images.files import (
     over_grey,
     refused_as_bad,
 )
+from completesplat.data.sequences import shortened
 from completesplat.data.validation import BadAnnotation, BadCamera, TooFewFrames, at, require_file
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.geometry.cameras import Cameras
+
+logger = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from pycolmap import Camera
@@ -117,6 +121,13 @@ def in_order(frames: Sequence[CapturedFrame]) -> tuple[CapturedFrame, ...]:
         return [(len(part), part) if part.isdecimal() else (-1, part) for part in parts]
 
     return tuple(sorted(frames, key=key))
+
+
+def warn_of_missing(path: Path, missing: Sequence[str], frames: int) -> None:
+    """Name the images that the file at `path` lists, in `frames` frames, and that are not there."""
+    if missing:
+        counted = f"{len(missing)} of {frames} frames have no image and are left out"
+        logger.warning("%s: %s: %s", path, counted, shortened(missing))
 
 
 def _read_upright(path: Path, image_size: tuple[int, int]) -> tuple[Image.Image, Image.Image | None]:

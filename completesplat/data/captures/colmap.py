@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, in_order
+from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, in_order, warn_of_missing
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
@@ -42,14 +42,21 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
         model: folder with `cameras`, `images` and `points3D`, `.bin` or `.txt`.
         images: folder of the images; their names in the model are relative to it.
 
+    Images that are not there are left out.
+
     Raises:
-        DataError: something is missing, damaged or impossible; the error has the file and COLMAP's image number.
+        DataError: something else is missing, damaged or impossible; the error has the file and COLMAP's image number.
     """
+    if not images.is_dir():
+        raise MissingFile("no such folder", str(images))
     suffix, read = ("bin", _binary_rows) if (model / "images.bin").is_file() else ("txt", _text_rows)
     files = tuple(require_file(model / f"{name}.{suffix}") for name in ("cameras", "images", "points3D"))
     lenses = dict(_parsed(_camera_of, read, files[0]))
     with at(files[1]):
-        frames = in_order(_parsed(partial(_frame_of, lenses=lenses, images=images, masks=masks), read, files[1]))
+        posed = _parsed(partial(_frame_of, lenses=lenses, images=images, masks=masks), read, files[1])
+        missing = sorted(str(frame.image.relative_to(images)) for frame in posed if not isfile(frame.image))
+        warn_of_missing(files[1], missing, len(posed))
+        frames = in_order([frame for frame in posed if isfile(frame.image)])
     points = np.array(_parsed(lambda row: [float(coordinate) for coordinate in row[1:4]], read, files[2]))
     return Capture(files, frames, points if len(points) else None)
 
@@ -88,8 +95,9 @@ def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | 
         world_to_camera = np.eye(4)
         world_to_camera[:3, :3] = quaternion_to_matrix(torch.from_numpy(pose[:4])).numpy()
         world_to_camera[:3, 3] = pose[4:]
-        mask = None if masks is None else _find_mask(masks, name)
-        return CapturedFrame(number, require_file(inside(images, name)), mask, lenses[camera], world_to_camera)
+        image = inside(images, name)
+        mask = None if masks is None or not isfile(image) else _find_mask(masks, name)
+        return CapturedFrame(number, image, mask, lenses[camera], world_to_camera)
 
 
 def _find_mask(masks: Path, name: str) -> Path:

@@ -1,6 +1,5 @@
 """Reader of captures that consist of a `transforms.json` and images, the format of NeRF, instant-ngp and nerfstudio."""
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from os.path import isfile
@@ -10,10 +9,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, in_order
+from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, in_order, warn_of_missing
 from completesplat.data.images.files import stored_size
 from completesplat.data.images.photograph import read_photograph
-from completesplat.data.sequences import shortened
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
@@ -31,8 +29,6 @@ from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras, crop_resize
 from completesplat.scene import Views
 from completesplat.tensors import stack
-
-logger = logging.getLogger(__name__)
 
 # OpenCV's distortion coefficients, and those of each camera model. There is no `k4`, on which programs disagree.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
@@ -147,9 +143,7 @@ def _read_frames(path: Path) -> tuple[list[CapturedFrame], Entry]:
                 mask = require_file(inside(root, field(entry, "mask_path", str))) if masked else None
                 lens, pose = _read_lens({**content, **entry}, image), _read_pose(entry.get("transform_matrix"))
                 frames.append(CapturedFrame(number, image, mask, lens, pose))
-    if missing:
-        counted = f"{len(missing)} of {len(entries)} frames have no image and are left out"
-        logger.warning("%s: %s: %s", path, counted, shortened(missing))
+    warn_of_missing(path, missing, len(entries))
     return frames, content
 
 
