@@ -27,6 +27,8 @@ BRIEF = {
     "test": ["trainer.accelerator=cpu"],
     **{f"report {study}": ["scenes=1", "samples=2"] for study in ("calibration", "controls", "depth", "modes")},
 }
+CAPTURE = ["trainer.max_steps=2", "trainer.accelerator=cpu", "data.image_size=12", "model.formats=[]", "model.frames=2"]
+BRIEF["fit experiment=capture"] = [*CAPTURE, "model.fitting.initial=100", "model.fitting.most=120"]
 # Stage 2 has as many levels as the small stage 1.
 BRIEF |= {
     f"fit experiment=toy_{of}_diffusion": [*BRIEF["fit"], "conditioning.channels=[8,8,16,16]"]
@@ -43,7 +45,8 @@ BRIEF |= {
 NEED_BLENDER = ("RENDERS", "ASSET", "RUN40", "RUN41")
 # What they need cannot be made here: Infinigen (`test_rendering` has such commands), CO3D, eight GPUs, VGG16
 # (`test_sweeps` has these two sweeps with a random one), Splatter Image's published weights (`test_published` has
-# made-up ones), images that Python lines of a README write (`test_scene_files` runs them).
+# made-up ones), images that Python lines of a README write (`test_scene_files` runs them), photos that COLMAP can pose
+# (`test_importing` draws them), published captures.
 NEEDS_MORE = (
     "IMAGES",
     "SOFA",
@@ -55,6 +58,10 @@ NEEDS_MORE = (
     "TABLE_OF_A",
     "splatter_image:",
     "model_hydrants.pth",
+    "PHOTOS",
+    "FOX",
+    "MOUSE",
+    "CUP",
 )
 TAKES_MINUTES = ("completesplat bench",)
 
@@ -99,8 +106,7 @@ def folder(tmp_path_factory):
         splits = {"train": names[:2], "val": names[2:3], "test": names[3:]}
         co3d_trees.write_tree(place / "ROOT", dict.fromkeys(names, 6), splits)
     write_capture(place, frames=6, names=("a.jpg", "b.jpg"))
-    # Two cameras of a circle would face each other, and look at no one place.
-    write_capture(place / "FOLDER", frames=3, names=("photo.jpg", "other.png"))
+    write_capture(place / "FOLDER", frames=6, names=("photo.jpg", "other.png"))
     for name in "abc":
         meshes.write_cube(place / f"MESHES/{name}.obj")
     return place

@@ -194,11 +194,8 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
         first = "model" if other_model else min(others, key=lambda key: (key.count("."), key))
         same = [argument for argument in overrides if not argument.startswith(("out=", "ckpt_path="))]
         again = shlex.join(["completesplat", "fit", *same, f"ckpt_path={out / LAST}", "out=MORE"])
-        advice = (
-            f"continue in another folder: {again}"
-            if (out / LAST).is_file() and not other_model
-            else "choose another out=DIR"
-        )
+        continued = (out / LAST).is_file() and not other_model
+        advice = f"continue in another folder: {again}" if continued else "choose another out=DIR"
         raise CompleteSplatError(f"{out} holds a run with another {first}: {advice}")
     finished, ends, earlier = (out / METRICS).is_file(), _ends(config), _ends(OmegaConf.load(out / CONFIG))
     if not finished or ends == earlier:

@@ -49,11 +49,8 @@ class OneOf:
 
     def refusal(self, value: object) -> str | None:
         """Return why the value is refused, None if it is accepted."""
-        return (
-            None
-            if value in self.choices
-            else f"choose one of {', '.join('null' if choice is None else str(choice) for choice in self.choices)}"
-        )
+        choices = ", ".join("null" if choice is None else str(choice) for choice in self.choices)
+        return None if value in self.choices else f"choose one of {choices}"
 
 
 @dataclass(frozen=True)

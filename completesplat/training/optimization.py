@@ -56,6 +56,7 @@ class Schedule(LambdaLR):
     """Learning-rate schedule that takes only its step from a checkpoint; rates and end are those of the config."""
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go to the checkpoint's step; call this after the optimizer's state is loaded, whose rates it replaces."""
         super().load_state_dict(state_dict | {"base_lrs": self.base_lrs})
         self._last_lr = [rate * at(self.last_epoch) for rate, at in zip(self.base_lrs, self.lr_lambdas, strict=True)]
         for group, rate in zip(self.optimizer.param_groups, self._last_lr, strict=True):
