@@ -26,6 +26,7 @@ def test_a_plan_is_printed_and_written_and_a_sweep_ends_in_a_total(command, tmp_
     assert "The paper, on one A100: 15.7 ms" in swept.out
 
 
+@pytest.mark.slow
 def test_devices_share_the_batch_and_latents_need_no_encoder():
     one, two = (plan_of(compose_config("plan", *SMALL, f"devices={n}")) for n in (1, 2))
     cached = plan_of(compose_config("plan", *SMALL, "data.latent_cache=LATENTS"))
@@ -37,6 +38,7 @@ def test_devices_share_the_batch_and_latents_need_no_encoder():
     assert cached["frozen_parameters"] == one["frozen_parameters"]
 
 
+@pytest.mark.slow
 def test_a_batch_that_does_not_fit_is_told_what_makes_it_fit():
     table = "gpus.l40s={bfloat16: 1, float32: 1, memory: %s, bandwidth: 1}"
     whole = plan_of(compose_config("plan", *SMALL))

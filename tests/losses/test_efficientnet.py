@@ -74,6 +74,7 @@ def test_images_get_a_finite_gradient_and_the_network_none(term):
     assert all(parameter.grad is None for parameter in term.distance.parameters())
 
 
+@pytest.mark.slow
 def test_the_loss_has_the_term_in_the_place_of_lpips_and_trains_and_is_planned():
     tiny = ["data.image_size=32", *NETWORKS, "rasterizer=reference", "model.checkpoint=null"]
     first, second, config = (

@@ -104,6 +104,7 @@ def test_settings_without_effect_and_several_captures_are_refused(command, captu
     assert reason in refused.err
 
 
+@pytest.mark.slow
 def test_a_prepared_capture_has_lost_its_units_and_is_refused(command, capture):
     prepared = command("data", "prepare", "data=capture", "data.root=capture", "data.image_size=12", "out=STORE")
     assert prepared.status == 0, prepared.err
