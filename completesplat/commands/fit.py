@@ -138,9 +138,11 @@ def refuse_without_effect(config: DictConfig, out: Path) -> None:
     """Raise CompleteSplatError for a setting of a command, not of a sweep, that its model does not use."""
     stage, given = get_class(config.model._target_), read_record(out).get("overrides", [])
     unused: tuple[str, ...] = getattr(stage, "without_effect", ())
+    if (out.parent / PLAN).is_file():
+        return
     if "trainer.max_" in unused and not config.test:
         raise CompleteSplatError(f"test=false: {stage.__name__} only fits the scenes of a test; leave it out")
-    for setting in [] if (out.parent / PLAN).is_file() else given:
+    for setting in given:
         if setting.lstrip("+~").startswith(unused):
             raise CompleteSplatError(f"{setting}: {stage.__name__} does nothing with it; leave it out")
 
