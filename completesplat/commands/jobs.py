@@ -31,9 +31,10 @@ from completesplat.settings.composition import resolved_settings, use_working_fo
 from completesplat.settings.options import did_you_mean
 from completesplat.settings.schema import check_settings
 from completesplat.signals import Interrupted, ended_by_signals
+from completesplat.weights import RUN_CHECKPOINT
 
 CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
-LAST = "checkpoints/last.ckpt"
+LAST = RUN_CHECKPOINT
 LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
 OF_MACHINES = ("trainer.devices", "trainer.num_nodes", "trainer.strategy")

@@ -57,7 +57,8 @@ def from_points(points: Float[np.ndarray, "n 3"], axes: Axes, what: str, quantil
     """Place the object as Splatter Image does (`co3d_normalisation.py`).
 
     The centre is the points' mean, but its height is the middle between the lowest and the highest point. The half size
-    is the largest absolute coordinate relative to this centre, along the axes. A `quantile` below 1 replaces extremes.
+    is the largest absolute coordinate relative to this centre, along the axes. A `quantile` below 1 replaces
+    the largest and smallest values.
 
     Raises:
         BadPlacement: there are no points, they are not finite, or all are in one place.

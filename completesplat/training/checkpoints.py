@@ -64,7 +64,8 @@ class Checkpoints(Checkpoint):
     loops' state at the end of the step, also at the end of training, which Lightning counts as an epoch's. It also
     holds the figures so far, because the end of a run reports them.
 
-    During training, signals are only recorded. After the step of the first, all save and end with `Interrupted`.
+    During training, signals are only recorded. After the step in which a process gets one, all processes save and end
+    with `Interrupted`.
 
     Args:
         every_n_train_steps, every_minutes: optimizer steps or minutes between checkpoints; None: ignored.

@@ -51,6 +51,7 @@ def test_kinds_ranges_and_choices_are_shown():
     assert "[number, 0 to 1 or null]" in text
     assert "image needed; A photo" in text
     assert "rasterizer=auto what draws Gaussians [auto, cuda, reference, tiled]" in text
+    assert "_global_" not in page("bench", ["rasterizers"])  # its constants have no name to choose them by
 
 
 def test_a_part_shows_its_settings_with_the_docstring_of_its_class():

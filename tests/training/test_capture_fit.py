@@ -55,8 +55,9 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
         assert command("fit", *QUICK, "out=parts").status != 0
     assert set(read) == set(range(FRAMES)) - {0, 4, 8}  # At least two of nine are held out, so every fourth is.
     assert command("fit", *QUICK, "ckpt_path=last", "out=parts").status == 0
-    finished = command("fit", *QUICK, "out=run")
+    finished = command("fit", *QUICK, "ckpt_path=last", "out=run")
     assert finished.status == 0, finished.err
+    assert f"there is no checkpoint in {tmp_path / 'run'}, so the training begins" in finished.out
     fitted = "the 6 training frames of the capture, and scored on the 3 held-out ones"
     assert f"fitted to {fitted}" in finished.out
     files = {path.name for path in (tmp_path / "run").iterdir()}
@@ -80,6 +81,12 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
     up = torch.nn.functional.normalize(-poses[:, 1, :3].mean(0), dim=0)  # of the held-out cameras
     torch.testing.assert_close(torch.tensor(scene["settings"]["up"]), up, atol=1e-5, rtol=1e-5)
     Image.open(tmp_path / "run/sheet.png").verify()
+    # The folder of a run stands for its checkpoint; that of other Gaussians is refused.
+    other = command("fit", *QUICK, "model.fitting.most=261", "ckpt_path=run", "out=other")
+    assert (other.status, other.err) == (
+        2,
+        "error: run/checkpoints/last.ckpt: of another model; give the settings of its run\n",
+    )
     # A test of a checkpoint writes no scene into the run.
     (tmp_path / "run/scene.ply").unlink()
     tested = command("test", "ckpt=run", "out=EVAL")

@@ -31,10 +31,10 @@ from completesplat.data.validation import BadAnnotation, BadCamera, TooFewFrames
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.geometry.cameras import Cameras
 
-logger = logging.getLogger(__name__)
-
 if TYPE_CHECKING:
     from pycolmap import Camera
+
+logger = logging.getLogger(__name__)
 
 FEWEST_FRAMES = 6
 # Limits for an undistorted image's area and sides, relative to the distorted image's. Wrong coefficients exceed them.

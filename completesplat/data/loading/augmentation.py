@@ -68,7 +68,7 @@ def changed(images: Images, change: int, factor: float) -> Images:
 
     Args:
         change: `BRIGHTNESS` multiplies the colours by the factor, `CONTRAST` their distance from the mean grey level of
-            all images, `SATURATION` that from the pixel's own grey. `HUE` turns the hue, factor 0 to 6 sixths.
+            all images, `SATURATION` that from the pixel's own grey. `HUE` turns the hue by sixths of a turn.
     """
     if change == BRIGHTNESS:
         return (images * factor).clamp_(0, 1)
