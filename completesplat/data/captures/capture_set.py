@@ -1,0 +1,144 @@
+"""Data module of many captures, each of which is one sequence: turntables, or other photos of many objects."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from completesplat.data.captures.capture import Capture
+from completesplat.data.captures.module import CaptureSource, read_capture
+from completesplat.data.co3d.splits import SeededSplit, split_by_seed
+from completesplat.data.loading.data_module import ObjectDataModule
+from completesplat.data.packed.manifest import Scalar
+from completesplat.data.sequences import SPLITS
+from completesplat.data.validation import (
+    BadAnnotation,
+    MissingFile,
+    SharedSequences,
+    at,
+    field,
+    read_json,
+    refused_to,
+    require_file,
+)
+from completesplat.errors import DataError
+from completesplat.settings.schema import Natural, Share
+
+SPLITS_FILE = "splits.json"
+
+
+def object_of(name: str) -> str:
+    """Return the object that a capture shows: the first folder of its name, whose captures stay in one split."""
+    return name.split("/", 1)[0]
+
+
+def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
+    """Read a list of splits: {"train": [...], "val": [...], "test": [...]} of captures, or of folders of captures.
+
+    Captures that it does not name belong to no split. Without "val", nothing validates.
+
+    Returns:
+        The captures of each split, in the order of `names`.
+
+    Raises:
+        BadAnnotation: an entry is neither a capture nor a folder of captures.
+        SharedSequences: two splits have captures of one object.
+    """
+    content, splits = read_json(path), dict[str, list[str]]()
+    with at(path):
+        for split in SPLITS:
+            listed = field(content, split, list) if split in content else []
+            for entry in listed:
+                if not any(name == entry or name.startswith(f"{entry}/") for name in names):
+                    raise BadAnnotation(f"{split} names {str(entry)[:80]!r}, which is no capture nor a folder of them")
+            splits[split] = [name for name in names if name in listed or any(name.startswith(f"{x}/") for x in listed)]
+        owners: dict[str, str] = {}
+        for split in SPLITS:
+            for name in splits[split]:
+                if owners.setdefault(object_of(name), split) != split:
+                    raise SharedSequences(f"{object_of(name)} is in both {owners[object_of(name)]} and {split}")
+    return splits
+
+
+class CaptureSetDataModule(ObjectDataModule):
+    """Scenes of many captures; all frames of a capture belong to the same split, as all captures of an object do.
+
+    The captures are the folders below `root`, at any depth, that `read_capture` can read. A capture's name is its path
+    below `root`, and its object is the first folder of that path.
+
+    Args:
+        root: folder of the captures, or prepared captures.
+        splits: file with the captures of each split (`read_splits`); None: `splits.json` in `root`, or, if it does not
+            exist, a seeded split of the objects.
+        val_fraction, test_fraction, split_seed: see `SeededSplit`.
+        **settings: of `ObjectDataModule`.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        splits: str | None = None,
+        val_fraction: Share = 0.05,
+        test_fraction: Share = 0.1,
+        split_seed: Natural = 0,
+        **settings: Any,
+    ) -> None:
+        super().__init__(root, **settings)
+        self.splits = splits
+        self.seeded = SeededSplit(val_fraction, test_fraction, split_seed)
+
+    def describe(self) -> dict[str, str | None]:
+        targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
+        val, test, seed = self.seeded
+        seeded = f"by seed {seed}: {val:g} of the objects for validation, {test:g} for the test"
+        return {
+            "data_set": "captures",
+            "split": f"of a list, or {seeded}",
+            "crop": "largest square around the principal point",
+            "protocol_views": f"reference: a capture's first frame; targets: {targets}",
+        }
+
+    def packed_settings(self) -> dict[str, Scalar]:
+        return {"splits": self.splits} | self.seeded._asdict() | vars(self.framing)
+
+    def open(self, split: str) -> Mapping[str, CaptureSource]:
+        """Read the cameras of all captures; one that cannot be read is only refused, unless all are."""
+        captures: dict[str, Capture] = {}
+        refused: list[DataError] = []
+        if not self.root.is_dir():
+            raise MissingFile("no such folder", str(self.root))
+        for folder in _capture_folders(self.root):
+            name = folder.relative_to(self.root).as_posix()
+            with refused_to(refused.append), at(sequence=name):
+                if (capture := read_capture(folder)) is not None:
+                    captures[name] = capture
+        if not captures:
+            raise refused[0] if refused else MissingFile("no folders with transforms.json or sparse/0", str(self.root))
+        members = self._members(list(captures))
+        return {
+            name: CaptureSource({k: captures[k] for k in names}, _all_frames, self.framing, refused)
+            for name, names in members.items()
+        }
+
+    def _members(self, names: list[str]) -> dict[str, list[str]]:
+        """Return the captures of each split."""
+        listed = self.root / SPLITS_FILE if self.splits is None else require_file(Path(self.splits))
+        if listed.is_file():
+            return read_splits(listed, names)
+        objects = split_by_seed({object_of(name): [0] for name in names}, self.seeded)
+        return {split: [name for name in names if (object_of(name), 0) in objects[split]] for split in SPLITS}
+
+
+def _all_frames(frames: int) -> list[int]:
+    return list(range(frames))
+
+
+def _capture_folders(root: Path) -> list[Path]:
+    """Return the folders below `root` that may be captures, in the order of their names."""
+    found: list[Path] = []
+    for folder, below, files in os.walk(root):
+        below.sort()
+        if Path(folder) != root and ("transforms.json" in files or "sparse" in below):
+            found.append(Path(folder))
+            below.clear()
+    return found
