@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -7,9 +8,9 @@ import torch
 from kornia import enhance
 from torch import Tensor
 
-from completesplat.data.loading.augmentation import HUE, BoxMasks, ColorJitter, augment, changed, mirrored
+from completesplat.data.loading.augmentation import HUE, BoxMasks, CameraJitter, ColorJitter, augment, changed, mirrored
 from completesplat.errors import CompleteSplatError
-from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
+from completesplat.geometry.cameras import Cameras, look_at, pinhole, pixel_rays, project
 from completesplat.scene import SceneBatch, Views
 
 SIZE = 24
@@ -200,3 +201,40 @@ def test_images_are_masked_with_the_stated_probability() -> None:
     for probability in (0.5, 0.2, 0.0):
         masked = sum(bool((BoxMasks(probability)(8, 8, rng(seed)) == 0).any()) for seed in range(300))
         assert abs(masked - 300 * probability) <= 4 * (300 * probability * (1 - probability)) ** 0.5
+
+
+def test_a_jittered_camera_sees_what_the_reference_image_shows_and_the_targets_stay_consistent() -> None:
+    """A smooth pattern on a plane, computed for the old and the new camera, and points seen by all cameras."""
+    before = scene()
+
+    def pattern(cameras: Cameras, world: Tensor) -> Tensor:
+        """Return a pattern on the plane z = 3 of the world in which `world` maps camera to world coordinates."""
+        points = 3 * pixel_rays(cameras) @ world.mT
+        return torch.stack([torch.sin(points[..., 0]), torch.cos(points[..., 1]), torch.sin(points.sum(-1))]) * 0.5 + 0.5
+
+    still = torch.eye(3)
+    before = replace(before, reference=replace(before.reference, images=pattern(before.reference.cameras, still)))
+    after = CameraJitter(roll=40, zoom=(0.7, 1.3), shift=0.1)(before, rng(3))
+    points = torch.tensor([0, 0, 3.0]) + noise(20, 3)
+    old, _ = project(before.targets.cameras, points)
+    turn = (after.targets.cameras.world_to_camera.inverse() @ before.targets.cameras.world_to_camera)[0]
+    new, _ = project(after.targets.cameras, points @ turn[:3, :3].mT)
+    torch.testing.assert_close(new, old, atol=1e-3, rtol=1e-4)
+    expected = pattern(after.reference.cameras, turn[:3, :3].mT)
+    inside = CameraJitter(roll=40, zoom=(0.7, 1.3), shift=0.1)(
+        replace(before, visible=torch.zeros(1, SIZE, SIZE).index_fill(2, torch.arange(2, SIZE - 2), 1.0)), rng(3)
+    ).visible[0, 6:-6, 6:-6] > 0.99
+    difference = (after.reference.images - expected)[:, 6:-6, 6:-6][:, inside]
+    assert inside.float().mean() > 0.5
+    assert difference.abs().max() < 0.02
+    assert torch.equal(after.targets.images, before.targets.images)
+    assert not torch.allclose(after.reference.cameras.intrinsics, before.reference.cameras.intrinsics)
+    assert torch.equal(after.reference.cameras.world_to_camera, torch.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"), [({"zoom": (1.2, 0.8)}, "smallest"), ({"roll": -1.0}, "roll"), ({"shift": 0.7}, "shift")]
+)
+def test_camera_jitter_refuses_impossible_ranges(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(CompleteSplatError, match=message):
+        CameraJitter(**settings)

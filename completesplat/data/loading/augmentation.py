@@ -1,4 +1,4 @@
-"""Random augmentation of training scenes: one colour jitter for all views, flips, boxes over the reference image."""
+"""Random augmentation of training scenes: colours of all views, the reference's camera, flips, boxes over its image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,13 +11,14 @@ from numpy import ndarray
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
-from completesplat.geometry.cameras import mirror
+from completesplat.geometry.cameras import mirror, pixel_centers
 from completesplat.rasterizers.kernels.compilation import helper, kernel
 from completesplat.scene import SceneBatch, Views
 from completesplat.settings.schema import Entries, Positive, Range, Share, check_value, hints_of
 
 Images = Float[Tensor, "view 3 height width"]
 Plane = Float32[ndarray, " pixel"]
+Zoom = Annotated[float, Range(0.1, 10)]
 BRIGHTNESS, CONTRAST, SATURATION, HUE = range(4)
 GREY_WEIGHTS = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float32)[:, None, None]  # ITU-R BT.601
 ZERO, ONE, TWO, FOUR, SIX = (np.float32(number) for number in (0, 1, 2, 4, 6))
@@ -146,25 +147,77 @@ class BoxMasks:
         return start, start + length
 
 
+@dataclass(frozen=True)
+class CameraJitter:
+    """Random turns, zooms and shifts of the reference image, with its camera, for photos that are not level.
+
+    The image that a turned, zoomed and shifted camera would see is resampled from the reference image; colours at the
+    border continue outside. The targets stay as they are.
+
+    Args:
+        roll: the angle about the optical axis is drawn from [-roll, roll] degrees.
+        zoom: the factor of the focal length is drawn from this range, uniformly in its logarithm.
+        shift: the principal point moves by at most this share of the image's side, along each axis.
+
+    Raises:
+        CompleteSplatError: a value is out of its range, or the zoom's range is empty.
+    """
+
+    roll: Annotated[float, Range(0, 180)] = 15.0
+    zoom: Annotated[Sequence[Zoom], Entries(2, 2)] = (0.85, 1.05)
+    shift: Annotated[float, Range(0, 0.5)] = 0.05
+
+    def __post_init__(self) -> None:
+        _check("data.camera_jitter", self)
+        if self.zoom[0] > self.zoom[1]:
+            raise CompleteSplatError(f"data.camera_jitter.zoom={list(self.zoom)}: the first number is the smallest")
+
+    def __call__(self, scene: SceneBatch, rng: np.random.Generator) -> SceneBatch:
+        """Return the scene with another reference view, whose camera's frame is again the world frame."""
+        angle = np.deg2rad(rng.uniform(-self.roll, self.roll))
+        zoom = np.exp(rng.uniform(*np.log(self.zoom)))
+        height, width = scene.reference.cameras.image_size
+        shift = rng.uniform(-self.shift, self.shift, 2) * (width, height)
+        turn = torch.eye(4)
+        turn[:2, :2] = torch.tensor([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        before = scene.reference.cameras.intrinsics
+        after = before * torch.tensor([[zoom, zoom, 1], [zoom, zoom, 1], [1, 1, 1]], dtype=torch.float32)
+        after[:2, 2] += torch.from_numpy(shift).float()
+        to_old = before @ turn[:3, :3].mT @ torch.linalg.inv(after)
+        pixels = pixel_centers(height, width, before.device)
+        old = (torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1) @ to_old.mT)[..., :2]
+        grid = old / torch.tensor([width, height]) * 2 - 1
+        layers = torch.cat([scene.reference.images, scene.reference.masks, scene.visible])[None]
+        seen = torch.nn.functional.grid_sample(layers, grid[None], padding_mode="border", align_corners=False)[0]
+        cameras = replace(scene.reference.cameras, intrinsics=after)
+        reference = Views(seen[:3], cameras, seen[3:4])
+        turned = scene.targets.cameras.world_to_camera @ turn.mT
+        targets = replace(scene.targets, cameras=replace(scene.targets.cameras, world_to_camera=turned))
+        return replace(scene, reference=reference, targets=targets, visible=seen[4:])
+
+
 def augment(
     scene: SceneBatch,
     rng: np.random.Generator,
     color_jitter: ColorJitter | None,
     box_masks: BoxMasks | None,
     horizontal_flip: bool,
+    camera_jitter: CameraJitter | None = None,
 ) -> SceneBatch:
     """Augment one scene (without batch axis): jitter all views, flip with probability 0.5, draw boxes into `visible`.
 
-    Jitter, flip and boxes draw from three generators, spawned from `rng` in this order. So each is independent of
-    whether the others are on, and of what was drawn from `rng` before. Nothing is drawn from `rng` itself.
+    Jitter, flip, boxes and camera draw from four generators, spawned from `rng` in this order. So each is independent
+    of whether the others are on, and of what was drawn from `rng` before. Nothing is drawn from `rng` itself.
     """
-    jitter_rng, flip_rng, boxes_rng = rng.spawn(3)
+    jitter_rng, flip_rng, boxes_rng, camera_rng = rng.spawn(4)
     if color_jitter is not None:
         images = color_jitter(scene.all_views().images, jitter_rng)
         reference, targets = replace(scene.reference, images=images[0]), replace(scene.targets, images=images[1:])
         scene = replace(scene, reference=reference, targets=targets)
     if horizontal_flip and flip_rng.random() < 0.5:
         scene = mirrored(scene)
+    if camera_jitter is not None:
+        scene = camera_jitter(scene, camera_rng)
     if box_masks is not None:
         height, width = scene.reference.cameras.image_size
         scene = replace(scene, visible=box_masks(height, width, boxes_rng).to(scene.visible))

@@ -15,7 +15,7 @@ from lightning import LightningDataModule
 from torch import Tensor
 
 from completesplat.data.hidden_modes import HiddenModeScenes
-from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augment
+from completesplat.data.loading.augmentation import BoxMasks, CameraJitter, ColorJitter, augment
 from completesplat.data.loading.distributed import batch_per_process, processes
 from completesplat.data.loading.latent_cache import CachedTrainingScenes, LatentCache
 from completesplat.data.loading.loader import EpochSampler, SceneLoader
@@ -49,7 +49,7 @@ class SceneDataModule(LightningDataModule):
         references_per_sequence: training items of a sequence in one epoch.
         mask_threshold: masks are binarized at this probability; None: they stay soft.
         background: grey value that replaces the background of images with a mask ("Objects only"); None: it stays.
-        color_jitter, box_masks: settings of `ColorJitter` and `BoxMasks`; None: off.
+        color_jitter, box_masks, camera_jitter: settings of `ColorJitter`, `BoxMasks` and `CameraJitter`; None: off.
         horizontal_flip: mirror half of the training scenes horizontally.
         workers: processes that load data; 0: none; None: one for each core, at most four.
         cache: keep decoded images in memory.
@@ -75,6 +75,7 @@ class SceneDataModule(LightningDataModule):
         background: Share | None = None,
         color_jitter: Mapping[str, float] | None = None,
         box_masks: Mapping[str, Any] | None = None,
+        camera_jitter: Mapping[str, Any] | None = None,
         horizontal_flip: bool = False,
         workers: Annotated[int, Range(0, 256)] | None = 0,
         cache: bool = False,
@@ -88,8 +89,11 @@ class SceneDataModule(LightningDataModule):
         ranged = {"targets": targets, "mask_threshold": mask_threshold, "background": background}
         for name, value in (ranged | {"workers": workers, "on_bad": on_bad}).items():
             check_value(f"data.{name}", hints_of(SceneDataModule.__init__)[name], value)
-        if latent_cache is not None and (color_jitter is not None or horizontal_flip or background is not None):
-            unchanged = "data.color_jitter=null data.horizontal_flip=false data.background=null"
+        changed = color_jitter is not None or camera_jitter is not None or horizontal_flip or background is not None
+        if latent_cache is not None and changed:
+            unchanged = (
+                "data.color_jitter=null data.camera_jitter=null data.horizontal_flip=false data.background=null"
+            )
             raise CompleteSplatError(f"data.latent_cache is of images as they are: set {unchanged}")
         self.root = local_root(root)
         self.image_size = image_size
@@ -101,7 +105,14 @@ class SceneDataModule(LightningDataModule):
         self.background = background
         jitter = None if color_jitter is None else ColorJitter(**color_jitter)
         self.box_masks = None if box_masks is None else BoxMasks(**box_masks)
-        self.augment = partial(augment, color_jitter=jitter, box_masks=self.box_masks, horizontal_flip=horizontal_flip)
+        moved = None if camera_jitter is None else CameraJitter(**camera_jitter)
+        self.augment = partial(
+            augment,
+            color_jitter=jitter,
+            box_masks=self.box_masks,
+            horizontal_flip=horizontal_flip,
+            camera_jitter=moved,
+        )
         self.workers = min(MOST_WORKERS, os.cpu_count() or 1) if workers is None else workers
         self.cache = cache
         self.latent_cache = None if latent_cache is None else Path(latent_cache)
