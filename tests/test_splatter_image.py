@@ -8,9 +8,17 @@ from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.baselines.regressor import SplatterImageUNet
+from completesplat.gaussians import DirectionalGaussians
 from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.geometry.harmonics import SH_C0
-from completesplat.splatter_image import CHANNELS, GROUPS, Parameterization, SplatterImage
+from completesplat.splatter_image import (
+    CHANNELS,
+    GROUPS,
+    Parameterization,
+    SplatterImage,
+    from_channels,
+    initialize_head,
+)
 
 SIZE = 6
 FIRST = {"scale": math.log(0.02)}  # Splatter Image's
@@ -126,3 +134,27 @@ def test_gaussians_start_with_the_scale_of_the_parameterization():
     reconstructor = Reconstructor(Parameterization(2, first_scale=0.06), (16, 32), 1, 4, 8)
     scales = reconstructor(torch.randn(2, 4, 4, 4), [torch.zeros(2, 16, 8, 8)]).split()["scale"].exp()
     torch.testing.assert_close(scales, torch.full_like(scales, 0.06), rtol=0.02, atol=0)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_harmonics_add_raw_values_at_the_end_of_a_layer_and_hardly_matter_at_first(degree):
+    plain, further = Parameterization(), Parameterization(harmonics=degree)
+    count = 3 * ((degree + 1) ** 2 - 1)
+    assert further.channels == plain.channels + 2 * count
+    torch.manual_seed(0)
+    head = nn.Conv2d(128, further.channels, 3, padding=1)
+    initialize_head(head, further)
+    features = torch.randn(1, 128, 8, 8)
+    image = from_channels(head(features), further)
+    raw = image.raw
+    assert raw.shape == (1, 2, CHANNELS + count, 8, 8)
+    cameras = Cameras(torch.eye(4)[None], pinhole(50, 8)[None], (8, 8))
+    gaussians = image.gaussians(cameras, torch.tensor([[1.0, 3.0]]))
+    assert isinstance(gaussians, DirectionalGaussians)
+    without = SplatterImage(raw[:, :, :CHANNELS], plain).gaussians(cameras, torch.tensor([[1.0, 3.0]]))
+    assert torch.equal(without.colors, gaussians.colors.clamp(min=0))
+    assert torch.equal(without.means, gaussians.means)
+    red_of_second = raw[0, 1, CHANNELS + 3, 2, 5]
+    assert gaussians.harmonics[0, 64 + 2 * 8 + 5, 1, 0] == red_of_second
+    spread = gaussians.seen_from(torch.tensor([[0.0, 0, 9]])).colors - gaussians.seen_from(torch.zeros(1, 3)).colors
+    assert 0 < spread.abs().mean() < 0.3 * gaussians.colors.std()

@@ -26,7 +26,7 @@ from completesplat.export.mesh import VOXELS, Mesh, mesh_of
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform, write_page
 from completesplat.files import write_bytes
-from completesplat.gaussians import Gaussians
+from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.cameras import transform_points
 from completesplat.geometry.harmonics import SH_C0
 from completesplat.geometry.rotations import normalize_quaternion
@@ -64,8 +64,9 @@ def write_formats(
 ) -> dict[str, str]:
     """Write one scene as `NAME.ply`, `NAME.spz` and so on, its mesh as `NAME_mesh.glb`.
 
-    All formats except `.ply` get colours clipped to [0, 1], because only some formats and readers would clip them. The
-    `.ply` keeps colours above 1, because Gaussians may be seen through others. All files keep the frame of the given
+    All formats except `.ply` get colours clipped to [0, 1], because only some formats and readers would clip them, and
+    the colours that the reference camera sees, if these depend on the direction. The `.ply` keeps colours above 1,
+    because Gaussians may be seen through others, and all harmonics. All files keep the frame of the given
     Gaussians, except the page, which is turned upright. `.ply`, `.splat` and `.sog` keep our axes (+y down). `.glb` and
     `.spz` prescribe +y up and +z towards the viewer; readers of `.spz` undo this. `.spz` omits `transparent` Gaussians.
 
@@ -76,7 +77,10 @@ def write_formats(
         CompleteSplatError: there is nothing to write, the converter (for `CONVERTED` formats) or the rasterizer (for a
             mesh) is missing, or one of them fails.
     """
-    clipped = replace(gaussians, colors=gaussians.colors.clamp(0, 1))
+    seen = gaussians
+    if isinstance(gaussians, DirectionalGaussians):
+        seen = gaussians.seen_from(view.reference.centers)
+    clipped = replace(seen, colors=seen.colors.clamp(0, 1))
     files = {kind: name + suffix(kind) for kind in formats}
     for kind, file in files.items():
         target = folder / file

@@ -1,18 +1,20 @@
 """Reader and writer of `.ply` files in the layout of the original 3D Gaussian Splatting code."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.errors import PlyError
 from completesplat.export.cleaning import cleaned
 from completesplat.files import write_bytes
-from completesplat.gaussians import Gaussians
-from completesplat.geometry.harmonics import SH_C0
+from completesplat.gaussians import DirectionalGaussians, Gaussians
+from completesplat.geometry.harmonics import LARGEST_DEGREE, SH_C0, coefficients, degree_of
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.ply_files import header, read_vertices
 
@@ -22,6 +24,8 @@ MEANS, NORMALS, COLORS = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1
 SCALES, QUATERNIONS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
 WRITTEN = (*MEANS, *NORMALS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
 REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
+
+log = logging.getLogger(__name__)
 
 
 def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
@@ -38,27 +42,36 @@ def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
         CompleteSplatError: no Gaussian of a nonempty set can be stored.
     """
     table = _table(cleaned(gaussians, path))
-    first = header(len(table), [(name, "float") for name in WRITTEN], (AXES_COMMENT, *comments))
+    names = [*WRITTEN[:9], *_further_names(table.shape[1] - len(WRITTEN)), *WRITTEN[9:]]
+    first = header(len(table), [(name, "float") for name in names], (AXES_COMMENT, *comments))
     write_bytes(path, first + table.numpy().astype("<f4").tobytes())
     return len(table)
 
 
-def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian 17"]:
+def _further_names(count: int) -> list[str]:
+    """Return the names of colours' harmonics from degree 1 on: all of red, then of green, then of blue."""
+    return [f"f_rest_{index}" for index in range(count)]
+
+
+def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian property"]:
     """Return a row for each Gaussian, computed in float64 so that only the stored float32 is rounded."""
     g = gaussians.detach().to("cpu", torch.float64)
     logits = g.opacities.logit(SMALLEST_ALPHA)[:, None]
     # Quaternions of unit length (up to float32 rounding) stay, because normalising them again would change bits.
     is_unit = (g.quaternions.square().sum(-1, keepdim=True) - 1).abs() < 1e-6
     rotations = torch.where(is_unit, g.quaternions, normalize_quaternion(g.quaternions))
-    rows = [g.means, torch.zeros_like(g.means), (g.colors - 0.5) / SH_C0, logits, g.scales.log(), rotations]
+    colors = [(g.colors - 0.5) / SH_C0]
+    if isinstance(g, DirectionalGaussians):
+        colors.append(g.harmonics.mT.flatten(1))
+    rows = [g.means, torch.zeros_like(g.means), *colors, logits, g.scales.log(), rotations]
     return torch.cat(rows, dim=-1).float()
 
 
 def read_ply(path: str | Path) -> Gaussians:
     """Read a 3DGS `.ply`, binary or ASCII, of this project or another.
 
-    Other properties (f_rest_*: the view-dependent part of the colour) are ignored. Colours below 0 become 0, as in
-    other 3DGS renderers.
+    Colours' harmonics above degree 2 are left out, with a warning, and other properties are ignored. Colours below 0
+    become 0, as in other 3DGS renderers.
 
     Raises:
         PlyError: `read_vertices` fails, or a value is not finite.
@@ -71,14 +84,33 @@ def read_ply(path: str | Path) -> Gaussians:
     def gather(names: Sequence[str]) -> Float[Tensor, "gaussian channel"]:
         return torch.from_numpy(np.stack([vertices[name].astype(np.float64) for name in names], axis=-1))
 
+    further = _further_harmonics(vertices, path)
+    colors = 0.5 + SH_C0 * gather(COLORS)
     gaussians = Gaussians(
         means=gather(MEANS).float(),
         quaternions=gather(QUATERNIONS).float(),
         scales=gather(SCALES).exp().float(),
         opacities=gather(["opacity"])[:, 0].sigmoid().float(),
-        colors=(0.5 + SH_C0 * gather(COLORS)).clamp(min=0).float(),
+        colors=(colors if further else colors.clamp(min=0)).float(),
     )
+    if further:
+        values = rearrange(gather(further), "gaussian (rgb coefficient) -> gaussian coefficient rgb", rgb=3)
+        gaussians = DirectionalGaussians(**vars(gaussians), harmonics=values.float())
     damaged = int((~gaussians.finite()).sum())
     if damaged:
         raise PlyError(f"{path}: {damaged} of {gaussians.count} Gaussians are not finite")
     return gaussians
+
+
+def _further_harmonics(vertices: np.ndarray, path: str | Path) -> list[str]:
+    """Return the names of the harmonics that are used: all up to the largest degree that the package has."""
+    names = [name for name in vertices.dtype.names or () if name.startswith("f_rest_")]
+    count, rest = divmod(len(names), 3)
+    degree = degree_of(count)
+    if rest or set(names) != set(_further_names(3 * coefficients(degree))):
+        log.warning("%s: %d properties f_rest_*, which no degree of harmonics has, are left out", path, len(names))
+        return []
+    if degree > LARGEST_DEGREE:
+        log.warning("%s: colours' harmonics above degree %d are left out", path, LARGEST_DEGREE)
+    used = range(min(count, coefficients(LARGEST_DEGREE)))
+    return [f"f_rest_{channel * count + index}" for channel in range(3) for index in used]

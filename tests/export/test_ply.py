@@ -9,7 +9,8 @@ from plyfile import PlyData
 
 from completesplat.errors import PlyError
 from completesplat.export.ply import read_ply, write_ply
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.gaussians import DirectionalGaussians, Gaussians, concatenate
+from completesplat.ply_files import header
 
 C0 = 0.5 / np.sqrt(np.pi)
 NAMES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
@@ -121,3 +122,55 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path, written, monkeypatch):
     with pytest.raises(OSError, match="full"):
         write_ply(written[0], random_gaussians(99))
     assert [p.read_bytes() for p in tmp_path.iterdir()] == [written[1]]
+
+
+def directional(degree, count=20):
+    harmonics = torch.randn(count, (degree + 1) ** 2 - 1, 3, generator=torch.Generator().manual_seed(1)) * 0.2
+    return DirectionalGaussians(**vars(random_gaussians(count)), harmonics=harmonics)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_harmonics_are_written_channel_by_channel_and_read_again(degree, tmp_path):
+    gaussians = directional(degree)
+    write_ply(tmp_path / "a.ply", gaussians)
+    vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
+    count = gaussians.harmonics.shape[1]
+    names = [*NAMES[:9], *(f"f_rest_{index}" for index in range(3 * count)), *NAMES[9:]]
+    assert [p.name for p in vertex.properties] == names
+    for channel in range(3):
+        for index in range(count):
+            values = gaussians.harmonics[:, index, channel].numpy()
+            np.testing.assert_array_equal(vertex[f"f_rest_{channel * count + index}"], values)
+    again = read_ply(tmp_path / "a.ply")
+    assert torch.equal(again.harmonics, gaussians.harmonics)
+    torch.testing.assert_close(again.colors, gaussians.colors)
+
+
+def test_a_color_seen_along_a_direction_is_that_of_the_formula_of_3d_gaussian_splatting(tmp_path):
+    """The formula of degree 1, with its signs, evaluated on the file's own columns."""
+    write_ply(tmp_path / "a.ply", directional(1))
+    vertex, eye = PlyData.read(tmp_path / "a.ply")["vertex"], np.array([1.0, -2.0, 9.0])
+    d = np.stack([vertex[axis] for axis in "xyz"], -1) - eye
+    x, y, z = (d / np.linalg.norm(d, axis=-1, keepdims=True)).T
+    c1 = np.sqrt(3 / (4 * np.pi))
+    for channel in range(3):
+        rest = [vertex[f"f_rest_{3 * channel + index}"] for index in range(3)]
+        color = 0.5 + C0 * vertex[f"f_dc_{channel}"] - c1 * y * rest[0] + c1 * z * rest[1] - c1 * x * rest[2]
+        seen = read_ply(tmp_path / "a.ply").seen_from(torch.tensor(eye, dtype=torch.float32)).colors[:, channel]
+        np.testing.assert_allclose(seen, np.maximum(color, 0), atol=1e-5)
+
+
+@pytest.mark.parametrize(("properties", "kept", "warning"), [(45, 8, "above degree 2"), (10, 0, "no degree")])
+def test_harmonics_that_are_not_known_are_left_out_with_a_warning(properties, kept, warning, tmp_path, caplog):
+    path = tmp_path / "a.ply"
+    write_ply(path, random_gaussians(4))
+    rows = np.fromfile(path, "<f4", offset=path.read_bytes().index(b"end_header\n") + 11).reshape(4, -1)
+    rest = np.arange(4 * properties, dtype="<f4").reshape(4, -1)
+    names = [*NAMES, *(f"f_rest_{index}" for index in range(properties))]
+    path.write_bytes(header(4, [(name, "float") for name in names]) + np.hstack([rows, rest]).tobytes())
+    gaussians = read_ply(path)
+    assert warning in caplog.text
+    assert isinstance(gaussians, DirectionalGaussians) == (kept > 0)
+    if kept:
+        expected = torch.from_numpy(rest.reshape(4, 3, 15)[:, :, :kept].copy()).mT
+        assert torch.equal(gaussians.harmonics, expected)
