@@ -15,7 +15,15 @@ from rich.progress import Progress, track
 from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.turntable import TurntableSettings, import_turntables
-from completesplat.data.images.files import FORMATS, check_sums, image_files, opened, refused_as_bad, save_image, stored_size
+from completesplat.data.images.files import (
+    FORMATS,
+    check_sums,
+    image_files,
+    opened,
+    refused_as_bad,
+    save_image,
+    stored_size,
+)
 from completesplat.data.validation import refused_to
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder, folder_names

@@ -23,8 +23,8 @@ Masks = Float[Tensor, "photo 1 size size"]
 WIDEST = 55  # degrees to each side of the middle in which the surface is compared
 LEAST_STEP = 8.0  # degrees between photos that are compared
 CERTAIN = 3.0  # standard errors from which on the flow has a direction
-VOXELS, PIXELS = 48, 32  # along each side of the hull, and of the masks that carve it
-MOST_VIEWS = 24
+HULL = 48  # voxels along each side of the hull, and pixels of the masks that carve it
+MOST_VIEWS = 24  # that carve it
 TILES, TILE, LABEL = 8, 48, 12  # photos of a turn on the sheet; pixels
 
 
@@ -94,15 +94,15 @@ def hull_overlap(masks: Masks, cameras: Cameras) -> float:
     The hull is carved from a cube of voxels around the origin, which is as large as the images see there.
     """
     views = torch.arange(min(len(masks), MOST_VIEWS)) * len(masks) // min(len(masks), MOST_VIEWS)
-    small = interpolate(masks[views], size=(PIXELS, PIXELS), mode="area")
-    cameras = crop_resize(cameras[views].to(torch.float32), 0, 0, masks.shape[-1], PIXELS)
-    half = float(cameras.centers[0].norm() / cameras.intrinsics[0, 0, 0]) * PIXELS / 2
-    places = half * ((torch.arange(VOXELS) + 0.5) / VOXELS * 2 - 1)
+    small = interpolate(masks[views], size=(HULL, HULL), mode="area")
+    cameras = crop_resize(cameras[views].to(torch.float32), 0, 0, masks.shape[-1], HULL)
+    half = float(cameras.centers[0].norm() / cameras.intrinsics[0, 0, 0]) * HULL / 2
+    places = half * ((torch.arange(HULL) + 0.5) / HULL * 2 - 1)
     pixels, _ = project(cameras, torch.cartesian_prod(places, places, places))
-    inside = grid_sample(small, (pixels * 2 / PIXELS - 1)[:, None], align_corners=False)[:, 0, 0]
-    column, row = pixels.long().clamp(0, PIXELS - 1).unbind(-1)
+    inside = grid_sample(small, (pixels * 2 / HULL - 1)[:, None], align_corners=False)[:, 0, 0]
+    column, row = pixels.long().clamp(0, HULL - 1).unbind(-1)
     hull = inside.amin(0).expand_as(inside)
-    silhouettes = inside.new_zeros(len(views), PIXELS**2).scatter_reduce(1, row * PIXELS + column, hull, "amax") > 0.5
+    silhouettes = inside.new_zeros(len(views), HULL**2).scatter_reduce(1, row * HULL + column, hull, "amax") > 0.5
     filled = small.flatten(1) > 0.5
     return float(((silhouettes & filled).sum(1) / (silhouettes | filled).sum(1)).mean())
 

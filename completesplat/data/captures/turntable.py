@@ -295,7 +295,9 @@ def _report(findings: Mapping[str, Findings]) -> int:
     odd = {
         f"flow goes {'right' if few < 0 else 'left'}, unlike in most": by_flow[few],
         "flow is unclear, direction of most is taken": by_flow[0],
-        f"overlap with the visual hull below {LOW_OVERLAP}": [n for n, f in findings.items() if f.overlap < LOW_OVERLAP],
+        f"overlap with the visual hull below {LOW_OVERLAP}": [
+            n for n, f in findings.items() if f.overlap < LOW_OVERLAP
+        ],
     }
     for what, names in odd.items():
         if names:

@@ -91,9 +91,7 @@ class SceneDataModule(LightningDataModule):
             check_value(f"data.{name}", hints_of(SceneDataModule.__init__)[name], value)
         changed = color_jitter is not None or camera_jitter is not None or horizontal_flip or background is not None
         if latent_cache is not None and changed:
-            unchanged = (
-                "data.color_jitter=null data.camera_jitter=null data.horizontal_flip=false data.background=null"
-            )
+            unchanged = "data.color_jitter=null data.camera_jitter=null data.horizontal_flip=false data.background=null"
             raise CompleteSplatError(f"data.latent_cache is of images as they are: set {unchanged}")
         self.root = local_root(root)
         self.image_size = image_size
