@@ -9,6 +9,7 @@ from torch import Tensor
 
 from completesplat import tensors
 from completesplat.geometry.cameras import transform_points
+from completesplat.geometry.harmonics import degree_of, harmonics, rotated
 from completesplat.geometry.rotations import (
     matrix_to_quaternion,
     normalize_quaternion,
@@ -23,7 +24,8 @@ class Gaussians(TensorDataclass):
     """3D Gaussians with final values: scales in world units, opacities in [0, 1], sRGB colours from 0 to 1.
 
     Quaternions are (w, x, y, z), of any length but zero for a defined rotation. Colours are stored as they are seen,
-    not as harmonics, because there is one colour for all directions (the DC term only, as in the paper).
+    not as harmonics, because there is one colour for all directions (the DC term only, as in the paper);
+    `DirectionalGaussians` add the others.
     """
 
     means: Float[Tensor, "*batch gaussian 3"]
@@ -54,6 +56,38 @@ class Gaussians(TensorDataclass):
         marks = [self.opacities.isfinite()]
         marks += [x.isfinite().all(-1) for x in (self.means, self.quaternions, self.scales, self.colors)]
         return torch.stack(marks).all(0)
+
+
+@dataclass(frozen=True)
+class DirectionalGaussians(Gaussians):
+    """Gaussians whose colours depend on the direction, by spherical harmonics of degree 1 or 2.
+
+    Seen along a unit vector d, the colour is max(0, colors + Y(d) @ harmonics) (`completesplat.geometry.harmonics`), so
+    `colors` are means over all directions.
+    """
+
+    harmonics: Float[Tensor, "*batch gaussian coefficient 3"]
+
+    @property
+    def degree(self) -> int:
+        """Return the largest degree of the harmonics."""
+        return degree_of(self.harmonics.shape[-2])
+
+    def seen_from(self, centers: Float[Tensor, "*batch 3"]) -> Gaussians:
+        """Return the Gaussians with the colours that they have as seen from these points."""
+        directions = torch.nn.functional.normalize(self.means - centers[..., None, :], dim=-1)
+        change = (harmonics(directions, self.degree)[..., None, :] @ self.harmonics).squeeze(-2)
+        colors = (self.colors + change).clamp(min=0)
+        return Gaussians(self.means, self.quaternions, self.scales, self.opacities, colors)
+
+    def transform(self, matrix: Float[Tensor, "*#batch 4 4"]) -> "DirectionalGaussians":
+        """Move the Gaussians as `Gaussians.transform` does, and turn their harmonics with them."""
+        moved = super().transform(matrix)
+        return DirectionalGaussians(**{**vars(moved), "harmonics": rotated(self.harmonics, matrix[..., :3, :3])})
+
+    def finite(self) -> Bool[Tensor, "*batch gaussian"]:
+        """Return a mask of the Gaussians whose values are all finite."""
+        return super().finite() & self.harmonics.isfinite().flatten(-2).all(-1)
 
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:

@@ -93,9 +93,7 @@ class SceneModel(nn.Module):
             images = images * visible + (self.background or 0) * (1 - visible)
         reconstruction: Reconstruction = self.eval().reconstruction_model(images)
         scenes = reconstruction.splatter_image.gaussians(cameras, depth_range)
-        # Gaussians without what a subclass adds, such as colours that depend on the direction.
-        plain = Gaussians(scenes.means, scenes.quaternions, scenes.scales, scenes.opacities, scenes.colors)
-        return self.fitted(plain, images, cameras, visible, color_fits)
+        return self.fitted(scenes, images, cameras, visible, color_fits)
 
     def fitted(
         self, scenes: Gaussians, images: Images, cameras: Cameras, visible: Visible | None, color_fits: int

@@ -1,8 +1,9 @@
-"""Splatter Images: M layers of 15 raw values per pixel, and the activations that turn them into Gaussians.
+"""Splatter Images: M layers of 15 or more raw values per pixel, and the activations that turn them into Gaussians.
 
 All activations of the project are here (paper, supplement A.1; values and initialisation of Szymanowicz et al.,
 "Splatter Image", `gaussian_predictor.py`). Per layer and pixel, in this order: depth 1, offset 3, opacity 1,
-scale 3, rotation 4, colour 3. Gaussians are in the reference camera's frame, ordered by layer, row, column.
+scale 3, rotation 4, colour 3, and, where colours depend on the direction, red, green and blue of each further harmonic.
+Gaussians are in the reference camera's frame, ordered by layer, row, column.
 """
 
 import math
@@ -15,14 +16,12 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from completesplat.gaussians import Gaussians
+from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_rays
+from completesplat.geometry.harmonics import LARGEST_DEGREE, SH_C0, coefficients
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.settings.schema import Few, Range, Share
 from completesplat.tensors import TensorDataclass
-
-SH_C0 = 0.28209479177387814
-"""The zeroth spherical harmonic, 1 / (2 sqrt(pi)): colours are predicted as its coefficient."""
 
 
 class Group(NamedTuple):
@@ -45,6 +44,7 @@ GROUPS = {
     "color": Group(3, 5.0, 0.0),
 }
 CHANNELS = sum(group.channels for group in GROUPS.values())
+HARMONICS_GAIN = 0.5  # a tenth of the colour's, so that a new network's colours hardly depend on the direction
 
 LayerMaps = Float[Tensor, "*batch layer height width"]
 
@@ -70,6 +70,7 @@ LAYER_DEPTHS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
 }
 
 Length = Annotated[float, Range(1e-9, 1e9)]
+Degree = Annotated[int, Range(0, LARGEST_DEGREE)]
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,8 @@ class Parameterization:
         layer_step: initial distance of a layer behind the last with incremental depths, in scene units.
         smallest_scale, largest_scale: the exponential of the raw scale is clamped to this range, in scene units
             (the paper states none). The clamp has no gradient outside and the full gradient inside.
+        harmonics: largest degree of the spherical harmonics of colours. 0 is the paper's: one colour for all
+            directions. Light that stands still while an object turns needs 1 or 2.
     """
 
     layers: Few = 2
@@ -95,24 +98,32 @@ class Parameterization:
     layer_step: Length = 1.0
     smallest_scale: Length = 1e-4
     largest_scale: Length = 2.0
+    harmonics: Degree = 0
+
+    @property
+    def groups(self) -> dict[str, Group]:
+        """Return the groups of a layer's raw values, in order."""
+        further = {"harmonics": Group(3 * coefficients(self.harmonics), HARMONICS_GAIN, 0.0)} if self.harmonics else {}
+        return GROUPS | further
 
     @property
     def channels(self) -> int:
-        """Return the channels of the network's output: M * 15."""
-        return self.layers * CHANNELS
+        """Return the channels of the network's output: M * 15 without harmonics."""
+        return self.layers * sum(group.channels for group in self.groups.values())
 
 
 @dataclass(frozen=True)
 class SplatterImage(TensorDataclass):
     """Raw network output for every layer and pixel of a reference image."""
 
-    raw: Float[Tensor, "*batch layer 15 height width"]
+    raw: Float[Tensor, "*batch layer value height width"]
     parameterization: Parameterization
 
     def split(self) -> dict[str, Float[Tensor, "*batch layer channel height width"]]:
-        """Return the raw values by group, in the order of `GROUPS`."""
-        parts = torch.split(self.raw, [group.channels for group in GROUPS.values()], dim=-3)
-        return dict(zip(GROUPS, parts, strict=True))
+        """Return the raw values by group, in the order of `Parameterization.groups`."""
+        groups = self.parameterization.groups
+        parts = torch.split(self.raw, [group.channels for group in groups.values()], dim=-3)
+        return dict(zip(groups, parts, strict=True))
 
     def gaussians(self, cameras: Cameras, depth_range: Float[Tensor, "*batch 2"]) -> Gaussians:
         """Activate the raw values and place each Gaussian on its pixel's ray (supplement A.1).
@@ -130,20 +141,26 @@ class SplatterImage(TensorDataclass):
         def flat(values: Tensor) -> Tensor:
             return rearrange(values, "... layer channel height width -> ... (layer height width) channel")
 
-        return Gaussians(
+        colors = flat(0.5 + SH_C0 * parts["color"])
+        plain = Gaussians(
             means=flat(rays * depth.unsqueeze(-3) + parts["offset"]),
             quaternions=normalize_quaternion(flat(parts["rotation"])),
             scales=flat(log_scale.exp()),
             opacities=flat(parts["opacity"].sigmoid()).squeeze(-1),
-            colors=flat((0.5 + SH_C0 * parts["color"]).clamp(min=0)),
+            colors=colors if settings.harmonics else colors.clamp(min=0),
         )
+        if not settings.harmonics:
+            return plain
+        further = rearrange(flat(parts["harmonics"]), "... (coefficient rgb) -> ... coefficient rgb", rgb=3)
+        return DirectionalGaussians(**vars(plain), harmonics=further)
 
 
 def from_channels(
     output: Float[Tensor, "batch channel height width"], parameterization: Parameterization
 ) -> SplatterImage:
     """Wrap a network's output, whose channels are ordered by layer, then by group."""
-    raw = rearrange(output, "batch (layer channel) height width -> batch layer channel height width", channel=CHANNELS)
+    layers = parameterization.layers
+    raw = rearrange(output, "batch (layer channel) height width -> batch layer channel height width", layer=layers)
     return SplatterImage(raw, parameterization)
 
 
@@ -163,7 +180,7 @@ def initialize_head(head: nn.Conv2d, parameterization: Parameterization) -> None
     for layer in range(parameterization.layers):
         behind = layer > 0 and parameterization.layer_depths == "incremental"
         starts["depth"] = math.log(parameterization.layer_step) if behind else first
-        for name, group in GROUPS.items():
+        for name, group in parameterization.groups.items():
             rows, row = slice(row, row + group.channels), row + group.channels
             bound = math.sqrt(3 * _upstream_variance(group) / inputs)
             nn.init.uniform_(head.weight[rows], -bound, bound)

@@ -38,7 +38,8 @@ DELTAS = ["experiment", "ablation", "posterior", "objective"]
 def needed(group: str, option: str) -> list[str]:
     """Return the settings that an option needs besides, so that nothing is missing in its config."""
     given = ["data.category=y"] if option == "co3d_category" else []
-    given += ["data.root=x"] if option.startswith(("capture", "co3d_", "paper_", "realestate10k", "rendered")) else []
+    rooted = ("capture", "co3d_", "paper_", "realestate10k", "rendered", "turntable")
+    given += ["data.root=x"] if option.startswith(rooted) else []
     given += ["autoreconstructor.pretrained=null"] if option.endswith(("_var_stage1", "stable_diffusion")) else []
     given += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked")) else []
     given += ["model.model.weights=x"] if option == "splatter_image_published" else []

@@ -9,7 +9,8 @@ from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.baselines.regressor import SplatterImageUNet
 from completesplat.geometry.cameras import Cameras, pinhole, project
-from completesplat.splatter_image import CHANNELS, GROUPS, SH_C0, Parameterization, SplatterImage
+from completesplat.geometry.harmonics import SH_C0
+from completesplat.splatter_image import CHANNELS, GROUPS, Parameterization, SplatterImage
 
 SIZE = 6
 FIRST = {"scale": math.log(0.02)}  # Splatter Image's

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import pixel_centers, project, unproject
+from completesplat.geometry.harmonics import SH_C0
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
 from completesplat.settings.schema import Positive, Share
-from completesplat.splatter_image import SH_C0
 
 POSITION_RATE, POSITION_DECAY = 1.6e-4, 0.01
 RATES = {"log_scales": 5e-3, "quaternions": 1e-3, "logits": 5e-2, "harmonics": 2.5e-3}

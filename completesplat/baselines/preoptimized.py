@@ -12,8 +12,9 @@ from torch import Tensor
 
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_rays, project
+from completesplat.geometry.harmonics import SH_C0
 from completesplat.rasterizers import RenderingConstants
-from completesplat.splatter_image import LAYER_DEPTHS, SH_C0, LayerMaps, Parameterization, SplatterImage
+from completesplat.splatter_image import LAYER_DEPTHS, LayerMaps, Parameterization, SplatterImage
 
 EMPTY_LOGIT = -30.0
 """Raw opacity of a place without a Gaussian: its opacity is 1e-13."""

@@ -119,7 +119,6 @@ class Trained:
             return self.files
         from torch.optim import Adam
 
-        from completesplat.baselines.splatter_image.model import DirectionalRasterizer
         from completesplat.losses import WeightedSum
         from completesplat.losses.terms import MeanSquaredError
         from completesplat.training.latent_diffusion import LatentDiffusion
@@ -132,7 +131,7 @@ class Trained:
         stage = ReconstructionModule(
             self.model.reconstruction_model,
             WeightedSum({"mse": {"weight": 1.0, "term": MeanSquaredError()}}),
-            rasterizer=DirectionalRasterizer(rasterizer),
+            rasterizer=rasterizer,
             optimizer=Adam,
             schedule=constant,
         )

@@ -28,9 +28,9 @@ from completesplat.export.splat_transform import PageView, SplatTransform, write
 from completesplat.files import write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import transform_points
+from completesplat.geometry.harmonics import SH_C0
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.rasterizers import Rasterizer
-from completesplat.splatter_image import SH_C0
 
 FORMATS = ("ply", "splat", "glb", "mesh", "spz", "sog", "html")
 CONVERTED = ("spz", "sog", "html")

@@ -12,9 +12,9 @@ from completesplat.errors import PlyError
 from completesplat.export.cleaning import cleaned
 from completesplat.files import write_bytes
 from completesplat.gaussians import Gaussians
+from completesplat.geometry.harmonics import SH_C0
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.ply_files import header, read_vertices
-from completesplat.splatter_image import SH_C0
 
 SMALLEST_ALPHA = 1e-6
 AXES_COMMENT = "coordinates as given, none turned; camera frames have +x right, +y down, +z forward (OpenCV)"

@@ -18,7 +18,7 @@ from completesplat.errors import PlyError
 from completesplat.export.formats import RECORD, TO_GLTF
 from completesplat.export.ply import read_ply
 from completesplat.gaussians import Gaussians
-from completesplat.splatter_image import SH_C0
+from completesplat.geometry.harmonics import SH_C0
 
 HEADER = struct.Struct("<4sIIBBBBI")  # magic, version, count, degree, fractional bits, flags, streams, their table
 WIDTHS = {2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}  # bytes of a Gaussian in each part, by version

@@ -4,15 +4,17 @@ Every backend computes the same function, with gsplat's conventions: alpha = min
 composited from front to back, with the constants of one shared config.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from functools import wraps
+from typing import Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
-from completesplat.gaussians import Gaussians
+from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.settings.options import gsplat_constants
 from completesplat.tensors import TensorDataclass
@@ -68,6 +70,28 @@ class Rasterizer(Protocol):
 
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Render Gaussians of batch shape [batch] from cameras of batch shape [batch view]."""
+
+
+Render = TypeVar("Render", bound=Callable[..., Rendering])
+
+
+def as_seen(render: Render) -> Render:
+    """Decorate a backend's `__call__`, so that it draws `DirectionalGaussians` in the colours that each camera sees.
+
+    Each view becomes a scene with one camera. Every backend has this decorator.
+    """
+
+    @wraps(render)
+    def drawn(backend: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        if not isinstance(gaussians, DirectionalGaussians):
+            return render(backend, gaussians, cameras)
+        shape = cameras.world_to_camera.shape[:2]
+        for_each_view = gaussians.map(lambda values: values.repeat_interleave(shape[1], dim=0))
+        single = cameras.map(lambda values: values.flatten(0, 1)[:, None])
+        rendering = render(backend, for_each_view.seen_from(cameras.centers.flatten(0, 1)), single)
+        return rendering.map(lambda values: values.view(*shape, *values.shape[2:]))
+
+    return cast(Render, drawn)
 
 
 def require_float32(name: str, gaussians: Gaussians, cameras: Cameras, device: torch.device) -> None:

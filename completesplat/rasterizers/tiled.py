@@ -10,7 +10,7 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.rasterizers import Rendering, RenderingConstants, require_float32
+from completesplat.rasterizers import Rendering, RenderingConstants, as_seen, require_float32
 from completesplat.rasterizers.kernels import array_layout as layout
 from completesplat.rasterizers.kernels.drawing import Drawing, Images, Parameters
 
@@ -36,6 +36,7 @@ class TiledRasterizer:
         if not (self.constants.near_plane >= 0 and self.constants.min_transmittance >= 0):
             raise CompleteSplatError("the tiled rasterizer needs near_plane and min_transmittance of at least 0")
 
+    @as_seen
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Render scenes [batch] from cameras [batch view]; CUDA tensors are copied here and the images back."""
         if gaussians.means.is_cuda:

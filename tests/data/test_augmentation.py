@@ -210,23 +210,22 @@ def test_a_jittered_camera_sees_what_the_reference_image_shows_and_the_targets_s
     def pattern(cameras: Cameras, world: Tensor) -> Tensor:
         """Return a pattern on the plane z = 3 of the world in which `world` maps camera to world coordinates."""
         points = 3 * pixel_rays(cameras) @ world.mT
-        return torch.stack([torch.sin(points[..., 0]), torch.cos(points[..., 1]), torch.sin(points.sum(-1))]) * 0.5 + 0.5
+        waves = [torch.sin(points[..., 0]), torch.cos(points[..., 1]), torch.sin(points.sum(-1))]
+        return torch.stack(waves) * 0.5 + 0.5
 
-    still = torch.eye(3)
-    before = replace(before, reference=replace(before.reference, images=pattern(before.reference.cameras, still)))
-    after = CameraJitter(roll=40, zoom=(0.7, 1.3), shift=0.1)(before, rng(3))
+    jitter, middle = CameraJitter(roll=40, zoom=(0.7, 1.3), shift=0.1), torch.zeros(1, SIZE, SIZE)
+    middle[:, 2:-2, 2:-2] = 1
+    seen = replace(before.reference, images=pattern(before.reference.cameras, torch.eye(3)))
+    before = replace(before, reference=seen, visible=middle)
+    after = jitter(before, rng(3))
     points = torch.tensor([0, 0, 3.0]) + noise(20, 3)
-    old, _ = project(before.targets.cameras, points)
-    turn = (after.targets.cameras.world_to_camera.inverse() @ before.targets.cameras.world_to_camera)[0]
-    new, _ = project(after.targets.cameras, points @ turn[:3, :3].mT)
-    torch.testing.assert_close(new, old, atol=1e-3, rtol=1e-4)
-    expected = pattern(after.reference.cameras, turn[:3, :3].mT)
-    inside = CameraJitter(roll=40, zoom=(0.7, 1.3), shift=0.1)(
-        replace(before, visible=torch.zeros(1, SIZE, SIZE).index_fill(2, torch.arange(2, SIZE - 2), 1.0)), rng(3)
-    ).visible[0, 6:-6, 6:-6] > 0.99
-    difference = (after.reference.images - expected)[:, 6:-6, 6:-6][:, inside]
-    assert inside.float().mean() > 0.5
-    assert difference.abs().max() < 0.02
+    turn = (after.targets.cameras.world_to_camera.inverse() @ before.targets.cameras.world_to_camera)[0, :3, :3]
+    moved, _ = project(after.targets.cameras, points @ turn.mT)
+    torch.testing.assert_close(moved, project(before.targets.cameras, points)[0], atol=1e-3, rtol=1e-4)
+    expected = pattern(after.reference.cameras, turn.mT)
+    shown = after.visible[0] > 0.99
+    assert shown.float().mean() > 0.3
+    assert (after.reference.images - expected)[:, shown].abs().max() < 0.02
     assert torch.equal(after.targets.images, before.targets.images)
     assert not torch.allclose(after.reference.cameras.intrinsics, before.reference.cameras.intrinsics)
     assert torch.equal(after.reference.cameras.world_to_camera, torch.eye(4))

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -22,14 +21,10 @@ from completesplat.data.images.photograph import ImageLike, Photograph, read_pho
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene_model import SceneModel
-from completesplat.splatter_image import CHANNELS, SH_C0, Parameterization, SplatterImage
+from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.weights.checkpoint_reading import mismatch
 
-SH_C1 = 0.4886025119029199
-"""Spherical harmonics of degree 1 are this factor, sqrt(3 / (4 pi)), times -y, z and -x of the unit direction."""
-HARMONICS = 9
 OBJECT_SIZE = 2 * 0.57
 """Largest extent of the captured objects, in scene units (`preprocess_co3d.py`: 1.2 * 0.95)."""
 OBJECT_SHARE = 0.65
@@ -37,7 +32,8 @@ OBJECT_SHARE = 0.65
 PHONE_FOV = 50.0
 TOLERANCE = 1e-4
 # Neither scales nor depths are clamped.
-PARAMETERIZATION = Parameterization(layers=1, smallest_scale=1e-9, largest_scale=1e9)
+PARAMETERIZATION = Parameterization(layers=1, smallest_scale=1e-9, largest_scale=1e9, harmonics=1)
+OUTPUTS = PARAMETERIZATION.channels
 ORDER_OF_HARMONICS = [[[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]]  # signed permutation of axes; its transpose inverts it
 
 
@@ -58,67 +54,14 @@ class Depths(NamedTuple):
 
 
 @dataclass(frozen=True)
-class DirectionalGaussians(Gaussians):
-    """Gaussians with spherical harmonics of degree 1, for models by others; those of this package have one colour.
+class PublishedImage(SplatterImage):
+    """Splatter Image with its own depth range."""
 
-    Seen along a unit vector d in the Gaussians' frame, their colour is max(0, mean_colors + d @ slopes).
-    Files and viewers, which hold one colour only, use `colors`.
-    """
-
-    mean_colors: Float[Tensor, "*batch gaussian 3"]
-    slopes: Float[Tensor, "*batch gaussian 3 3"]
-
-    def seen_from(self, centers: Float[Tensor, "*batch 3"]) -> Gaussians:
-        """Return the Gaussians in the colours that they have as seen from these points."""
-        directions = torch.nn.functional.normalize(self.means - centers[..., None, :], dim=-1)
-        colors = self.mean_colors + (directions[..., None, :] @ self.slopes).squeeze(-2)
-        return Gaussians(self.means, self.quaternions, self.scales, self.opacities, colors.clamp(min=0))
-
-    def transform(self, matrix: Float[Tensor, "*#batch 4 4"]) -> "DirectionalGaussians":
-        """Move the Gaussians as `Gaussians.transform` does, and rotate the slopes of their colours."""
-        moved = super().transform(matrix)
-        slopes = matrix[..., None, :3, :3] @ self.slopes
-        return DirectionalGaussians(**{**vars(moved), "slopes": slopes})
-
-
-class DirectionalRasterizer:
-    """Wrapper of a rasterizer that draws `DirectionalGaussians` in the colours that each camera sees."""
-
-    def __init__(self, rasterizer: Rasterizer) -> None:
-        self.rasterizer = rasterizer
-
-    def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Render scenes [batch] from cameras [batch view]: each view becomes a scene with one camera."""
-        if not isinstance(gaussians, DirectionalGaussians):
-            return self.rasterizer(gaussians, cameras)
-        shape = cameras.world_to_camera.shape[:2]
-        for_each_view = gaussians.map(lambda values: values.repeat_interleave(shape[1], dim=0))
-        seen = for_each_view.seen_from(cameras.centers.flatten(0, 1))
-        single = cameras.map(lambda values: values.flatten(0, 1)[:, None])
-        return self.rasterizer(seen, single).map(lambda values: values.view(*shape, *values.shape[2:]))
-
-
-@dataclass(frozen=True)
-class DirectionalSplatterImage(SplatterImage):
-    """Splatter Image of one layer, with spherical harmonics of degree 1 and its own depth range.
-
-    `harmonics` holds red, green and blue of three coefficients, in the reference camera's frame.
-    """
-
-    harmonics: Float[Tensor, "*batch 9 height width"]
     depths: Depths
 
-    def gaussians(self, cameras: Cameras, depth_range: Float[Tensor, "*batch 2"]) -> DirectionalGaussians:
-        """Return Gaussians like `SplatterImage.gaussians`, with the colours that the reference camera sees."""
-        plain = super().gaussians(cameras, self.depths.range(depth_range))
-        mean = 0.5 + SH_C0 * rearrange(self.split()["color"], "... 1 rgb height width -> ... (height width) rgb")
-        minus_y, z, minus_x = SH_C1 * rearrange(
-            self.harmonics, "... (term rgb) height width -> term ... (height width) rgb", rgb=3
-        )
-        slopes = torch.stack([-minus_x, -minus_y, z], dim=-2)
-        seen = DirectionalGaussians(**vars(plain), mean_colors=mean, slopes=slopes)
-        colors = seen.seen_from(torch.zeros_like(plain.means[..., 0, :])).colors
-        return DirectionalGaussians(**{**vars(seen), "colors": colors})
+    def gaussians(self, cameras: Cameras, depth_range: Float[Tensor, "*batch 2"]) -> Gaussians:
+        """Return Gaussians like `SplatterImage.gaussians`, in the depth range of the weights."""
+        return super().gaussians(cameras, self.depths.range(depth_range))
 
 
 class PublishedSplatterImage(ReconstructionModel):
@@ -150,10 +93,8 @@ class PublishedSplatterImage(ReconstructionModel):
         if size % 8 or model["base_dim"] % 4:
             raise WeightsError(f"{file}: a size of {size}, {model['base_dim']} wide: neither fits the network")
         with torch.device("meta"):  # tensors have sizes but take no memory
-            network = SongUNet(
-                size, 3, CHANNELS + HARMONICS, model["base_dim"], model["num_blocks"], model["attention_resolutions"]
-            )
-            last = nn.Conv2d(CHANNELS + HARMONICS, CHANNELS + HARMONICS, 1)
+            network = SongUNet(size, 3, OUTPUTS, model["base_dim"], model["num_blocks"], model["attention_resolutions"])
+            last = nn.Conv2d(OUTPUTS, OUTPUTS, 1)
             self.network_with_offset = nn.Sequential(OrderedDict(encoder=network, out=last))
             self.register_buffer("ray_dirs", torch.empty(1, 3, size, size))
             for name in ("v_to_sh_transform", "sh_to_v_transform"):
@@ -170,9 +111,8 @@ class PublishedSplatterImage(ReconstructionModel):
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Reconstruction:
         """Reconstruct from sRGB images in [0, 1] of objects on `background`; there is no posterior."""
-        output = self.network_with_offset(images).float()
-        raw, harmonics = output.split([CHANNELS, HARMONICS], dim=1)
-        return Reconstruction(DirectionalSplatterImage(raw[:, None], PARAMETERIZATION, harmonics, self.depths), None)
+        raw = self.network_with_offset(images).float()[:, None]
+        return Reconstruction(PublishedImage(raw, PARAMETERIZATION, self.depths), None)
 
     def object_distance(self, image: Float[Tensor, "3 size size"], focal_length: float) -> float:
         """Estimate the distance of an object on `background`, assuming that it is as large as the training objects.

@@ -50,7 +50,7 @@ def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
             listed = field(content, split, list) if split in content else []
             for entry in listed:
                 if not any(name == entry or name.startswith(f"{entry}/") for name in names):
-                    raise BadAnnotation(f"{split} names {str(entry)[:80]!r}, which is no capture nor a folder of them")
+                    raise BadAnnotation(f"{split} names {repr(entry)[:80]}, which is no capture nor a folder of them")
             splits[split] = [name for name in names if name in listed or any(name.startswith(f"{x}/") for x in listed)]
         owners: dict[str, str] = {}
         for split in SPLITS:

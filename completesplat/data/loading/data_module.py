@@ -3,11 +3,11 @@
 import logging
 import os
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -33,7 +33,15 @@ from completesplat.settings.schema import Natural, OneOf, Positive, Range, Share
 MOST_WORKERS = 4  # if data.workers is null
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
 
+UNCHANGED = "data.color_jitter=null data.camera_jitter=null data.horizontal_flip=false data.background=null"
+
+T = TypeVar("T")
+
 logger = logging.getLogger(__name__)
+
+
+def _built(kind: Callable[..., T], settings: Mapping[str, Any] | None) -> T | None:
+    return None if settings is None else kind(**settings)
 
 
 class SceneDataModule(LightningDataModule):
@@ -89,10 +97,8 @@ class SceneDataModule(LightningDataModule):
         ranged = {"targets": targets, "mask_threshold": mask_threshold, "background": background}
         for name, value in (ranged | {"workers": workers, "on_bad": on_bad}).items():
             check_value(f"data.{name}", hints_of(SceneDataModule.__init__)[name], value)
-        changed = color_jitter is not None or camera_jitter is not None or horizontal_flip or background is not None
-        if latent_cache is not None and changed:
-            unchanged = "data.color_jitter=null data.camera_jitter=null data.horizontal_flip=false data.background=null"
-            raise CompleteSplatError(f"data.latent_cache is of images as they are: set {unchanged}")
+        if latent_cache is not None and (color_jitter or camera_jitter or horizontal_flip or background is not None):
+            raise CompleteSplatError(f"data.latent_cache is of images as they are: set {UNCHANGED}")
         self.root = local_root(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -101,15 +107,13 @@ class SceneDataModule(LightningDataModule):
         self.references_per_sequence = references_per_sequence
         self.mask_threshold = mask_threshold
         self.background = background
-        jitter = None if color_jitter is None else ColorJitter(**color_jitter)
-        self.box_masks = None if box_masks is None else BoxMasks(**box_masks)
-        moved = None if camera_jitter is None else CameraJitter(**camera_jitter)
+        self.box_masks = _built(BoxMasks, box_masks)
         self.augment = partial(
             augment,
-            color_jitter=jitter,
+            color_jitter=_built(ColorJitter, color_jitter),
             box_masks=self.box_masks,
             horizontal_flip=horizontal_flip,
-            camera_jitter=moved,
+            camera_jitter=_built(CameraJitter, camera_jitter),
         )
         self.workers = min(MOST_WORKERS, os.cpu_count() or 1) if workers is None else workers
         self.cache = cache

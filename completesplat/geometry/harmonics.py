@@ -1,0 +1,62 @@
+"""Real spherical harmonics of degree 1 and 2, in the order and with the signs of 3D Gaussian Splatting.
+
+A colour seen along the unit vector d is 0.5 + C0 c_0 + sum_k Y_k(d) c_k (Kerbl et al. 2023, `utils/sh_utils.py`).
+"""
+
+import math
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SH_C0 = 0.28209479177387814
+"""The zeroth spherical harmonic, 1 / (2 sqrt(pi)): colours are predicted as its coefficient."""
+SH_C1 = 0.4886025119029199
+SH_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+LARGEST_DEGREE = 2
+Directions = Float[Tensor, "*batch 3"]
+
+
+def coefficients(degree: int) -> int:
+    """Return the number of harmonics of degree 1 up to `degree`."""
+    return (degree + 1) ** 2 - 1
+
+
+def degree_of(count: int) -> int:
+    """Return the degree up to which there are `count` harmonics without degree 0."""
+    return math.isqrt(count + 1) - 1
+
+
+def harmonics(directions: Directions, degree: int) -> Float[Tensor, "*batch coefficient"]:
+    """Return the harmonics of degree 1 up to `degree` for unit vectors."""
+    x, y, z = directions.unbind(-1)
+    terms = [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
+    if degree > 1:
+        mixed, even, difference = SH_C2
+        terms += [mixed * x * y, -mixed * y * z, even * (2 * z * z - x * x - y * y)]
+        terms += [-mixed * x * z, difference * (x * x - y * y)]
+    return torch.stack(terms[: coefficients(degree)], dim=-1)
+
+
+def rotated(
+    values: Float[Tensor, "*batch gaussian coefficient 3"], rotation: Float[Tensor, "*#batch 3 3"]
+) -> Float[Tensor, "*batch gaussian coefficient 3"]:
+    """Return the coefficients of the same colours after a rotation: seen along R d as they were along d before.
+
+    Harmonics of one degree turn among themselves, so the change of coefficients follows exactly from enough directions.
+    """
+    degree = degree_of(values.shape[-2])
+    directions, inverse = _fit(degree)
+    directions, inverse = directions.to(values), inverse.to(values)
+    change = inverse @ harmonics(directions @ rotation, degree)
+    return change[..., None, :, :] @ values
+
+
+@lru_cache
+def _fit(degree: int) -> tuple[Float[Tensor, "direction 3"], Float[Tensor, "coefficient direction"]]:
+    """Return directions, and the matrix that fits coefficients to values along them."""
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(32, 3, generator=generator, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(directions, dim=-1)
+    return directions, torch.linalg.pinv(harmonics(directions, degree))
