@@ -9,7 +9,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Literal, Unpack
 
-from PIL import Image, ImageOps
+from PIL import ImageOps
 from rich.progress import Progress, track
 
 from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap

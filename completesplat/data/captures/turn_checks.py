@@ -79,13 +79,15 @@ def direction_of_flow(photos: Photos, masks: Masks, angles: Float[np.ndarray, " 
     degrees = np.degrees(angles)
     stride = math.ceil(LEAST_STEP / float(np.median(np.diff(degrees))))
     scores = []
-    for first, second, turn in zip(unrolled, unrolled.roll(-stride, 0), np.roll(degrees, -stride) - degrees):
-        if 0 < (step := round(turn % 360)) <= WIDEST:
+    for index, first in enumerate(unrolled):
+        later = (index + stride) % len(unrolled)
+        second, step = unrolled[later], round((degrees[later] - degrees[index]) % 360)
+        if 0 < step <= WIDEST:
             left = (first[..., step:] - second[..., :-step]).square().mean()
             right = (first[..., :-step] - second[..., step:]).square().mean()
             scores.append(float((right - left) / (right + left + 1e-9)))
-    error = np.std(scores) / math.sqrt(len(scores)) if scores else math.inf
-    return int(np.sign(np.mean(scores))) if scores and abs(np.mean(scores)) > CERTAIN * error else 0
+    certain = scores and abs(np.mean(scores)) * math.sqrt(len(scores)) > CERTAIN * np.std(scores)
+    return int(np.sign(np.mean(scores))) if certain else 0
 
 
 def hull_overlap(masks: Masks, cameras: Cameras) -> float:

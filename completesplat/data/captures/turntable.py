@@ -6,7 +6,6 @@ Cameras lie on a circle around the origin at one elevation, with z up and the tu
 import json
 import logging
 import math
-import os
 import re
 import shutil
 from collections.abc import Mapping, Sequence
@@ -25,7 +24,6 @@ from completesplat.data.images.files import (
     EIGHT_BIT_MODES,
     FORMATS,
     check_sums,
-    decode,
     image_files,
     opened,
     over_grey,
@@ -39,7 +37,6 @@ from completesplat.data.validation import (
     MissingFile,
     TooFewFrames,
     at,
-    field,
     read_json,
     refused_to,
 )
@@ -91,9 +88,10 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
     Raises:
         DataError: there are no photos, no turn can be used, or the list of splits or of turns is wrong.
     """
-    folders = _folders_of_photos(folder, out)
+    folders = _folders_of_photos(folder)
     splits = {} if settings["splits"] is None else read_splits(Path(settings["splits"]), list(folders))
-    counts = _photos_of_turns(settings["photos_of_a_turn"], list(folders))
+    count = settings["photos_of_a_turn"]
+    counts = read_json(Path(count)) if isinstance(count, str) else dict.fromkeys(folders, count)
     for name in folders:
         if (out / name).exists():
             raise DataError("exists already: choose another out=DIR", str(out / name))
@@ -104,7 +102,8 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
         with writing(out, temporary=unfinished):
             for name, photos in track(folders.items(), "turns"):
                 with refused_to(refused.append), at(sequence=name):
-                    turns[name] = _write_turn(photos, counts[name], unfinished / name, settings)
+                    known = None if count is None else field(counts, name, int)
+                    turns[name] = _write_turn(photos, known, unfinished / name, settings)
             if not turns:
                 raise refused[0]
             for error in refused:
@@ -125,31 +124,17 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def _folders_of_photos(root: Path, out: Path) -> dict[str, Path]:
-    """Return the folders at and below `root` that have photos, by name; hidden folders and `out` are left out."""
+def _folders_of_photos(root: Path) -> dict[str, Path]:
+    """Return the folders at and below `root` that have photos, but not those within such a folder, by name."""
     if not root.is_dir():
         raise MissingFile("no such folder", str(root))
     folders: dict[str, Path] = {}
-    for place, below, _ in os.walk(root):
-        path = Path(place)
-        below[:] = sorted(x for x in below if not x.startswith(".") and (path / x).resolve() != out.resolve())
-        if image_files(path):
-            folders[path.resolve().name if path == root else path.relative_to(root).as_posix()] = path
+    for path in (root, *sorted(root.rglob("*/"))):
+        if image_files(path) and not {*path.parents} & {*folders.values()}:
+            folders[path.relative_to(root).as_posix() if path != root else root.resolve().name] = path
     if not folders:
         raise MissingFile("no photos there, nor in its folders", str(root))
     return folders
-
-
-def _photos_of_turns(given: int | str | None, names: list[str]) -> dict[str, int | None]:
-    """Return the number of photos of a full turn for each folder, if known."""
-    if not isinstance(given, str):
-        return dict.fromkeys(names, given)
-    listed = read_json(Path(given))
-    with at(given):
-        for name in names:
-            if (count := field(listed, name, int)) < FEWEST_PHOTOS:
-                raise BadAnnotation(f"{name}: {count} photos; a turn needs at least {FEWEST_PHOTOS}")
-    return {name: listed[name] for name in names}
 
 
 def _write_turn(folder: Path, count: int | None, out: Path, settings: TurntableSettings) -> Turn:
@@ -186,8 +171,8 @@ def read_turn(folder: Path, count: int | None, settings: TurntableSettings) -> t
         BadImage: photos have several sizes, or a mask is empty or fills its photo.
     """
     paths = image_files(folder)
-    if len(paths) < FEWEST_PHOTOS:
-        raise TooFewFrames(f"{len(paths)} photo{'s'[: len(paths) != 1]}; a turn needs at least {FEWEST_PHOTOS}")
+    if (fewest := min(len(paths), count or len(paths))) < FEWEST_PHOTOS:
+        raise TooFewFrames(f"{fewest} photo{'s'[: fewest != 1]}; a turn needs at least {FEWEST_PHOTOS}")
     places = dict(enumerate(paths)) if count is None else _numbered(paths, count)
     positions = sorted(places)
     photos = [_read_photo(places[position], settings["background"]) for position in positions]
@@ -220,11 +205,10 @@ def _read_photo(path: Path, background: str | None) -> Photo:
     """Read a photo, upright and at most 512 pixels wide and high, and find its object."""
     with refused_as_bad(str(path)):
         with opened(path, FORMATS) as stored:
-            transparent = stored.has_transparency_data and stored.mode in EIGHT_BIT_MODES
-            if transparent:
-                check_sums(stored, path)
-                image = ImageOps.exif_transpose(stored).convert("RGBA")
-        image = image if transparent else decode(path, str(path), "RGB").convert("RGBA")
+            if stored.mode not in EIGHT_BIT_MODES:
+                raise ImageError(f"colour mode {stored.mode} is not supported")
+            check_sums(stored, path)
+            image = ImageOps.exif_transpose(stored).convert("RGBA")
         image.thumbnail((MOST_SIDE, MOST_SIDE), Image.Resampling.LANCZOS)
         if background is not None:
             image = over_grey(image, 1.0)
@@ -282,24 +266,20 @@ def _write_transforms(folder: Path, turn: Turn, direction: int) -> None:
 
 def _report(findings: Mapping[str, Findings]) -> int:
     """Log a summary of all turns and the names of odd ones; return by how many more the flow goes left than right."""
-    by_flow = {flow: [name for name, found in findings.items() if found.flow == flow] for flow in (1, -1, 0)}
-    left, right, unclear = map(len, by_flow.values())
+    left, right, unclear = ([name for name, f in findings.items() if f.flow == flow] for flow in (1, -1, 0))
     ends, neighbours, opposite = np.median([found.differences for found in findings.values()], axis=0)
     overlap = np.median([found.overlap for found in findings.values()])
     logger.info(
-        f"{len(findings)} turns; flow in the middle goes left in {left}, right in {right}, is unclear in {unclear}; "
-        f"last and first photo differ by {ends:.1f} of 255, neighbours by {neighbours:.1f}, opposite ones by "
-        f"{opposite:.1f}; overlap of masks with their visual hull {overlap:.3f} (medians)"
+        f"{len(findings)} turns; flow in the middle goes left in {len(left)}, right in {len(right)}, is unclear in "
+        f"{len(unclear)}; last and first photo differ by {ends:.1f} of 255, neighbours by {neighbours:.1f}, opposite "
+        f"ones by {opposite:.1f}; the masks overlap by {overlap:.3f} with their visual hull (medians)"
     )
-    few = -1 if left >= right else 1
-    odd = {
-        f"flow goes {'right' if few < 0 else 'left'}, unlike in most": by_flow[few],
-        "flow is unclear, direction of most is taken": by_flow[0],
-        f"overlap with the visual hull below {LOW_OVERLAP}": [
-            n for n, f in findings.items() if f.overlap < LOW_OVERLAP
-        ],
-    }
-    for what, names in odd.items():
+    low = [name for name, found in findings.items() if found.overlap < LOW_OVERLAP]
+    for names, what in (
+        (min(right, left, key=len), f"flow goes {'left' if len(left) < len(right) else 'right'}, unlike in most"),
+        (unclear, "flow is unclear, the direction of most is taken"),
+        (low, f"the masks overlap by less than {LOW_OVERLAP} with their visual hull"),
+    ):
         if names:
             logger.warning("%s: %s", what, ", ".join(names))
-    return left - right
+    return len(left) - len(right)
