@@ -4,7 +4,6 @@ import json
 import logging
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,57 +11,18 @@ import pytest
 import torch
 from PIL import Image
 from support import refused
+from turntables import SIZE, draw, toy, write_turn
 
 from completesplat.data.captures import turntable
 from completesplat.data.captures.capture_set import CaptureSetDataModule
 from completesplat.data.captures.module import read_capture
 from completesplat.data.captures.turn_checks import hull_overlap
-from completesplat.data.images.files import to_bytes
-from completesplat.data.toy.object_scene import ToyScene, draw_mini, render_frame
-from completesplat.data.toy.shapes import CHECKS, rotation_about
+from completesplat.data.toy.shapes import rotation_about
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras, look_at
 
-SIZE, DISTANCE = 48, 3.6
 DEFAULTS = {"photos_of_a_turn": None, "elevation": 0, "fov": 18, "direction": None, "height": "ring"}
 DEFAULTS |= {"background": "white", "splits": None}
-
-
-def toy() -> ToyScene:
-    """An ellipsoid with checks, a nose and a patch."""
-    scene = draw_mini(np.random.default_rng(0), 2)
-    textures = scene.shapes.textures.copy()
-    textures[0], scene.shapes.colors[0, 1] = [CHECKS, 6, 0], 0.1
-    return replace(scene, shapes=scene.shapes._replace(textures=textures), fov_degrees=20.0)
-
-
-def draw(scene: ToyScene, azimuth: float) -> Image.Image:
-    """The toy on white, from the level of its centre; the light comes from the camera's side, the axis is y."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_about("y", azimuth) @ np.diag([1, -1, -1])  # at azimuth 0 it looks along -z
-    pose[:3, 3] = -DISTANCE * pose[:3, 2]
-    light = scene.light._replace(place=rotation_about("y", azimuth) @ [0.5, 0.6, 0.62])
-    moved = replace(scene, camera_to_world=pose[None], light=light)
-    color, coverage, _ = render_frame(moved, 0, SIZE)
-    return Image.fromarray(to_bytes(color + 0.5 * (1 - coverage[..., None])))  # the dome behind it is grey
-
-
-def cropped(photo: Image.Image) -> Image.Image:
-    """The object's box, enlarged until it fills the square."""
-    left, top, right, bottom = Image.fromarray(np.asarray(photo).min(-1) < 245).getbbox()
-    scale = SIZE / max(right - left, bottom - top)
-    box = photo.crop((left, top, right, bottom))
-    box = box.resize((round(scale * box.width), round(scale * box.height)), Image.Resampling.BICUBIC)
-    square = Image.new("RGB", (SIZE, SIZE), "white")
-    square.paste(box, ((SIZE - box.width) // 2, (SIZE - box.height) // 2))
-    return square
-
-
-def write_turn(folder: Path, azimuths: np.ndarray, crop: bool = True) -> None:
-    folder.mkdir(parents=True)
-    for index, azimuth in enumerate(azimuths):
-        photo = draw(toy(), azimuth)
-        (cropped(photo) if crop else photo).save(folder / f"photo {index}.png")
 
 
 def angles_to(folder: Path, azimuths: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Findings about photos of a turntable: whether the turn closes, where it goes, and how well the masks fit together."""
+"""TurnFindings about photos of a turntable: whether the turn closes, where it goes, and how well the masks fit together."""
 
 import math
 from collections.abc import Mapping
@@ -28,8 +28,8 @@ MOST_VIEWS = 24  # that carve it
 TILES, TILE, LABEL = 8, 48, 12  # photos of a turn on the sheet; pixels
 
 
-class Findings(NamedTuple):
-    """Findings about one turn.
+class TurnFindings(NamedTuple):
+    """TurnFindings about one turn.
 
     Attributes:
         differences: mean absolute differences (0 to 255) of equally bright photos: the last and the first, neighbours,
@@ -45,7 +45,7 @@ class Findings(NamedTuple):
     tiles: Photos
 
 
-def examine(photos: Photos, masks: Masks, angles: Float[np.ndarray, " photo"], cameras: Cameras) -> Findings:
+def examine(photos: Photos, masks: Masks, angles: Float[np.ndarray, " photo"], cameras: Cameras) -> TurnFindings:
     """Return the findings about one turn of square photos with the axis in the middle.
 
     Raises:
@@ -62,7 +62,7 @@ def examine(photos: Photos, masks: Masks, angles: Float[np.ndarray, " photo"], c
         raise DataError(f"the turn does not close: {message} {half:.1f}")
     tiles = (photos * masks + 0.7 * (1 - masks))[torch.arange(TILES) * len(photos) // TILES]
     tiles = interpolate(tiles, size=(TILE, TILE), mode="area")
-    return Findings((ends, mean, half), direction_of_flow(even, masks, angles), hull_overlap(masks, cameras), tiles)
+    return TurnFindings((ends, mean, half), direction_of_flow(even, masks, angles), hull_overlap(masks, cameras), tiles)
 
 
 def direction_of_flow(photos: Photos, masks: Masks, angles: Float[np.ndarray, " photo"]) -> int:
@@ -109,7 +109,7 @@ def hull_overlap(masks: Masks, cameras: Cameras) -> float:
     return float(((silhouettes & filled).sum(1) / (silhouettes | filled).sum(1)).mean())
 
 
-def write_sheet(findings: Mapping[str, Findings], path: Path) -> None:
+def write_sheet(findings: Mapping[str, TurnFindings], path: Path) -> None:
     """Write some photos of each turn, evenly spread over it, with the turn's name and overlap, in columns."""
     height, width = TILE + LABEL, TILES * TILE + LABEL
     columns = math.ceil(math.sqrt(len(findings) * height / width))

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageOps
 from rich.progress import track
 
 from completesplat.data.captures.capture_set import SPLITS_FILE, read_splits
-from completesplat.data.captures.turn_checks import Findings, examine, write_sheet
+from completesplat.data.captures.turn_checks import TurnFindings, examine, write_sheet
 from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.files import (
     EIGHT_BIT_MODES,
@@ -37,6 +37,7 @@ from completesplat.data.validation import (
     MissingFile,
     TooFewFrames,
     at,
+    field,
     read_json,
     refused_to,
 )
@@ -76,7 +77,7 @@ class Turn(NamedTuple):
 
     positions: list[int]
     cameras: Cameras
-    findings: Findings
+    findings: TurnFindings
 
 
 def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> None:
@@ -264,7 +265,7 @@ def _write_transforms(folder: Path, turn: Turn, direction: int) -> None:
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}, indent=1) + "\n")
 
 
-def _report(findings: Mapping[str, Findings]) -> int:
+def _report(findings: Mapping[str, TurnFindings]) -> int:
     """Log a summary of all turns and the names of odd ones; return by how many more the flow goes left than right."""
     left, right, unclear = ([name for name, f in findings.items() if f.flow == flow] for flow in (1, -1, 0))
     ends, neighbours, opposite = np.median([found.differences for found in findings.values()], axis=0)
