@@ -168,6 +168,12 @@ def safe_name(text: str, ending: str = "") -> str:
     return (shortened or UNNAMED) + ending
 
 
+def by_numbers(path: Path) -> list[tuple[int, str]]:
+    """Return a key that sorts paths with numbers by them, `r_2` before `r_10`."""
+    parts = re.split(r"([0-9]+)", str(path))
+    return [(len(part), part) if part.isdecimal() else (-1, part) for part in parts]
+
+
 def folder_names(stems: Iterable[str]) -> list[str]:
     """Return a safe name for each stem, with `_2`, `_3` and so on behind names that are taken.
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from support import LIMIT, SMALL, write_capture
+from turntables import write_turn
 from written_commands import CARDS, DOCUMENTS, arguments_of, block_commands
 
 from completesplat.data.rendered.blender import find_blender
@@ -41,6 +42,12 @@ BRIEF |= {
     "plan experiment=rendered_var": ["data.image_size=32"],
     "fit experiment=rendered_var": [*RENDERED, "data.batch_size=1", "data.targets=4"],
     "fit experiment=rendered_diffusion": [*RENDERED, "data.batch_size=2", "conditioning.channels=[8,8,16,16]"],
+}
+TABLE = [*SMALL, "test=false", "callbacks.images=null", "data.targets=2", "data.camera_jitter=null"]
+BRIEF |= {
+    "data check data=turntable": ["workers=1"],
+    "fit experiment=turntable_var": TABLE,
+    "fit experiment=turntable_diffusion": [*TABLE, "conditioning.channels=[8,8,16,16]"],
 }
 NEED_BLENDER = ("RENDERS", "ASSET", "RUN40", "RUN41")
 # What they need cannot be made here: Infinigen (`test_rendering` has such commands), CO3D, eight GPUs, VGG16
@@ -96,7 +103,7 @@ def named_in(command: str) -> set[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A photograph, a folder of three with their cameras, a capture, CO3D's hydrants in its layout, three meshes."""
+    """A photograph, a folder of three with cameras, a capture, CO3D's hydrants in its layout, six turns, three meshes."""
     place = tmp_path_factory.mktemp("readme")
     rng = np.random.default_rng(0)
     Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)).save(place / "photo.jpg")
@@ -107,6 +114,8 @@ def folder(tmp_path_factory):
         co3d_trees.write_tree(place / "ROOT", dict.fromkeys(names, 6), splits)
     write_capture(place, frames=6, names=("a.jpg", "b.jpg"))
     write_capture(place / "FOLDER", frames=6, names=("photo.jpg", "other.png"))
+    for index in range(6):
+        write_turn(place / f"TURNS/object{index // 2}/turn{index % 2}", 2 * np.pi * np.arange(8) / 8)
     for name in "abc":
         meshes.write_cube(place / f"MESHES/{name}.obj")
     return place

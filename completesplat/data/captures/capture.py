@@ -1,7 +1,6 @@
 """Common form of captures, independent of their files and conventions, and undistorted reading of their images."""
 
 import logging
-import re
 import signal
 import threading
 from collections.abc import Sequence
@@ -29,6 +28,7 @@ from completesplat.data.images.files import (
 from completesplat.data.sequences import shortened
 from completesplat.data.validation import BadAnnotation, BadCamera, TooFewFrames, at, require_file
 from completesplat.errors import CompleteSplatError, ImageError
+from completesplat.files import by_numbers
 from completesplat.geometry.cameras import Cameras
 
 if TYPE_CHECKING:
@@ -115,12 +115,7 @@ def in_order(frames: Sequence[CapturedFrame]) -> tuple[CapturedFrame, ...]:
         first = seen.setdefault(frame.image.resolve(), frame.number)
         if first != frame.number:
             raise BadAnnotation(f"the same image as frame {first}: {frame.image}", frame=frame.number)
-
-    def key(frame: CapturedFrame) -> list[tuple[int, str]]:
-        parts = re.split(r"([0-9]+)", str(frame.image))
-        return [(len(part), part) if part.isdecimal() else (-1, part) for part in parts]
-
-    return tuple(sorted(frames, key=key))
+    return tuple(sorted(frames, key=lambda frame: by_numbers(frame.image)))
 
 
 def warn_of_missing(path: Path, missing: Sequence[str], frames: int) -> None:

@@ -1,4 +1,4 @@
-"""Import of captures: a check of their cameras, or cameras by COLMAP for photos or a video."""
+"""Import of captures: a check of their cameras, or cameras for photos or a video, by COLMAP or of a turntable."""
 
 import logging
 import os
@@ -7,14 +7,23 @@ import subprocess
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Unpack
 
-from PIL import Image, ImageOps
+from PIL import ImageOps
 from rich.progress import Progress, track
 
 from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
 from completesplat.data.captures.module import CaptureDataModule
-from completesplat.data.images.files import FORMATS, check_sums, opened, refused_as_bad, save_image, stored_size
+from completesplat.data.captures.turntable import TurntableSettings, import_turntables
+from completesplat.data.images.files import (
+    FORMATS,
+    check_sums,
+    image_files,
+    opened,
+    refused_as_bad,
+    save_image,
+    stored_size,
+)
 from completesplat.data.validation import refused_to
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder, folder_names
@@ -29,9 +38,17 @@ NEAR = 10  # frames
 
 
 def import_capture(
-    folder: str, cameras: Literal["colmap"] | None, frames: Positive, max_image_size: Positive, out: Path
+    folder: str,
+    cameras: Literal["colmap", "turntable"] | None,
+    frames: Positive,
+    max_image_size: Positive,
+    out: Path,
+    **turntable: Unpack[TurntableSettings],
 ) -> str:
-    """Check the cameras of captures, which COLMAP computes first if asked to; return the command that goes on."""
+    """Check the cameras of captures, which COLMAP or a turntable gives first if asked to; return the next command."""
+    if cameras == "turntable":
+        import_turntables(Path(folder), out, turntable)
+        return f"go on with: completesplat data show data=turntable {shlex.quote(f'data.root={out}')}"
     root = Path(folder) if cameras is None else _make_capture(Path(folder), frames, max_image_size, out)
     sources = CaptureDataModule(str(root)).open("train")
     for error in sources["train"].refused:
@@ -75,8 +92,7 @@ def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> 
 
 def _copy_photos(folder: Path, images: Path) -> None:
     """Write upright photos, with the rest of their EXIF records, which has the focal length."""
-    suffixes = {suffix for suffix, kind in Image.registered_extensions().items() if kind in FORMATS}
-    photos = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes)
+    photos = image_files(folder)
     stems = folder_names("_".join(path.stem.split()) for path in photos)  # COLMAP lists pairs with a space between
     for photo, stem in track(list(zip(photos, stems, strict=True)), "photos"):
         with refused_to(leave_out), refused_as_bad(str(photo)):

@@ -16,6 +16,7 @@ from torch import Tensor
 from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, Tags, read_exif
 from completesplat.data.validation import BadImage, require_file
 from completesplat.errors import ImageError
+from completesplat.files import by_numbers
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 MOST_PIXELS = 50_000_000
@@ -80,6 +81,12 @@ def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height w
         if depth.min() < 0:
             raise ImageError("negative depths; its bits are no float16")
     return torch.from_numpy(depth * np.float32(scale_adjustment))[None]
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Return the files in a folder whose suffix is that of an image, `r_2` before `r_10`."""
+    suffixes = {suffix for suffix, kind in Image.registered_extensions().items() if kind in FORMATS}
+    return sorted((path for path in folder.iterdir() if path.suffix.lower() in suffixes), key=by_numbers)
 
 
 @contextmanager

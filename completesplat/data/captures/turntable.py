@@ -1,0 +1,286 @@
+"""Import of turntables: a folder of photos that are one turn of an object, or a data set of such folders.
+
+Cameras lie on a circle around the origin at one elevation, with z up and the turning axis in the images' middle.
+"""
+
+import json
+import logging
+import math
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple, TypedDict
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageOps
+from rich.progress import track
+
+from completesplat.data.captures.capture_set import SPLITS_FILE, read_splits
+from completesplat.data.captures.turn_checks import TurnFindings, examine, write_sheet
+from completesplat.data.images.crop import Square, cut_square
+from completesplat.data.images.files import (
+    EIGHT_BIT_MODES,
+    FORMATS,
+    check_sums,
+    image_files,
+    opened,
+    over_grey,
+    refused_as_bad,
+    save_image,
+)
+from completesplat.data.images.photograph import without_background
+from completesplat.data.validation import (
+    BadAnnotation,
+    BadImage,
+    MissingFile,
+    TooFewFrames,
+    at,
+    field,
+    read_json,
+    refused_to,
+)
+from completesplat.errors import DataError, ImageError
+from completesplat.files import writing
+from completesplat.geometry.cameras import Cameras, invert_rigid, look_at, mirror
+from completesplat.settings.schema import Range
+
+logger = logging.getLogger(__name__)
+
+FEWEST_PHOTOS = 8
+MOST_SIDE = 512  # pixels; larger photos are reduced
+WHITE = 245  # least value of a white background's pixels, in every channel
+FULL = 0.98  # share of a photo from which on a mask fills it
+LEAST_FACTOR, LARGEST_FACTOR = 0.8, 1.25  # of the scale that undoes a crop
+MARGIN = 1.1  # side of the images, in units of the object's largest side
+LOW_OVERLAP = 0.85  # of the masks with their visual hull; a turn with less is named
+
+Photo = tuple[Image.Image, Image.Image]
+"""RGB image over white, and mask of the object."""
+
+
+class TurntableSettings(TypedDict):
+    """Settings of `import_turntables`; `conf/data_task/import.yaml` explains them."""
+
+    photos_of_a_turn: Annotated[int, Range(FEWEST_PHOTOS)] | str | None
+    elevation: Annotated[float, Range(-85, 85)]
+    fov: Annotated[float, Range(1, 120)]
+    direction: Literal[1, -1] | None
+    height: Literal["ring"] | None
+    background: Literal["white", "remove"] | None
+    splits: str | None
+
+
+class Turn(NamedTuple):
+    """Positions of one turn's photos, their cameras if the surface moves left, and findings about the photos."""
+
+    positions: list[int]
+    cameras: Cameras
+    findings: TurnFindings
+
+
+def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> None:
+    """Write each turn below `folder` as a capture below `out`, all or none, with `splits.json` and `sheet.png`.
+
+    A turn has the name of its path below `folder`, or of `folder` itself if its photos are there. A turn that cannot be
+    used is named and left out.
+
+    Raises:
+        DataError: there are no photos, no turn can be used, or the list of splits or of turns is wrong.
+    """
+    folders = _folders_of_photos(folder)
+    splits = {} if settings["splits"] is None else read_splits(Path(settings["splits"]), list(folders))
+    count = settings["photos_of_a_turn"]
+    counts = read_json(Path(count)) if isinstance(count, str) else dict.fromkeys(folders, count)
+    for name in folders:
+        if (out / name).exists():
+            raise DataError("exists already: choose another out=DIR", str(out / name))
+    unfinished, refused = out / ".turntable.unfinished", list[DataError]()
+    shutil.rmtree(unfinished, ignore_errors=True)
+    turns: dict[str, Turn] = {}
+    try:
+        with writing(out, temporary=unfinished):
+            for name, photos in track(folders.items(), "turns"):
+                with refused_to(refused.append), at(sequence=name):
+                    known = None if count is None else field(counts, name, int)
+                    turns[name] = _write_turn(photos, known, unfinished / name, settings)
+            if not turns:
+                raise refused[0]
+            for error in refused:
+                logger.warning("left out: %s", error)
+            findings = {name: turn.findings for name, turn in turns.items()}
+            left = _report(findings) >= 0
+            write_sheet(findings, out / "sheet.png")
+            if splits:
+                usable = {split: [name for name in names if name in turns] for split, names in splits.items()}
+                (out / SPLITS_FILE).write_text(json.dumps(usable, indent=1) + "\n")
+            for name, turn in turns.items():
+                direction = settings["direction"] or turn.findings.flow or (1 if left else -1)
+                _write_transforms(unfinished / name, turn, direction)
+            for name in turns:
+                (out / name).parent.mkdir(parents=True, exist_ok=True)
+                (unfinished / name).rename(out / name)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def _folders_of_photos(root: Path) -> dict[str, Path]:
+    """Return the folders at and below `root` that have photos, but not those within such a folder, by name."""
+    if not root.is_dir():
+        raise MissingFile("no such folder", str(root))
+    folders: dict[str, Path] = {}
+    for path in (root, *sorted(root.rglob("*/"))):
+        if image_files(path) and not {*path.parents} & {*folders.values()}:
+            folders[path.relative_to(root).as_posix() if path != root else root.resolve().name] = path
+    if not folders:
+        raise MissingFile("no photos there, nor in its folders", str(root))
+    return folders
+
+
+def _write_turn(folder: Path, count: int | None, out: Path, settings: TurntableSettings) -> Turn:
+    """Write images and masks of one turn, and return what its cameras follow from; errors as in `read_turn`."""
+    positions, cameras, photos = read_turn(folder, count, settings)
+    size = min(128, cameras.image_size[0])
+    images, masks = (
+        torch.stack([cut_square(photo[part], Square(0, 0, photo[part].width), size) / 255 for photo in photos])
+        for part in (0, 1)
+    )
+    angles = 2 * np.pi * np.array(positions) / (count or len(positions))
+    turn = Turn(positions, cameras, examine(images, masks, angles, cameras))
+    for kind in ("images", "masks"):
+        (out / kind).mkdir(parents=True)
+    for position, (image, mask) in zip(positions, photos, strict=True):
+        save_image(image, out / f"images/{position:05d}.jpg", quality=95, subsampling=0)
+        save_image(mask, out / f"masks/{position:05d}.png")
+    return turn
+
+
+def read_turn(folder: Path, count: int | None, settings: TurntableSettings) -> tuple[list[int], Cameras, list[Photo]]:
+    """Read the photos of one turn, and place its axis in the middle of square images.
+
+    Args:
+        count: photos of a full turn; None: as many as there are.
+
+    Returns:
+        Positions in the turn; cameras [photo] (float64) that rise in azimuth, as if the surface moves left, where half
+        the object's height has length 1; and photos.
+
+    Raises:
+        TooFewFrames: there are fewer than 8 photos.
+        BadAnnotation: a file name has no number, or two have the same, where `count` is given.
+        BadImage: photos have several sizes, or a mask is empty or fills its photo.
+    """
+    paths = image_files(folder)
+    if (fewest := min(len(paths), count or len(paths))) < FEWEST_PHOTOS:
+        raise TooFewFrames(f"{fewest} photo{'s'[: fewest != 1]}; a turn needs at least {FEWEST_PHOTOS}")
+    places = dict(enumerate(paths)) if count is None else _numbered(paths, count)
+    positions = sorted(places)
+    photos = [_read_photo(places[position], settings["background"]) for position in positions]
+    sizes = sorted({image.size for image, _ in photos})
+    if len(sizes) > 1:
+        raise BadImage("photos of several sizes: " + ", ".join(f"{width} x {height}" for width, height in sizes))
+    squares, height = _squared(photos, settings["height"])
+    focal = sizes[0][0] / 2 / math.tan(math.radians(settings["fov"]) / 2)
+    azimuths = 2 * np.pi * torch.tensor(positions, dtype=torch.float64) / (count or len(paths))
+    elevation, side = math.radians(settings["elevation"]), squares[0][0].width
+    level = math.cos(elevation) * torch.stack([azimuths.cos(), azimuths.sin()], dim=-1)
+    eyes = torch.cat([level, torch.full_like(level[:, :1], math.sin(elevation))], dim=-1) * (2 * focal / height)
+    poses = look_at(eyes, torch.zeros_like(eyes), eyes.new_tensor([0, 0, 1]))
+    intrinsics = eyes.new_tensor([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1]])
+    return positions, Cameras(poses, intrinsics.expand(len(poses), 3, 3), (side, side)), squares
+
+
+def _numbered(paths: Sequence[Path], count: int) -> dict[int, Path]:
+    """Return photos by the last number in their names, modulo the photos of a turn."""
+    places: dict[int, Path] = {}
+    for path in paths:
+        if not (numbers := re.findall(r"[0-9]+", path.stem)):
+            raise BadAnnotation("no number in this name, but photos_of_a_turn needs positions", str(path))
+        if (first := places.setdefault(int(numbers[-1]) % count, path)) != path:
+            raise BadAnnotation(f"the same position in the turn of {count} photos as {first.name}", str(path))
+    return places
+
+
+def _read_photo(path: Path, background: str | None) -> Photo:
+    """Read a photo, upright and at most 512 pixels wide and high, and find its object."""
+    with refused_as_bad(str(path)):
+        with opened(path, FORMATS) as stored:
+            if stored.mode not in EIGHT_BIT_MODES:
+                raise ImageError(f"colour mode {stored.mode} is not supported")
+            check_sums(stored, path)
+            image = ImageOps.exif_transpose(stored).convert("RGBA")
+        image.thumbnail((MOST_SIDE, MOST_SIDE), Image.Resampling.LANCZOS)
+        if background is not None:
+            image = over_grey(image, 1.0)
+            image = without_background(image) if background == "remove" else _without_white(image)
+        mask = image.getchannel("A")
+        share = np.mean(np.asarray(mask) > 127)
+        if not 0 < share <= FULL:
+            raise ImageError(f"background={background}: its mask {'fills the photo' if share else 'is empty'}")
+        return over_grey(image, 1.0), mask
+
+
+def _without_white(image: Image.Image) -> Image.Image:
+    """Make white pixels transparent that can be reached from the border through white ones."""
+    white = Image.fromarray((np.asarray(image) >= WHITE).all(-1)).convert("L")
+    framed = ImageOps.expand(white, 1, 255)
+    ImageDraw.floodfill(framed, (0, 0), 128)
+    image.putalpha(ImageOps.crop(framed, 1).point(lambda value: 255 * (value != 128)))
+    return image
+
+
+def _squared(photos: Sequence[Photo], height: str | None) -> tuple[list[Photo], float]:
+    """Cut the photos to squares of one size around the axis; return also the object's height in pixels."""
+    masks = [mask.point(lambda value: 255 * (value > 127)) for _, mask in photos]
+    boxes = np.array([mask.getbbox() for mask in masks], dtype=np.float64)
+    heights = boxes[:, 3] - boxes[:, 1]
+    factors = np.ones(len(boxes))
+    if height == "ring":
+        factors = (np.median(heights) / heights).clip(LEAST_FACTOR, LARGEST_FACTOR)
+    else:  # One box around all masks is symmetric about the axis of a full turn.
+        boxes[:] = np.concatenate([boxes[:, :2].min(0), boxes[:, 2:].max(0)])
+    sizes, centers = boxes[:, 2:] - boxes[:, :2], (boxes[:, :2] + boxes[:, 2:]) / 2
+    side = math.ceil(MARGIN * (factors * sizes.max(1)).max())
+    squares = []
+    for (image, mask), center, factor in zip(photos, centers, factors, strict=True):
+        box = tuple(np.concatenate([center - side / factor / 2, center + side / factor / 2]).tolist())
+        cut = ((side, side), Image.Transform.EXTENT, box)
+        color = image.transform(*cut, Image.Resampling.BICUBIC, fillcolor="white")
+        squares.append((color, mask.transform(*cut, Image.Resampling.BILINEAR)))
+    return squares, float(np.median(heights))
+
+
+def _write_transforms(folder: Path, turn: Turn, direction: int) -> None:
+    """Write `transforms.json`, with OpenGL's axes, for one turn's images in a folder."""
+    cameras = turn.cameras if direction == 1 else mirror(turn.cameras)
+    poses = invert_rigid(cameras.world_to_camera)
+    poses[:, :3, 1:3] *= -1
+    frames = [
+        {"file_path": f"images/{number:05d}.jpg", "mask_path": f"masks/{number:05d}.png", "transform_matrix": pose}
+        for number, pose in zip(turn.positions, poses.tolist(), strict=True)
+    ]
+    focal, (height, width) = float(cameras.intrinsics[0, 0, 0]), cameras.image_size
+    lens = {"camera_model": "PINHOLE", "fl_x": focal, "fl_y": focal, "w": width, "h": height}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}, indent=1) + "\n")
+
+
+def _report(findings: Mapping[str, TurnFindings]) -> int:
+    """Log a summary of all turns and the names of odd ones; return by how many more the flow goes left than right."""
+    left, right, unclear = ([name for name, f in findings.items() if f.flow == flow] for flow in (1, -1, 0))
+    ends, neighbours, opposite = np.median([found.differences for found in findings.values()], axis=0)
+    overlap = np.median([found.overlap for found in findings.values()])
+    logger.info(
+        f"{len(findings)} turns; flow in the middle goes left in {len(left)}, right in {len(right)}, is unclear in "
+        f"{len(unclear)}; last and first photo differ by {ends:.1f} of 255, neighbours by {neighbours:.1f}, opposite "
+        f"ones by {opposite:.1f}; the masks overlap by {overlap:.3f} with their visual hull (medians)"
+    )
+    low = [name for name, found in findings.items() if found.overlap < LOW_OVERLAP]
+    for names, what in (
+        (min(right, left, key=len), f"flow goes {'left' if len(left) < len(right) else 'right'}, unlike in most"),
+        (unclear, "flow is unclear, the direction of most is taken"),
+        (low, f"the masks overlap by less than {LOW_OVERLAP} with their visual hull"),
+    ):
+        if names:
+            logger.warning("%s: %s", what, ", ".join(names))
+    return len(left) - len(right)
