@@ -40,7 +40,7 @@ demo: $(READY) ## Complete three images with the weights in the package, and sco
 	@echo "                sample_0*.ply open in any splat viewer, orbit_0*.mp4 in any player"
 	@echo "  toy/          the same for a toy scene that training never saw"
 	@echo "  photograph/   the same for a real photograph, which these weights do not understand"
-	@echo "  test/         metrics.json: scores of one sample for each held-out toy scene, beside two naive predictors"
+	@echo "  test/         metrics.json: scores of one sample for each held-out toy scene, beside naive predictors"
 	@echo "Next: $(BIN)/completesplat predict image=FILE, and make demo-train for both stages of training"
 
 demo-train: $(READY) ## Make toy scenes, train both stages briefly, evaluate, complete an image (CPU, under 15 minutes)

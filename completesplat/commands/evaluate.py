@@ -96,7 +96,7 @@ def run(trained: Config, evaluation: Config, trainer: Config, logger: Config | N
             return
         described = protocol(evaluation, module, data, results, out) | tested.facts()
         write_json(out / METRICS, {"protocol": described} | results)
-    show(evaluation_table(results))
+    show(evaluation_table(results), width=160)
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")
 

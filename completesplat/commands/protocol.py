@@ -83,6 +83,7 @@ def protocol(
         **({} if module.fitted_to is None else {"fitted_to": module.fitted_to}),
         "object_pixels": "background black in both, by the true mask cut at 0.5",
         "average": "over the views of a scene, then over scenes",
+        "sharpness": "squared differences of neighbours, summed over a scene's novel views, over the truth's",
         "metrics": {name: METRICS[name] for name in scored.metrics if name in METRICS},
         "missing": scored.missing,
         **provenance(data, out),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from completesplat.errors import WeightsError
@@ -18,6 +18,8 @@ PerImage = Float[Tensor, " image"]
 
 PSNR_LIMIT = 100.0
 """Largest reported PSNR (dB); identical images have an infinite one, and averages must stay finite."""
+FLATTEST = (1 / 255) ** 2
+"""Smallest gradient energy of a truth that sharpness is measured against: one step of 8 bits in all images together."""
 ADVICE = "give torchvision's VGG16 as evaluation.scoring.perceptual.vgg_weights=FILE_OR_URL"
 
 
@@ -56,6 +58,28 @@ def ssim(predicted: Images, true: Images) -> PerImage:
     The mean is over all pixels; the image is mirrored beyond its border, as in torchmetrics.
     """
     return structural_similarity(predicted, true).mean((1, 2, 3))
+
+
+def gradient_energy(images: Images, counted: Bool[Tensor, "image 1 height width"]) -> float:
+    """Return the sum over images and colours of squared differences between neighbours, if both pixels are counted.
+
+    Neighbours lie side by side or one below the other.
+    """
+    total = 0.0
+    for axis in (-2, -1):
+        first, second = (counted.narrow(axis, start, counted.shape[axis] - 1) for start in (0, 1))
+        total += images.diff(dim=axis).square().mul(first & second).sum().item()
+    return total
+
+
+def sharpness(predicted: Images, true: Images, counted: Bool[Tensor, "image 1 height width"]) -> float | None:
+    """Return the gradient energy of predicted images over that of the true ones: 1 is as sharp, less is a blur.
+
+    Noise has gradients, too, so more than 1 is not better. Both energies are sums over all images, so that an image
+    with few gradients has little weight. None if the truth has no gradient (`FLATTEST`).
+    """
+    truth = gradient_energy(true, counted)
+    return gradient_energy(predicted, counted) / truth if truth >= FLATTEST else None
 
 
 def object_only(images: Images, masks: Float[Tensor, "image 1 height width"]) -> Images:

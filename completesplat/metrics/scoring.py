@@ -15,7 +15,7 @@ from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.surfaces import hidden_from
 from completesplat.metrics.image_sets import ImageSets, SetMetric
-from completesplat.metrics.images import Missing, object_only, psnr, ssim
+from completesplat.metrics.images import Missing, object_only, psnr, sharpness, ssim
 from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
 from completesplat.scene import SceneBatch, Views
 
@@ -107,7 +107,8 @@ class Evaluation:
         by_criterion = {region: chosen[region, self.criterion] for region in REGIONS}
         scores = {key: each[by_criterion[key[0]]][key] for key in each[0]}
         self._add(BEST, name, scores, {region: images[i] for region, i in by_criterion.items()}, truth)
-        self.scores[BEST_BY_METRIC][name] = {(r, v, m): each[chosen[r, m]][r, v, m] for r, v, m in each[0]}
+        by_metric = {(r, v, m): each[chosen[r, m]][r, v, m] for r, v, m in each[0] if m in self.metrics}
+        self.scores[BEST_BY_METRIC][name] = by_metric
         self.scores[MEAN][name] = {key: sum(scores[key] for scores in each) / len(each) for key in each[0]}
         proper, ranks = proper_scores(images[:, 1:], truth)
         self.scores[MODEL][name] |= proper
@@ -119,7 +120,7 @@ class Evaluation:
         self.drawn[name] = {**curves, "diversity": diversity(images[:, 1:]), "ranks": ranks}
 
     def score(self, images: Float[Tensor, "view 3 height width"], truth: Views) -> Scores:
-        """Score one prediction (values in [0, 1]) of one scene, with means over the novel views."""
+        """Score one prediction (values in [0, 1]) of one scene: means over the novel views, and their `sharpness`."""
         scores: Scores = {}
         for region in REGIONS:
             predicted, true = _region(images, truth, region), _region(truth.images, truth, region)
@@ -128,6 +129,8 @@ class Evaluation:
                     values = metric(predicted.float(), true)
                 scores[region, "reference", name] = values[0].item()
                 scores[region, "novel", name] = values[1:].mean().item()
+            sharp = sharpness(images[1:].float(), truth.images[1:], _counted(truth[1:], region))
+            scores |= {} if sharp is None else {(region, "novel", "sharpness"): sharp}
         return scores
 
     @torch.no_grad()
@@ -135,8 +138,7 @@ class Evaluation:
         """Add errors of the depth of the model's first sample: `depth_abs_rel` and the others of `depth_errors`."""
         assert true.depths is not None
         for region in REGIONS:
-            counted = true.masks > 0.5 if region == "object" else torch.ones_like(true.masks, dtype=torch.bool)
-            errors = depth_errors(predicted, true.depths.to(predicted), counted)
+            errors = depth_errors(predicted, true.depths.to(predicted), _counted(true, region))
             for kind, views in (("reference", errors[:1]), ("novel", errors[1:])):
                 known = [view for view in views if view is not None]
                 for metric in known[0] if known else ():
@@ -228,6 +230,10 @@ def novel_values(images: Samples, truth: Views) -> dict[str, tuple[Float[Tensor,
 
 def _region(images: Tensor, truth: Views, region: str) -> Tensor:
     return object_only(images, truth.masks) if region == "object" else images
+
+
+def _counted(truth: Views, region: str) -> Bool[Tensor, "view 1 height width"]:
+    return truth.masks > 0.5 if region == "object" else torch.ones_like(truth.masks, dtype=torch.bool)
 
 
 def depth_errors(predicted: Depths, true: Depths, valid: Bool[Tensor, "image 1 _ _"]) -> list[dict[str, float] | None]:

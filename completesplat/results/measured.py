@@ -34,7 +34,7 @@ DESCRIBED = [*ALIKE, "image_size", "scenes_listed", "samples", "criterion", "see
 DESCRIBED += ["guidance_weight", "color_fits", "ema", "commit", "frame", "align", "fitted_to"]
 """Entries of the protocol that the note on a row states."""
 COLUMNS = [f"full_novel_{name}" for name in METRICS]
-COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips")] + ["full_reference_psnr"]
+COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips", "sharpness")] + ["full_reference_psnr"]
 """Scores that a table shows if a run has them."""
 MODE_SCORES = {"coverage": "coverage ↑", "total_variation": "total variation ↓", "sharpness": "sharpness ↓"}
 MODE_SCORES |= {"rejected": "rejected ↓"}

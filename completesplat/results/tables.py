@@ -13,9 +13,10 @@ from completesplat.results.runs import UPPER_BOUND, Protocol, flat
 if TYPE_CHECKING:
     from rich.table import Table as PrintedTable
 
-METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID"}
-FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f"}
-LOWER_IS_BETTER = {"lpips", "fid", "kid"}
+METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID", "sharpness": "sharpness"}
+FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f", "sharpness": ".2f"}
+BETTER = {"psnr": "↑", "ssim": "↑", "lpips": "↓", "fid": "↓", "kid": "↓", "sharpness": "(truth: 1)"}
+"""Better direction of each metric. Sharpness has none, because a blur has less than the truth and noise has more."""
 GROUPS = {
     "full_novel": "all pixels, novel views",
     "object_novel": "object pixels, novel views",
@@ -23,6 +24,7 @@ GROUPS = {
 }
 SSIM_NOTE = "SSIM: mean over all pixels, images mirrored at their border (skimage leaves 5 pixels out on every side)."
 """Note below tables with SSIM; the border has 37 % of the pixels of a 48 x 48 image, 15 % of a 128 x 128 one."""
+SHARPNESS_NOTE = "Sharpness: gradient energy of the novel views over the truth's; a blur has less than 1."
 
 BEST, SECOND, UNMARKED = "best", "second", ""
 MARKED_MARKDOWN = {BEST: "**{}**", SECOND: "<ins>{}</ins>", UNMARKED: "{}"}
@@ -40,6 +42,7 @@ Column = tuple[str, str, str]  # heading, key of the record, and format of its v
 LABELS = {"full": "all\npixels", "object": "object\npixels"}
 EVALUATED = ["_".join((*place, name)) for place in product(LABELS, ("novel", "reference")) for name in ("psnr", "ssim")]
 EVALUATED_IF_POSSIBLE = [f"full_novel_{name}" for name in ("lpips", "fid", "kid")]
+EVALUATED_IF_POSSIBLE += [f"{region}_novel_sharpness" for region in LABELS]
 """Scores in the table of an evaluation, if they were measured."""
 PLAIN = (type(None), str, bool, int, float)  # types of values that a table can show
 CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
@@ -48,19 +51,19 @@ CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "ma
 def score_heading(name: str) -> "Heading":
     """Return a heading for a score named `REGION_VIEW_METRIC`: its better direction, grouped by region and view."""
     group, _, metric = name.rpartition("_")
-    return Heading(f"{METRICS[metric]} {'↓' if metric in LOWER_IS_BETTER else '↑'}", GROUPS[group])
+    return Heading(f"{METRICS[metric]} {BETTER[metric]}", GROUPS[group])
 
 
 def marks(values: Sequence[float | None], competing: Sequence[bool], name: str) -> list[str]:
     """Return for each score of a metric (or `REGION_VIEW_METRIC`) the mark of the best, the second best, or none.
 
     Scores are compared as they are written, so that scores which look equal share a mark; None was not measured. Naive
-    predictors and upper bounds are not `competing` and have no mark.
+    predictors and upper bounds are not `competing` and have no mark, nor have metrics without a better direction.
     """
     name = name.rpartition("_")[2]
-    sign = 1 if name in LOWER_IS_BETTER else -1
+    sign = {"↑": -1, "↓": 1}.get(BETTER[name])
     written = [
-        sign * float(format(value, FORMATS[name])) if competes and value is not None else None
+        sign * float(format(value, FORMATS[name])) if sign and competes and value is not None else None
         for value, competes in zip(values, competing, strict=True)
     ]
     ranked = sorted({value for value in written if value is not None and value == value})  # without NaN
@@ -178,7 +181,10 @@ def _written(value: object) -> str:
 
 
 def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
-    """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks."""
+    """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks.
+
+    Sharpness is of object pixels, or else of all.
+    """
     from completesplat.metrics.images import PSNR_LIMIT
 
     records: list[Mapping[str, object]] = []
@@ -188,8 +194,9 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
         records.append({"predictor": label, **scores})
     names = [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]
     pairs = [(name, name.replace("object", "full")) for name in EVALUATED]
-    if all(record.get(name) == record.get(whole) for record in records for name, whole in pairs):
-        names = [name for name in names if not name.startswith("object")]  # without masks, every pixel is the object's
+    masked = any(record.get(name) != record.get(whole) for record in records for name, whole in pairs)
+    # Without masks, every pixel is the object's.
+    names = [name for name in names if not name.startswith("full_novel_sharpness" if masked else "object")]
     columns = [("predictor", "predictor", "")]
     for name in names:
         region, view, kind = name.split("_")
@@ -199,7 +206,8 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
     fitted = [f"{name}: fitted to {entry['fitted_to']}." for name, entry in results.items() if entry.get("fitted_to")]
     same = format(PSNR_LIMIT, FORMATS["psnr"])
     rows = [[Cell("the same image") if cell.text == same else cell for cell in row.cells] for row in result.rows]
-    return replace(result, rows=[TableRow("", cells) for cells in rows], remarks=[*fitted, SSIM_NOTE])
+    remarks = [*fitted, SSIM_NOTE, SHARPNESS_NOTE]
+    return replace(result, rows=[TableRow("", cells) for cells in rows], remarks=remarks)
 
 
 def show(*tables: Table, width: int = 120) -> None:

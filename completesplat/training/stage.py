@@ -47,6 +47,11 @@ def copy_reference(scenes: SceneBatch) -> Renders:
     return scenes.reference.images[:, None].expand_as(scenes.all_views().images)
 
 
+def mirror_reference(scenes: SceneBatch) -> Renders:
+    """Return the reference image, flipped left to right, for every view: often the best naive guess of a back."""
+    return copy_reference(scenes).flip(-1)
+
+
 def repeat_image(image: Float[Tensor, "3 height width"], scenes: SceneBatch) -> Renders:
     """Return an image for every view; the training set's mean image is the best constant prediction of the MSE."""
     return image.to(scenes.reference.images).expand_as(scenes.all_views().images)
@@ -224,6 +229,7 @@ class Stage(LightningModule):
         if self.mean_image is not None:
             evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
         evaluation.update("copy_reference", copy_reference(scenes), scenes)
+        evaluation.update("mirrored_reference", mirror_reference(scenes), scenes)
 
     def timed(self, name: str, work: Callable[[], Result], scenes: int) -> Result:
         """Do the work for this number of scenes, and note its seconds for each."""

@@ -33,7 +33,7 @@ def scored(command, pipeline, tmp_path):
 def test_scores_stand_beside_the_naive_predictors(scored):
     printed, metrics = scored("var")
     described = metrics.pop("protocol")
-    assert list(metrics) == ["model", "mean_image", "copy_reference"]
+    assert list(metrics) == ["model", "mean_image", "copy_reference", "mirrored_reference"]
     assert described["data_set"] == "toy_objects"
     assert described["missing"].keys() == {"lpips", "fid", "kid"}
     for scores in metrics.values():
@@ -42,6 +42,13 @@ def test_scores_stand_beside_the_naive_predictors(scored):
             assert -1 <= values["ssim"] <= 1
         assert 0 < scores["scenes"] == scores["views"] / 2
     assert metrics["copy_reference"]["full"]["reference"]["psnr"] == 100
+    assert metrics["mirrored_reference"]["full"]["reference"]["psnr"] < 100
+    assert "mirrored_reference" in printed
+    # The copy has the reference's gradients in every view, mirrored or not.
+    sharp = {name: scores["full"]["novel"]["sharpness"] for name, scores in metrics.items()}
+    assert sharp["mirrored_reference"] == pytest.approx(sharp["copy_reference"])
+    assert 0 < sharp["mean_image"] < sharp["copy_reference"]
+    assert f"{metrics['copy_reference']['object']['novel']['sharpness']:.2f}" in printed
     (copied,) = [line for line in printed.splitlines() if "copy_reference" in line]
     assert (copied.count("the same image"), "100.00" in printed) == (2, False)
     assert described["checkpoint"]["path"].endswith("var/checkpoints/last.ckpt")
@@ -50,7 +57,7 @@ def test_scores_stand_beside_the_naive_predictors(scored):
 def test_data_without_training_images_have_no_mean_image(scored):
     printed, metrics = scored("var", "overrides=['data.subset=null','data.test_fraction=1']")
     described = metrics.pop("protocol")
-    assert list(metrics) == ["model", "copy_reference"]
+    assert list(metrics) == ["model", "copy_reference", "mirrored_reference"]
     assert described["missing"]["mean_image"] in printed
     assert metrics["model"]["scenes"] == 4
 

@@ -5,7 +5,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from completesplat.commands.protocol import METRICS
-from completesplat.metrics.images import PSNR_LIMIT, object_only, psnr, ssim
+from completesplat.metrics.images import PSNR_LIMIT, object_only, psnr, sharpness, ssim
 from completesplat.results.tables import SSIM_NOTE
 
 
@@ -52,3 +52,45 @@ def test_ssim_mirrors_images_at_the_border_and_counts_all_pixels(pair):
 def test_object_only_is_black_outside_the_binarised_mask():
     image, mask = torch.full((1, 3, 2, 2), 0.8), torch.tensor([[[[0.0, 0.4], [0.6, 1.0]]]])
     assert object_only(image, mask)[0, 0].tolist() == [[0, 0], [pytest.approx(0.8), pytest.approx(0.8)]]
+
+
+def everywhere(images):
+    return torch.ones_like(images[:, :1], dtype=torch.bool)
+
+
+def test_the_truth_has_sharpness_one_half_the_contrast_a_quarter_and_a_blur_less(pair):
+    _, true = pair
+    mean = true.mean((2, 3), keepdim=True)
+    assert sharpness(true, true, everywhere(true)) == 1
+    assert sharpness(true.flip(-1), true, everywhere(true)) == pytest.approx(1, rel=1e-5)
+    assert sharpness(mean + (true - mean) / 2, true, everywhere(true)) == pytest.approx(1 / 4, rel=1e-5)
+    once, twice = (torch.from_numpy(gaussian_filter(true.numpy(), sigma, axes=(2, 3))) for sigma in (1, 2))
+    values = [sharpness(images, true, everywhere(true)) for images in (mean.expand_as(true), twice, once)]
+    assert values == sorted(values)
+    assert values[0] == pytest.approx(0, abs=1e-6)
+    assert values[2] < 1
+    assert sharpness(pair[0], true, everywhere(true)) > 1  # noise has gradients, too
+
+
+def test_sharpness_is_a_ratio_of_sums_over_images_between_pairs_of_counted_pixels(pair):
+    predicted, true = pair
+    counted = torch.rand(3, 1, 40, 36, generator=torch.Generator().manual_seed(1)) > 0.3
+
+    def energy(images):
+        total = 0.0
+        for image, mask in zip(images.double().numpy(), counted[:, 0].numpy(), strict=True):
+            for row, column in np.argwhere(mask):
+                for other in ((row + 1, column), (row, column + 1)):
+                    if other[0] < 40 and other[1] < 36 and mask[other]:
+                        total += ((image[:, row, column] - image[(slice(None), *other)]) ** 2).sum()
+        return total
+
+    assert sharpness(predicted, true, counted) == pytest.approx(energy(predicted) / energy(true), rel=1e-5)
+
+
+def test_a_truth_without_gradients_has_no_sharpness(pair):
+    predicted, true = pair
+    flat = torch.full_like(true, 0.5)
+    assert sharpness(predicted, flat, everywhere(true)) is None
+    assert sharpness(predicted, flat + 1e-7 * true, everywhere(true)) is None  # rounding errors of resized images
+    assert sharpness(predicted, true, torch.zeros_like(everywhere(true))) is None

@@ -162,6 +162,30 @@ def test_the_best_sample_is_that_of_a_region_for_all_metrics_or_that_of_each_met
     assert each["full"]["novel"]["lpips"] < results["best_of_k"]["full"]["novel"]["lpips"]
 
 
+def textured(targets: int) -> SceneBatch:
+    """A scene of `scenes` whose views have noise on the object, the upper half, and an edge below it."""
+    batch = scenes(1, targets)
+    images = batch.targets.images.clone()
+    images[..., :8, :] = torch.rand(1, targets, 3, 8, 16, generator=torch.Generator().manual_seed(0))
+    images[..., 8:, :] = 0
+    return replace(batch, targets=replace(batch.targets, images=images))
+
+
+def test_sharpness_is_of_novel_views_and_leaves_out_the_objects_silhouette():
+    batch, evaluation = textured(2), Evaluation(samples=2)
+    truth = batch.all_views()[0]
+    flat = truth.images.clone()
+    flat[..., :8, :] = truth.images[..., :8, :].mean()  # no texture, the silhouette as it is
+    evaluation.update_samples("scene", torch.stack([flat, truth.images]), truth)
+    results = evaluation.results()
+    assert results["model"]["object"]["novel"]["sharpness"] == 0
+    assert results["model"]["full"]["novel"]["sharpness"] > 0  # of the silhouette alone
+    assert results["best_of_k"]["object"]["novel"]["sharpness"] == 1
+    assert results["mean_of_k"]["object"]["novel"]["sharpness"] == 0.5
+    assert "sharpness" not in results["best_of_k_by_metric"]["full"]["novel"]  # no sample is the best by it
+    assert "sharpness" not in results["model"]["full"]["reference"]
+
+
 def test_missing_metrics_are_named_and_have_no_figure():
     absent = {"inception": Missing("none here", ("fid", "kid"))}
     evaluation = Evaluation(perceptual=Missing("no weights", ("lpips",)), sets=absent)

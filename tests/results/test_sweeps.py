@@ -141,6 +141,7 @@ def scored(means: list[Any], column: str = PSNR, naive: int = 0, **changes: Any)
     [
         ("full_novel_ssim", [0.8, 0.9, 0.7], ["second", "best", ""]),
         ("full_novel_lpips", [0.2, 0.3, 0.1], ["second", "", "best"]),
+        ("full_novel_sharpness", [0.5, 1.0, 1.5], ["", "", ""]),  # a blur and noise are both worse than the truth's 1
         (PSNR, [21.996, 22.001, 21.98, 21.98, 20.0], ["best", "best", "second", "second", ""]),  # as written
         (PSNR, [None, 22.0, float("nan"), 21.0], ["", "best", "", "second"]),
         (PSNR, [float("inf"), 30.0], ["best", "second"]),

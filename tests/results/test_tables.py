@@ -9,6 +9,7 @@ from completesplat.results.paper_figures import published, tables
 from completesplat.results.runs import find
 from completesplat.results.tables import (
     BLANK,
+    SHARPNESS_NOTE,
     SSIM_NOTE,
     as_latex,
     as_markdown,
@@ -102,20 +103,23 @@ def test_missing_entries_of_records_stay_empty(capsys) -> None:
 
 
 def test_an_evaluation_shows_every_predictor_with_all_digits_in_any_width(capsys) -> None:
-    views = {"psnr": 20.0, "ssim": 0.5, "lpips": 0.125, "fid": 101.25, "kid": 0.0123}
+    views = {"psnr": 20.0, "ssim": 0.5, "lpips": 0.125, "fid": 101.25, "kid": 0.0123, "sharpness": 0.6225}
     entry = {"scenes": 2, "views": 4, "full": {"novel": views, "reference": views}, "seconds": {"inference": 7.0}}
     entry["object"] = {"novel": views | {"psnr": 24.0}, "reference": views}
-    show(evaluation_table({"model": entry, "mean_image": entry}))
+    show(evaluation_table({"model": entry, "mirrored_reference": entry}), width=160)
     printed = capsys.readouterr().out
     assert "2 scenes, 4 novel views" in printed
     assert all(text in printed for text in ("20.00", "24.00", "object", "0.500", "0.125", "101.2", "0.0123", SSIM_NOTE))
+    assert printed.count("0.62 ") == 2  # of object pixels
+    assert "mirrored_reference" in printed
+    assert SHARPNESS_NOTE in printed
     assert "…" not in printed
 
 
 def test_an_evaluation_names_upper_bounds_and_leaves_out_objects_that_are_all_pixels() -> None:
-    views = {view: {"psnr": 20.0, "ssim": 0.5} for view in ("novel", "reference")}
+    views = {"novel": {"psnr": 20.0, "ssim": 0.5, "sharpness": 0.5}, "reference": {"psnr": 20.0, "ssim": 0.5}}
     entry = {"scenes": 2, "views": 4, "full": views, "object": views}
     shown = evaluation_table({"model": entry | {"upper_bound": True}, "mean_image": entry})
     assert [row.cells[0].text for row in shown.rows] == ["model (upper bound)", "mean_image"]
-    assert len(shown.headings) == 5
+    assert len(shown.headings) == 6
     assert not any("object" in heading.joined() for heading in shown.headings)

@@ -8,7 +8,7 @@ from support import NETWORKS, compose_config
 from torch.utils.data import DataLoader
 
 from completesplat.training.callbacks import BadSteps
-from completesplat.training.stage import copy_reference, repeat_image
+from completesplat.training.stage import copy_reference, mirror_reference, repeat_image
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
 
@@ -61,9 +61,13 @@ def test_gradients_are_clipped_for_fused_optimizers_by_a_norm_that_is_computed_o
     assert moved.norm().item() == pytest.approx(1e-3, rel=1e-2)  # as far as gradients of this norm go
 
 
-def test_naive_predictions_are_the_reference_and_one_image():
+def test_naive_predictions_are_the_reference_its_mirror_image_and_one_image():
     scenes, image = scene_batch(), torch.rand(3, 16, 16)
     truth, copied, repeated = scenes.all_views().images, copy_reference(scenes), repeat_image(image, scenes)
     assert copied.shape == repeated.shape == truth.shape
     assert all(torch.equal(copied[:, view], truth[:, 0]) for view in range(truth.shape[1]))
     assert (repeated == image).all()
+    mirrored = mirror_reference(scenes)
+    assert not torch.equal(mirrored, copied)
+    for column in range(truth.shape[-1]):
+        assert torch.equal(mirrored[..., column], copied[..., -1 - column])
