@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from completesplat.scene import Views
 from completesplat.settings.schema import Natural, check_settings
 from completesplat.splatter_image import Parameterization
 from completesplat.tensors import concatenate
-from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
+from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, read_small, shipped, write_sums
 
 Visible = Float[Tensor, "batch 1 height width"]  # masks that are 0 where an image is hidden, and 1 elsewhere
 _rasterizer = cache(auto)
@@ -224,6 +225,24 @@ def distance_to_training(photograph: Photograph, architecture: Mapping[str, Any]
         return None
     mean, std = (torch.tensor(training[name]) for name in ("picture_mean", "picture_std"))
     return ((image_features(photograph.image) - mean) / std).square().mean().sqrt().item()
+
+
+def distances_to_shipped(image: ImageLike, remove_background: bool = False) -> dict[str, float]:
+    """Return the distances of an image from the training images of the weights in the package, the nearest first.
+
+    They depend on the resolution, so the image, which is read once, is resized for each model.
+
+    Raises:
+        CompleteSplatError: as `read_photograph`.
+    """
+    configs = {name: json.loads(read_small(folder / CONFIG_FILE)) for name, folder in shipped().items()}
+    largest = max((config["image_size"] for config in configs.values()), default=1)
+    square = read_photograph(image, largest, remove_background=remove_background).image
+    distances: dict[str, float] = {}
+    for name, config in configs.items():
+        distance = distance_to_training(read_photograph(square, config["image_size"]), config)
+        distances |= {} if distance is None else {name: distance}
+    return dict(sorted(distances.items(), key=itemgetter(1)))
 
 
 def camera_tensors(camera: Mapping[str, Any]) -> dict[str, Tensor]:

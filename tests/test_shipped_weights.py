@@ -25,6 +25,8 @@ def test_they_are_small_and_complete():
     for name in shipped():
         assert (SHIPPED / name / SUMS_FILE).is_file()
         assert locate(name).parent == SHIPPED / name
+        facts = strict_json(SHIPPED / name / "config.json")["training"]  # which weights=auto chooses by
+        assert {"content", "picture_mean", "picture_std"} <= facts.keys()
 
 
 def test_couches_agree_with_the_photo_in_front_and_differ_behind():

@@ -1,6 +1,5 @@
 """`completesplat predict`: complete scenes, each from one photo, or one scene from several photos."""
 
-import json
 import logging
 import math
 import os
@@ -30,13 +29,13 @@ from completesplat.export.splat_transform import find_splat_transform
 from completesplat.files import folder_names, printable, safe_name
 from completesplat.generator import CompleteSplat
 from completesplat.rasterizers import Rasterizer
-from completesplat.scene_model import SceneModel, distance_to_training
+from completesplat.scene_model import SceneModel, distance_to_training, distances_to_shipped
 from completesplat.settings.checks import REMOVE
-from completesplat.weights import CONFIG_FILE, read_small, shipped
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5  # ratio of tan(fov / 2), photo to training, from which a warning is given
 UNLIKE = 2.0  # distance from the training images (`distance_to_training`) from which a warning is given
+RESIZING = 0.1  # change of a distance that resizing to another model's size and back may cause
 # The network has 56.4 million numbers in float32; its authors' checkpoint may hold more.
 ELSEWHERE = (
     "; for an object try weights=splatter_image:objaverse background=remove (MIT, downloads at least 226 MB) or"
@@ -56,7 +55,7 @@ def run(config: DictConfig, out: Path) -> None:
     if config.cameras is not None:
         predict_from_views(config, images, wanted, out)
     else:
-        predict_images(config, open_generator(config), images, wanted, out)
+        predict_images(config, open_generator(config, images), images, wanted, out)
 
 
 def find_images(image: object) -> list[Path]:
@@ -172,7 +171,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Wante
     others += ["background=remove"] if config.background == REMOVE else []
     if others:
         raise CompleteSplatError(f"{others[0]} does not go with cameras=FILE")
-    model = open_generator(config)
+    model = open_generator(config, images)
     views = read_photographs(images, Path(config.cameras), model.image_size)
     views = replace(views, cameras=model.in_model_units(views.cameras))
     scene = model.reconstruct(views)
@@ -181,6 +180,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Wante
         "image": printable(images[0].name),
         "images": [printable(image.name) for image in images],
         "cameras": printable(Path(config.cameras).name),
+        "weights": printable(Path(config.weights).name),
         "screen_space_dilation": config.screen_space_dilation,
         "depth_range": model.depth_range.tolist(),
     }
@@ -214,6 +214,7 @@ def _predict(
         **settings,
         **sampler,
         "image": printable(image.name),
+        "weights": printable(Path(config.weights).name),
         "screen_space_dilation": config.screen_space_dilation,
         "mask": None if config.mask is None else printable(Path(config.mask).name),
         "box": None if config.box is None else list(config.box),
@@ -242,12 +243,10 @@ def remarks(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]
 
 def nearer_weights(photograph: Photograph, distance: float) -> str:
     """Name the shipped weights whose training images are nearer to a photo, and `ELSEWHERE` if these are far, too."""
-    nearest = ""
-    for name, folder in shipped().items():
-        other = distance_to_training(photograph, json.loads(read_small(folder / CONFIG_FILE)))
-        if other is not None and other < distance:
-            nearest, distance = f"; weights={name} were trained on images that are nearer ({other:.1f})", other
-    return nearest + (ELSEWHERE if distance > UNLIKE else "")
+    name, other = next(iter(distances_to_shipped(photograph.image).items()), ("", math.inf))
+    nearer = other < distance - RESIZING
+    nearest = f"; weights={name} were trained on images that are nearer ({other:.1f})" if nearer else ""
+    return nearest + (ELSEWHERE if min(other, distance) > UNLIKE else "")
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:

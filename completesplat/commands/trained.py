@@ -1,6 +1,7 @@
 """Models for commands, from a run's checkpoint, from weights or from files of scenes, and the data to use with them."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,11 +11,13 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from completesplat.commands.protocol import checkpoint_facts
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, ImageError, WeightsError
+from completesplat.files import printable
 from completesplat.generator import CompleteSplat
 from completesplat.opening import config_of_run, locate
-from completesplat.scene_model import SceneModel
-from completesplat.weights import RUN_CHECKPOINT, sha256_of, shipped
+from completesplat.scene_model import SceneModel, distances_to_shipped
+from completesplat.settings.checks import REMOVE
+from completesplat.weights import AUTO, RUN_CHECKPOINT, sha256_of, shipped
 from completesplat.weights.checkpoint_reading import load_part
 
 if TYPE_CHECKING:
@@ -140,18 +143,43 @@ class Trained:
         return stage
 
 
-def open_generator(config: Any) -> SceneModel:
+def nearest_weights(images: Sequence[Path], remove_background: bool) -> tuple[str, str]:
+    """Return the name of the shipped weights nearest to the first readable image, and the reason as a clause.
+
+    Without an image, they are the first ones of the package.
+
+    Raises:
+        WeightsError: the package has no weights.
+    """
+    if not shipped():
+        raise WeightsError("weights=auto: this package has no weights; give weights=DIR")
+    for image in images:
+        with suppress(ImageError, OSError):  # which ends the prediction of this image alone, when its turn comes
+            (name, distance), *others = distances_to_shipped(image, remove_background).items()
+            photo = f"{'the first image, ' if len(images) > 1 else ''}{printable(image.name)}"
+            far = f"{distance:.1f} standard deviations{''.join(f', {other} {x:.1f}' for other, x in others)}"
+            return name, f"; their training images are the nearest to {photo} ({far})"
+    name, *names = shipped()
+    return name, f"; there is no image to choose by (weights=NAME takes others: {', '.join(names)})"
+
+
+def open_generator(config: Any, images: Sequence[Path]) -> SceneModel:
     """Return the model of `config.weights`, with `config.sampler` if given, and print its limits.
 
-    If the model draws no samples, `config.samples` is set to 1.
+    `weights=auto` is replaced by `nearest_weights` of the images. If the model draws no samples, `config.samples` is
+    set to 1.
 
     Raises:
         WeightsError: as `from_pretrained`.
         CompleteSplatError: a sampler is given for a model that draws no samples.
     """
-    if config.weights in shipped():
-        print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
+    reason = ""
+    if config.weights == AUTO:
+        config.weights, reason = nearest_weights(images, config.background == REMOVE)
     model = CompleteSplat.from_pretrained(config.weights)
+    if config.weights in shipped():
+        content = model.architecture["training"]["content"]
+        print(f"weights: {config.weights}, which come with the package and know {content}{reason}")
     if config.get("sampler") is not None:
         model.replace_sampler(OmegaConf.to_container(config.sampler))  # type: ignore[arg-type]
     if not model.draws_samples:

@@ -15,7 +15,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.files import SPLATS, printable
 from completesplat.settings.checks import REMOVE, check_parts
 from completesplat.signals import Interrupted
-from completesplat.weights import CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, check_name
+from completesplat.weights import AUTO, CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, check_name
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 KINDS = dict.fromkeys(SPLATS, "scene") | {".ckpt": "weights", ".pth": "weights"}
@@ -37,7 +37,8 @@ def run(config: DictConfig, out: Path) -> None:
     from completesplat.viewer.access import start_server, stop_server
 
     config.update(settings_of(Path(config.path)) if config.path is not None else {})
-    if config.scene is None and config.watch is None and ":" not in config.weights:  # as in `splatter_image:NAME`
+    drawn = config.scene is None and config.watch is None
+    if drawn and config.weights != AUTO and ":" not in config.weights:  # as in `splatter_image:NAME`
         check_name(config.weights)
     background = 0.5 if config.background == REMOVE else config.background
     server = start_server(0 if config.export is not None else config.port, background)
@@ -113,7 +114,7 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
         status, path = next(iter(scenes.items()))
         samples, up = read_scene(path)
     else:
-        model = open_generator(config).to(device)
+        model = open_generator(config, [] if config.image is None else [Path(config.image)]).to(device)
         samples, up = [], tuple(model.up.tolist())
     remove = config.background == REMOVE
     background = Wanted.background if remove else config.background

@@ -18,6 +18,7 @@ SHIPPED = Path(__file__).parent
 CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE = "config.json", "model.safetensors", "SHA256SUMS"
 # In a training run's folder: its final weights, its config, its newest checkpoint, fitted scenes.
 RUN_WEIGHTS, RUN_CONFIG_FILE, RUN_CHECKPOINT, SCENES = "weights", "config.yaml", "checkpoints/last.ckpt", "scenes"
+AUTO = "auto"  # in place of a name: the shipped weights whose training images are nearest to the photo
 NEWEST = "images/newest"  # in a training run's folder, too: its fixed scenes as they are now, with `scenes.json`
 CAMERA = "camera"  # in stage 1's checkpoints: the typical camera of the training set
 LARGEST_TEXT = 1_000_000

@@ -172,13 +172,13 @@ def test_shipped_weights_that_are_nearer_to_a_photo_are_named(tiny_weights, tmp_
         folders[name] = tmp_path / name
         folders[name].mkdir()
         training = {} if mean is None else {"picture_mean": mean + [0.0] * 5, "picture_std": [0.1] * 8}
-        (folders[name] / "config.json").write_text(json.dumps({"training": training}))
-    monkeypatch.setattr("completesplat.commands.predict.shipped", lambda: folders)
+        (folders[name] / "config.json").write_text(json.dumps({"image_size": 24, "training": training}))
+    monkeypatch.setattr("completesplat.scene_model.shipped", lambda: folders)
     blue, red = (model.read(save(tmp_path / f"{color}.png", color)) for color in ("blue", "red"))
     (unlike,) = remarks(blue, model, whole=True)
     assert unlike.endswith("; weights=blues were trained on images that are nearer (0.0)")
     assert remarks(red, model, whole=True) == []
-    monkeypatch.setattr("completesplat.commands.predict.shipped", lambda: {"reds": folders["reds"]})
+    monkeypatch.setattr("completesplat.scene_model.shipped", lambda: {"reds": folders["reds"]})
     (unlike,) = remarks(blue, model, whole=True)
     near, elsewhere = unlike.partition("expect little of it in the scenes; ")[2].split("; ", 1)
     assert near == "weights=reds were trained on images that are nearer (4.8)"  # but not near
