@@ -28,6 +28,7 @@ from completesplat.tensors import concatenate
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, read_small, shipped, write_sums
 
 Visible = Float[Tensor, "batch 1 height width"]  # masks that are 0 where an image is hidden, and 1 elsewhere
+OBJECT_SHARE = 0.9  # of the image's side that an object on a background fills, as on imported turntables
 _rasterizer = cache(auto)
 
 
@@ -36,6 +37,9 @@ class SceneModel(nn.Module):
 
     Args:
         architecture: the config that is written beside the weights; it has `image_size`.
+
+    Attributes:
+        background: grey value behind the objects in all its training images; None if they show whole scenes.
     """
 
     network: ReconstructionModel
@@ -49,13 +53,11 @@ class SceneModel(nn.Module):
     note: str | None = None
     """Advice to users about the photos that it needs."""
 
-    background: float | None = None
-    """Grey value behind the objects in all its training images; None if they show whole scenes."""
-
     def __init__(self, architecture: dict[str, Any]) -> None:
         super().__init__()
         self.architecture = architecture
         self.image_size: int = architecture["image_size"]
+        self.background: float | None = (architecture.get("training") or {}).get("background")
         # These are measured on the training set and serve photos of unknown cameras.
         self.register_buffer("fov_degrees", torch.tensor(50.0))
         self.register_buffer("depth_range", torch.tensor([0.5, 5.0]))
@@ -121,7 +123,7 @@ class SceneModel(nn.Module):
 
     def needed_of_data(self, data: Mapping[str, object]) -> dict[str, object]:
         """Return the settings that a data set with the config `data` must have for this model."""
-        return {"image_size": self.image_size}
+        return {"image_size": self.image_size} | ({} if self.background is None else {"background": self.background})
 
     def forward(
         self, image: Photograph | ImageLike, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any
@@ -191,8 +193,16 @@ class SceneModel(nn.Module):
         return cameras.scale_world(torch.tensor((near + share * (far - near)) / depth))
 
     def read(self, image: ImageLike, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
-        """Read an image at the model's size (`read_photograph`); an unknown field of view is the training set's."""
-        return read_photograph(image, self.image_size, fov_degrees, self.fov_degrees.item(), remove_background)
+        """Read an image at the model's size (`read_photograph`); an unknown field of view is the training set's.
+
+        A model of objects on a background gets a cut-out or transparent object on it, as large as in training. It takes
+        every image as of its training's field of view, unless another one is given.
+        """
+        typical = self.fov_degrees.item()
+        if self.background is None:
+            return read_photograph(image, self.image_size, fov_degrees, typical, remove_background)
+        known = typical if fov_degrees is None else fov_degrees
+        return read_photograph(image, self.image_size, known, known, remove_background, self.background, OBJECT_SHARE)
 
     def camera(self, photograph: Photograph) -> Cameras:
         """Return the camera that took a photo, at the origin of the world."""

@@ -19,7 +19,7 @@ from rich.markup import escape
 from rich.progress import Progress
 from torch import Tensor
 
-from completesplat.commands.trained import open_generator
+from completesplat.commands.trained import open_generator, shown_background
 from completesplat.data.images.photograph import Photograph, outside_of_box, outside_of_mask
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
@@ -99,7 +99,6 @@ def wanted_files(config: DictConfig) -> Wanted:
         formats=formats,
         videos=videos,
         frames=config.frames,
-        background=Wanted.background if config.background == REMOVE else config.background,
         maps=config.maps,
         screen_space_dilation=config.screen_space_dilation,
     )
@@ -115,6 +114,8 @@ def _names(value: object) -> tuple[str, ...]:
 def predict_images(config: DictConfig, model: SceneModel, images: Sequence[Path], wanted: Wanted, out: Path) -> None:
     """Write each image's files into a folder below `out`, with a progress bar, or a line per image without a terminal.
 
+    The background is `shown_background`.
+
     Raises:
         CompleteSplatError: the only image failed, or some of several, which the message names; the others are written.
         DiskError: the disk is full; the remaining images are not predicted.
@@ -125,6 +126,7 @@ def predict_images(config: DictConfig, model: SceneModel, images: Sequence[Path]
         text = "these weights were not trained with parts of the image hidden (data.box_masks, conf/experiment/"
         log.warning("%s: %s*_masked.yaml): hidden parts may come out black or grey", hiding[0], text)
     rasterizer = instantiate(config.rasterizer, _convert_="all")
+    wanted = replace(wanted, background=shown_background(config.background, model))
     folders = folder_names(image.stem for image in images)
     with Progress(console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=len(images) * config.samples)
@@ -184,6 +186,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Wante
         "screen_space_dilation": config.screen_space_dilation,
         "depth_range": model.depth_range.tolist(),
     }
+    wanted = replace(wanted, background=shown_background(config.background, model))
     rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / safe_name(images[0].stem)
     write_prediction(folder, views.images[0], [scene], views.cameras[0], rasterizer, model.up, wanted, recorded)
     print(f"one scene of {len(images)} images, at the posterior's mean: {folder}")

@@ -128,19 +128,14 @@ class Trained:
         from completesplat.training.optimization import constant
         from completesplat.training.reconstruction import ReconstructionModule
 
-        rasterizer = instantiate(self.rasterizer, _convert_="all")
-        if isinstance(self.model, CompleteSplat):
-            return LatentDiffusion(self.model, rasterizer=rasterizer, optimizer=Adam, schedule=constant)
-        stage = ReconstructionModule(
-            self.model.reconstruction_model,
-            WeightedSum({"mse": {"weight": 1.0, "term": MeanSquaredError()}}),
-            rasterizer=rasterizer,
-            optimizer=Adam,
-            schedule=constant,
-        )
+        rendering = {"rasterizer": instantiate(self.rasterizer, _convert_="all")}
         if self.model.background is not None:
-            stage.background = self.model.background
-        return stage
+            rendering["background"] = self.model.background
+        if isinstance(self.model, CompleteSplat):
+            return LatentDiffusion(self.model, optimizer=Adam, schedule=constant, **rendering)
+        loss = WeightedSum({"mse": {"weight": 1.0, "term": MeanSquaredError()}})
+        network = self.model.reconstruction_model
+        return ReconstructionModule(network, loss, optimizer=Adam, schedule=constant, **rendering)
 
 
 def nearest_weights(images: Sequence[Path], remove_background: bool) -> tuple[str, str]:
@@ -188,6 +183,13 @@ def open_generator(config: Any, images: Sequence[Path]) -> SceneModel:
     if model.note is not None:
         print(f"weights: {model.note}")
     return model
+
+
+def shown_background(chosen: float | str | None, model: SceneModel | None) -> float:
+    """Return the grey value behind renders: a chosen number, else that of the weights' training, else 0.5."""
+    if chosen is not None and chosen != REMOVE:
+        return float(chosen)
+    return 0.5 if model is None or model.background is None else model.background
 
 
 def diffusion_of(stage: "Stage") -> CompleteSplat:

@@ -40,8 +40,7 @@ def run(config: DictConfig, out: Path) -> None:
     drawn = config.scene is None and config.watch is None
     if drawn and config.weights != AUTO and ":" not in config.weights:  # as in `splatter_image:NAME`
         check_name(config.weights)
-    background = 0.5 if config.background == REMOVE else config.background
-    server = start_server(0 if config.export is not None else config.port, background)
+    server = start_server(0 if config.export is not None else config.port)
     page = None
     try:
         if config.export is None:
@@ -96,8 +95,8 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
         import torch
         from hydra.utils import instantiate
 
-        from completesplat.commands.trained import open_generator
-        from completesplat.export.prediction import Wanted
+        from completesplat.commands.trained import open_generator, shown_background
+        from completesplat.viewer.access import show_background
         from completesplat.viewer.completion import Completion
         from completesplat.viewer.page import Page, Saver
         from completesplat.viewer.panel import SLIDERS
@@ -117,7 +116,8 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
         model = open_generator(config, [] if config.image is None else [Path(config.image)]).to(device)
         samples, up = [], tuple(model.up.tolist())
     remove = config.background == REMOVE
-    background = Wanted.background if remove else config.background
+    background = shown_background(config.background, model)
+    show_background(server, background)
     photograph = None
     if model is not None and config.image is not None:
         photograph = model.read(Path(config.image), config.fov, remove)

@@ -54,12 +54,13 @@ class TrainingImages(TypedDict, total=False):
     """Facts about the training images that are stored with weights; older weights have none.
 
     `content`: what they show, in words, for weights in the package. `box_masks`: how often parts of an image were
-    hidden. The others: mean and standard deviation of the training images' features, see
-    `completesplat.data.images.photograph.image_features`.
+    hidden. `background`: grey value behind the objects, if images show nothing else. The others: mean and standard
+    deviation of the training images' features, see `completesplat.data.images.photograph.image_features`.
     """
 
     content: str
     box_masks: Share
+    background: Share
     picture_mean: Annotated[Sequence[Share], Entries(8, 8)]
     picture_std: Annotated[Sequence[Annotated[float, Range(1e-6, 1)]], Entries(8, 8)]
 

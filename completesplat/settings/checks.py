@@ -73,7 +73,7 @@ class SceneSettings(TypedDict):
     steps: Annotated[int, Range(1, 1000)] | None
     fov: float | None
     frames: Annotated[int, Range(1, 1000)]
-    background: Share | Literal["remove"]
+    background: Share | Literal["remove"] | None
 
 
 class Predict(SceneSettings):

@@ -105,16 +105,21 @@ class GuardedServer(viser.ViserServer):
         return None
 
 
-def start_server(port: int, background: float = 0.5) -> GuardedServer:
-    """Start a server with a grey background on the port or, if that is taken, the next free one (0: any)."""
+def start_server(port: int) -> GuardedServer:
+    """Start a server on the port or, if that is taken, the next free one (0: any)."""
     logging.getLogger("websockets").setLevel(logging.WARNING)
     with contextlib.redirect_stdout(io.StringIO()):
         server = GuardedServer(port)
-    server.scene.set_background_image(np.full((1, 1, 3), round(255 * background), np.uint8), format="png")
+    show_background(server, 0.5)
     server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would use the internet
     say(server, LOADING)
     server.gui.main_panel.dock_right()
     return server
+
+
+def show_background(server: viser.ViserServer, grey: float) -> None:
+    """Show a grey value (0 to 1) behind the scene."""
+    server.scene.set_background_image(np.full((1, 1, 3), round(255 * grey), np.uint8), format="png")
 
 
 def say(server: viser.ViserServer, text: str) -> None:

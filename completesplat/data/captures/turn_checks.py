@@ -1,4 +1,4 @@
-"""TurnFindings about photos of a turntable: whether the turn closes, where it goes, and how well the masks fit together."""
+"""Checks of photos of a turntable: whether the turn closes, where it goes, how well the masks fit together."""
 
 import math
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ TILES, TILE, LABEL = 8, 48, 12  # photos of a turn on the sheet; pixels
 
 
 class TurnFindings(NamedTuple):
-    """TurnFindings about one turn.
+    """Findings about one turn.
 
     Attributes:
         differences: mean absolute differences (0 to 255) of equally bright photos: the last and the first, neighbours,

@@ -311,7 +311,8 @@ class SceneDataModule(LightningDataModule):
     def training_facts(self) -> dict[str, float | list[float]]:
         """Return the facts about training images that weights store (`completesplat.opening.parts.TrainingImages`)."""
         hidden = 0.0 if self.box_masks is None else self.box_masks.probability
-        return {"box_masks": hidden, **feature_moments(self.store("train"))}
+        background = {} if self.background is None else {"background": self.background}
+        return {"box_masks": hidden, **background, **feature_moments(self.store("train"))}
 
     def mean_image(self) -> Float[Tensor, "3 height width"] | None:
         """Return the mean of the images that `typical_camera` averages, a baseline that ignores the input, if any."""
