@@ -11,6 +11,7 @@ from itertools import product
 import pytest
 import torch
 from omegaconf import OmegaConf
+from PIL import Image
 from published_weights import write_published
 from safetensors.torch import load_file, save
 from support import compose_config, tiny_generator
@@ -278,3 +279,25 @@ def test_cameras_of_any_units_come_to_where_gaussians_start(model):
     turned = look_at(eyes, 2 * eyes, torch.tensor([0.0, -1, 0]))
     with pytest.raises(CompleteSplatError, match="do not look at one place"):
         model.in_model_units(replace(cameras, world_to_camera=turned))
+
+
+def test_weights_of_objects_on_white_put_a_transparent_object_on_white_as_large_as_in_training(model, tmp_path):
+    """A red square of 20 pixels aside in a transparent image of 100: in the middle, 0.9 of the side, on white."""
+    trained = copy.deepcopy(model)
+    trained.architecture["training"] = {"background": 1.0}
+    trained.fov_degrees.fill_(18.0)
+    trained.save_pretrained(tmp_path / "white")
+    loaded = CompleteSplat.from_pretrained(str(tmp_path / "white"))
+    assert (model.background, loaded.background) == (None, 1.0)
+    assert loaded.needed_of_data({}) == {"image_size": 32, "background": 1.0}
+    assert model.needed_of_data({}) == {"image_size": 32}
+    image = Image.new("RGBA", (100, 100), (0, 0, 255, 0))
+    image.paste((255, 0, 0, 255), (70, 10, 90, 30))
+    photograph = loaded.read(image)
+    assert (photograph.fov_degrees, loaded.read(image, 30.0).fov_degrees) == (18.0, 30.0)
+    red = (photograph.image - torch.tensor([1.0, 0, 0])[:, None, None]).abs().amax(0) < 0.05
+    white = (photograph.image > 0.95).all(0)
+    assert red[3:29, 3:29].all()
+    assert white[:, 0].all()
+    assert white[-1].all()
+    assert abs(red.float().mean().sqrt() - 0.9) < 0.1
