@@ -61,10 +61,7 @@ def ssim(predicted: Images, true: Images) -> PerImage:
 
 
 def gradient_energy(images: Images, counted: Bool[Tensor, "image 1 height width"]) -> float:
-    """Return the sum over images and colours of squared differences between neighbours, if both pixels are counted.
-
-    Neighbours lie side by side or one below the other.
-    """
+    """Return the sum of squared differences between neighbours in rows and columns, where both pixels are counted."""
     total = 0.0
     for axis in (-2, -1):
         first, second = (counted.narrow(axis, start, counted.shape[axis] - 1) for start in (0, 1))

@@ -181,10 +181,7 @@ def _written(value: object) -> str:
 
 
 def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
-    """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks.
-
-    Sharpness is of object pixels, or else of all.
-    """
+    """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks."""
     from completesplat.metrics.images import PSNR_LIMIT
 
     records: list[Mapping[str, object]] = []
@@ -195,7 +192,7 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
     names = [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]
     pairs = [(name, name.replace("object", "full")) for name in EVALUATED]
     masked = any(record.get(name) != record.get(whole) for record in records for name, whole in pairs)
-    # Without masks, every pixel is the object's.
+    # Without masks, every pixel is the object's; with them, sharpness is the object's.
     names = [name for name in names if not name.startswith("full_novel_sharpness" if masked else "object")]
     columns = [("predictor", "predictor", "")]
     for name in names:
@@ -206,8 +203,7 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
     fitted = [f"{name}: fitted to {entry['fitted_to']}." for name, entry in results.items() if entry.get("fitted_to")]
     same = format(PSNR_LIMIT, FORMATS["psnr"])
     rows = [[Cell("the same image") if cell.text == same else cell for cell in row.cells] for row in result.rows]
-    remarks = [*fitted, SSIM_NOTE, SHARPNESS_NOTE]
-    return replace(result, rows=[TableRow("", cells) for cells in rows], remarks=remarks)
+    return replace(result, rows=[TableRow("", cells) for cells in rows], remarks=[*fitted, SSIM_NOTE, SHARPNESS_NOTE])
 
 
 def show(*tables: Table, width: int = 120) -> None:
