@@ -74,10 +74,16 @@ class DirectionalGaussians(Gaussians):
         return degree_of(self.harmonics.shape[-2])
 
     def seen_from(self, centers: Float[Tensor, "*batch 3"]) -> Gaussians:
-        """Return the Gaussians with the colours that they have as seen from these points."""
-        directions = torch.nn.functional.normalize(self.means - centers[..., None, :], dim=-1)
-        change = (harmonics(directions, self.degree)[..., None, :] @ self.harmonics).squeeze(-2)
-        colors = (self.colors + change).clamp(min=0)
+        """Return the Gaussians with the colours that they have as seen from these points.
+
+        Colours of Gaussians that are not finite are NaN, without a gradient.
+        """
+        finite = self.finite()[..., None]
+        means, plain = (torch.where(finite, values, 0.0) for values in (self.means, self.colors))
+        directions = torch.nn.functional.normalize(means - centers[..., None, :], dim=-1)
+        terms = torch.where(finite[..., None], self.harmonics, 0.0)
+        change = (harmonics(directions, self.degree)[..., None, :] @ terms).squeeze(-2)
+        colors = torch.where(finite, (plain + change).clamp(min=0), torch.nan)
         return Gaussians(self.means, self.quaternions, self.scales, self.opacities, colors)
 
     def transform(self, matrix: Float[Tensor, "*#batch 4 4"]) -> "DirectionalGaussians":

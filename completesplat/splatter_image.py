@@ -107,9 +107,14 @@ class Parameterization:
         return GROUPS | further
 
     @property
+    def layer_channels(self) -> int:
+        """Return the number of a layer's raw values: 15 without harmonics."""
+        return sum(group.channels for group in self.groups.values())
+
+    @property
     def channels(self) -> int:
-        """Return the channels of the network's output: M * 15 without harmonics."""
-        return self.layers * sum(group.channels for group in self.groups.values())
+        """Return the channels of the network's output."""
+        return self.layers * self.layer_channels
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,8 @@ def project_to_splatter_image(
         placed(gaussians.quaternions, 0.0),
         placed((gaussians.colors - 0.5) / SH_C0, 0.0),
     ]
+    if parameterization.harmonics:
+        parts.append(parts[0].new_zeros(*grid[:2], parameterization.groups["harmonics"].channels, height, width))
     return SplatterImage(torch.cat(parts, dim=2), parameterization), ~filled.any(dim=1).squeeze(1)
 
 

@@ -15,7 +15,7 @@ from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.baselines.preoptimized import occupied
 from completesplat.errors import CompleteSplatError
-from completesplat.splatter_image import CHANNELS, SplatterImage
+from completesplat.splatter_image import SplatterImage
 
 Raw = Float[Tensor, "batch layer 15 height width"]
 
@@ -42,13 +42,13 @@ class SparseVAE(nn.Module):
         super().__init__()
         if len(reconstructor.skips) > 0:
             raise CompleteSplatError("a VAE of Splatter Images has no skips: set its reconstructor's skip_levels=[]")
-        layers = reconstructor.parameterization.layers
-        self.encoder = encoder(in_channels=layers * (CHANNELS + 1))
+        layers, channels = reconstructor.parameterization.layers, reconstructor.parameterization.layer_channels
+        self.encoder = encoder(in_channels=layers * (channels + 1))
         self.reconstructor = reconstructor
         reconstructor.network.conv_out.reset_parameters()
         # Statistics of the raw values of occupied places, by layer and channel.
-        self.register_buffer("mean", torch.zeros(layers, CHANNELS, 1, 1))
-        self.register_buffer("std", torch.ones(layers, CHANNELS, 1, 1))
+        self.register_buffer("mean", torch.zeros(layers, channels, 1, 1))
+        self.register_buffer("std", torch.ones(layers, channels, 1, 1))
 
     def forward(self, image: SplatterImage) -> Reconstruction:
         """Encode and decode a sparse Splatter Image."""

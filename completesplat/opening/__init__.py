@@ -204,9 +204,8 @@ def without_training(config: Any) -> Any:
         parent, _, name = key.rpartition(".")
         if name in list(OmegaConf.select(config, parent) or ()):  # also where its value is missing
             OmegaConf.update(config, key, None)
-    for place in ("model.rasterizer", "model.rasterizer.rasterizer"):
-        if OmegaConf.select(config, f"{place}._target_") == "completesplat.rasterizers.selection.cuda":
-            OmegaConf.update(config, f"{place}._target_", "completesplat.rasterizers.selection.auto")
+    if OmegaConf.select(config, "model.rasterizer._target_") == "completesplat.rasterizers.selection.cuda":
+        OmegaConf.update(config, "model.rasterizer._target_", "completesplat.rasterizers.selection.auto")
     return config
 
 

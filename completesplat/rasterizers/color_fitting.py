@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.gaussians import Gaussians
+from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer
 
@@ -26,6 +26,8 @@ def fit_colors(
     covers, weighted by its contributions to them (simultaneous iterative reconstruction, Gilbert 1972). If these sum
     to less than 1, the colour moves by the weighted sum, so that colours of hidden Gaussians stay as they are.
 
+    Of `DirectionalGaussians`, the means of the colours move, by as much as the colours that the camera sees.
+
     This also works where autograd is off, as in `torch.inference_mode()`.
 
     Args:
@@ -35,6 +37,8 @@ def fit_colors(
     with torch.inference_mode(False), torch.enable_grad():
         # Autograd cannot use tensors that were made in inference mode, but it can use copies.
         fixed, views = gaussians.map(torch.clone).detach(), cameras.map(lambda x: x[:, None].clone())
+        if isinstance(fixed, DirectionalGaussians):
+            fixed = fixed.seen_from(views.centers[:, 0])
         shown = 1.0 if visible is None else visible[:, None].clone()
         colors, total = fixed.colors, torch.ones(())
         for number in range(rounds):
@@ -45,4 +49,6 @@ def fit_colors(
             missing = (images[:, None] - rendering.over(background)).detach() * shown
             (change,) = torch.autograd.grad((rendering.color * missing).sum(), colors)
             colors = (colors + change / total.clamp(min=1)).clamp(min=0)
+        if isinstance(gaussians, DirectionalGaussians):
+            colors = gaussians.colors + colors - fixed.colors
     return replace(gaussians, colors=colors.detach())

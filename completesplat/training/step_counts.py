@@ -23,7 +23,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses.ssim import blur_matrix
-from completesplat.rasterizers import Rendering
+from completesplat.rasterizers import Rendering, as_seen
 from completesplat.scene import Batch, CachedScene, SceneBatch
 from completesplat.training.capture import CaptureFit
 from completesplat.training.latent_diffusion import LatentDiffusion
@@ -147,6 +147,7 @@ class StoreOnly:
     def __init__(self, gpu: bool) -> None:
         self.floats = RASTERIZER_FLOATS["gpu" if gpu else "cpu"]
 
+    @as_seen
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Return empty images of scenes [batch] from cameras [batch view]."""
         image = _Store.apply(self.floats, cameras, *vars(gaussians).values())  # type: ignore[no-untyped-call]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from completesplat.gaussians import Gaussians
+from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.color_fitting import fit_colors
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -96,3 +96,13 @@ def test_it_works_where_autograd_is_off(image):
         scene, camera = wall(2, 0.2).map(torch.clone), CAMERA.map(torch.clone)
         result = fit_colors(scene, camera, image.clone(), ReferenceRasterizer(), 2, 0.5, visible.clone())
     assert torch.equal(result.colors, expected)
+
+
+def test_of_directional_colors_the_means_move_and_the_photo_is_met(image: torch.Tensor) -> None:
+    plain = wall(2, 0.5)
+    slopes = 0.1 * torch.randn(1, plain.count, 3, 3, generator=torch.Generator().manual_seed(2))
+    before = DirectionalGaussians(**vars(replace(plain, colors=plain.colors - 0.1)), harmonics=slopes)
+    after = fitted(before, image, rounds=20)
+    assert isinstance(after, DirectionalGaussians)
+    assert torch.equal(after.harmonics, slopes)
+    assert (render(after) - image).abs().max() < 0.1

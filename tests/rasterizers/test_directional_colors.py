@@ -68,3 +68,21 @@ def test_a_moved_scene_looks_the_same_from_moved_cameras(degree: int) -> None:
     )
     torch.testing.assert_close(turned, still, atol=2e-3, rtol=0)
     assert not torch.allclose(ReferenceRasterizer()(gaussians, moved).color, still, atol=2e-2)
+
+
+@pytest.mark.parametrize("name", ["means", "harmonics"])
+def test_broken_gaussians_are_not_drawn_and_leave_the_others_gradients_whole(name: str) -> None:
+    gaussians, cameras = directional(3)
+    broken = gaussians.map(torch.clone)
+    getattr(broken, name)[0, 0] = float("nan")
+    without = gaussians.map(lambda tensor: tensor[:1, 1:].clone().requires_grad_())
+    results = []
+    for inputs in (broken.map(lambda tensor: tensor[:1].clone().requires_grad_()), without):
+        color = TiledRasterizer()(inputs, cameras[:1]).color
+        color.square().sum().backward()
+        results.append((color, inputs.colors.grad, inputs.means.grad))
+    (color, colors, means), (expected, other_colors, other_means) = results
+    torch.testing.assert_close(color, expected)
+    torch.testing.assert_close(colors[:, 1:], other_colors)
+    torch.testing.assert_close(means[:, 1:], other_means)
+    assert colors[:, 0].eq(0).all()
