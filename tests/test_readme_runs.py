@@ -103,7 +103,7 @@ def named_in(command: str) -> set[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A photograph, a folder of three with cameras, a capture, CO3D's hydrants as published, six turns, three meshes."""
+    """A photograph, a folder of three with cameras, a capture, CO3D's hydrants, six turns, three meshes."""
     place = tmp_path_factory.mktemp("readme")
     rng = np.random.default_rng(0)
     Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)).save(place / "photo.jpg")
