@@ -1,4 +1,4 @@
-"""Checks of photos of a turntable: whether the turn closes, where it goes, how well the masks fit together."""
+"""Findings about photos of a turntable: whether the turn closes, where it goes, and how well the masks fit together."""
 
 import math
 from collections.abc import Mapping
@@ -28,24 +28,26 @@ MOST_VIEWS = 24  # that carve it
 TILES, TILE, LABEL = 8, 48, 12  # photos of a turn on the sheet; pixels
 
 
-class TurnFindings(NamedTuple):
-    """Findings about one turn.
+class Turn(NamedTuple):
+    """Cameras of one turn and findings about its photos.
 
     Attributes:
+        cameras: [photo], as they are if the surface in the middle of the photos moves left; `mirror` gives the others.
         differences: mean absolute differences (0 to 255) of equally bright photos: the last and the first, neighbours,
             and half a turn apart.
-        flow: 1 if the surface in the middle of the photos moves left, -1 if it moves right, 0 if that cannot be told.
+        flow: 1 if the surface moves left, -1 if it moves right, 0 if that cannot be told.
         overlap: of the masks with their visual hull; see `hull_overlap`.
         tiles: some of the photos, grey outside of their masks.
     """
 
+    cameras: Cameras
     differences: tuple[float, float, float]
     flow: int
     overlap: float
     tiles: Photos
 
 
-def examine(photos: Photos, masks: Masks, angles: Float[np.ndarray, " photo"], cameras: Cameras) -> TurnFindings:
+def examine(photos: Photos, masks: Masks, angles: Float[np.ndarray, " photo"], cameras: Cameras) -> Turn:
     """Return the findings about one turn of square photos with the axis in the middle.
 
     Raises:
@@ -62,7 +64,8 @@ def examine(photos: Photos, masks: Masks, angles: Float[np.ndarray, " photo"], c
         raise DataError(f"the turn does not close: {message} {half:.1f}")
     tiles = (photos * masks + 0.7 * (1 - masks))[torch.arange(TILES) * len(photos) // TILES]
     tiles = interpolate(tiles, size=(TILE, TILE), mode="area")
-    return TurnFindings((ends, mean, half), direction_of_flow(even, masks, angles), hull_overlap(masks, cameras), tiles)
+    flow, overlap = direction_of_flow(even, masks, angles), hull_overlap(masks, cameras)
+    return Turn(cameras, (ends, mean, half), flow, overlap, tiles)
 
 
 def direction_of_flow(photos: Photos, masks: Masks, angles: Float[np.ndarray, " photo"]) -> int:
@@ -109,16 +112,16 @@ def hull_overlap(masks: Masks, cameras: Cameras) -> float:
     return float(((silhouettes & filled).sum(1) / (silhouettes | filled).sum(1)).mean())
 
 
-def write_sheet(findings: Mapping[str, TurnFindings], path: Path) -> None:
+def write_sheet(turns: Mapping[str, Turn], path: Path) -> None:
     """Write some photos of each turn, evenly spread over it, with the turn's name and overlap, in columns."""
     height, width = TILE + LABEL, TILES * TILE + LABEL
-    columns = math.ceil(math.sqrt(len(findings) * height / width))
-    rows = math.ceil(len(findings) / columns)
+    columns = math.ceil(math.sqrt(len(turns) * height / width))
+    rows = math.ceil(len(turns) / columns)
     sheet = Image.new("RGB", (columns * width, rows * height), "white")
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(LABEL - 2)
-    for index, (name, found) in enumerate(findings.items()):
+    for index, (name, turn) in enumerate(turns.items()):
         left, top = index // rows * width, index % rows * height
-        draw.text((left, top), printable(f"{name}  {found.overlap:.2f}"), "black", font)
-        strip = np.concatenate(list(found.tiles.numpy()), axis=-1).transpose(1, 2, 0)
+        draw.text((left, top), printable(f"{name}  {turn.overlap:.2f}"), "black", font)
+        strip = np.concatenate(list(turn.tiles.numpy()), axis=-1).transpose(1, 2, 0)
         sheet.paste(Image.fromarray(to_bytes(strip)), (left, top + LABEL))
     save_image(sheet, path)

@@ -10,15 +10,16 @@ import re
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, TypedDict
+from typing import Annotated, Literal, TypedDict
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageOps
 from rich.progress import track
 
 from completesplat.data.captures.capture_set import SPLITS_FILE, read_splits
-from completesplat.data.captures.turn_checks import TurnFindings, examine, write_sheet
+from completesplat.data.captures.turn_checks import Turn, examine, write_sheet
 from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.files import (
     EIGHT_BIT_MODES,
@@ -72,14 +73,6 @@ class TurntableSettings(TypedDict):
     splits: str | None
 
 
-class Turn(NamedTuple):
-    """Positions of one turn's photos, their cameras if the surface moves left, and findings about the photos."""
-
-    positions: list[int]
-    cameras: Cameras
-    findings: TurnFindings
-
-
 def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> None:
     """Write each turn below `folder` as a capture below `out`, all or none, with `splits.json` and `sheet.png`.
 
@@ -109,15 +102,14 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
                 raise refused[0]
             for error in refused:
                 logger.warning("left out: %s", error)
-            findings = {name: turn.findings for name, turn in turns.items()}
-            left = _report(findings) >= 0
-            write_sheet(findings, out / "sheet.png")
+            most = 1 if _report(turns) >= 0 else -1
+            write_sheet(turns, out / "sheet.png")
             if splits:
                 usable = {split: [name for name in names if name in turns] for split, names in splits.items()}
                 (out / SPLITS_FILE).write_text(json.dumps(usable, indent=1) + "\n")
             for name, turn in turns.items():
-                direction = settings["direction"] or turn.findings.flow or (1 if left else -1)
-                _write_transforms(unfinished / name, turn, direction)
+                moves_right = (settings["direction"] or turn.flow or most) == -1
+                _write_transforms(unfinished / name, mirror(turn.cameras) if moves_right else turn.cameras)
             for name in turns:
                 (out / name).parent.mkdir(parents=True, exist_ok=True)
                 (unfinished / name).rename(out / name)
@@ -139,37 +131,16 @@ def _folders_of_photos(root: Path) -> dict[str, Path]:
 
 
 def _write_turn(folder: Path, count: int | None, out: Path, settings: TurntableSettings) -> Turn:
-    """Write images and masks of one turn, and return what its cameras follow from; errors as in `read_turn`."""
-    positions, cameras, photos = read_turn(folder, count, settings)
-    size = min(128, cameras.image_size[0])
-    images, masks = (
-        torch.stack([cut_square(photo[part], Square(0, 0, photo[part].width), size) / 255 for photo in photos])
-        for part in (0, 1)
-    )
-    angles = 2 * np.pi * np.array(positions) / (count or len(positions))
-    turn = Turn(positions, cameras, examine(images, masks, angles, cameras))
-    for kind in ("images", "masks"):
-        (out / kind).mkdir(parents=True)
-    for position, (image, mask) in zip(positions, photos, strict=True):
-        save_image(image, out / f"images/{position:05d}.jpg", quality=95, subsampling=0)
-        save_image(mask, out / f"masks/{position:05d}.png")
-    return turn
-
-
-def read_turn(folder: Path, count: int | None, settings: TurntableSettings) -> tuple[list[int], Cameras, list[Photo]]:
-    """Read the photos of one turn, and place its axis in the middle of square images.
+    """Write images and masks of one turn, squares with the axis in the middle, and return its cameras and findings.
 
     Args:
         count: photos of a full turn; None: as many as there are.
-
-    Returns:
-        Positions in the turn; cameras [photo] (float64) that rise in azimuth, as if the surface moves left, where half
-        the object's height has length 1; and photos.
 
     Raises:
         TooFewFrames: there are fewer than 8 photos.
         BadAnnotation: a file name has no number, or two have the same, where `count` is given.
         BadImage: photos have several sizes, or a mask is empty or fills its photo.
+        DataError: the turn does not close.
     """
     paths = image_files(folder)
     if (fewest := min(len(paths), count or len(paths))) < FEWEST_PHOTOS:
@@ -180,15 +151,34 @@ def read_turn(folder: Path, count: int | None, settings: TurntableSettings) -> t
     sizes = sorted({image.size for image, _ in photos})
     if len(sizes) > 1:
         raise BadImage("photos of several sizes: " + ", ".join(f"{width} x {height}" for width, height in sizes))
-    squares, height = _squared(photos, settings["height"])
     focal = sizes[0][0] / 2 / math.tan(math.radians(settings["fov"]) / 2)
-    azimuths = 2 * np.pi * torch.tensor(positions, dtype=torch.float64) / (count or len(paths))
-    elevation, side = math.radians(settings["elevation"]), squares[0][0].width
-    level = math.cos(elevation) * torch.stack([azimuths.cos(), azimuths.sin()], dim=-1)
-    eyes = torch.cat([level, torch.full_like(level[:, :1], math.sin(elevation))], dim=-1) * (2 * focal / height)
+    photos, height = _squared(photos, settings["height"])
+    angles = 2 * np.pi * np.array(positions) / (count or len(paths))
+    cameras = _on_circle(angles, settings["elevation"], 2 * focal / height, focal, photos[0][0].width)
+    whole = Square(0, 0, photos[0][0].width)
+    size = min(128, photos[0][0].width)
+    images, masks = (
+        torch.stack([cut_square(x, whole, size) / 255 for x in part]) for part in zip(*photos, strict=True)
+    )
+    turn = examine(images, masks, angles, cameras)
+    for kind in ("images", "masks"):
+        (out / kind).mkdir(parents=True)
+    for position, (image, mask) in zip(positions, photos, strict=True):
+        save_image(image, out / f"images/{position:05d}.jpg", quality=95, subsampling=0)
+        save_image(mask, out / f"masks/{position:05d}.png")
+    return turn
+
+
+def _on_circle(
+    angles: Float[np.ndarray, " photo"], elevation: float, distance: float, focal: float, side: int
+) -> Cameras:
+    """Return cameras [photo] in float64 whose azimuths are the angles, each to the right of the one before."""
+    azimuths, height = torch.from_numpy(angles), math.radians(elevation)
+    level = math.cos(height) * torch.stack([azimuths.cos(), azimuths.sin()], dim=-1)
+    eyes = distance * torch.cat([level, torch.full_like(level[:, :1], math.sin(height))], dim=-1)
     poses = look_at(eyes, torch.zeros_like(eyes), eyes.new_tensor([0, 0, 1]))
     intrinsics = eyes.new_tensor([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1]])
-    return positions, Cameras(poses, intrinsics.expand(len(poses), 3, 3), (side, side)), squares
+    return Cameras(poses, intrinsics.expand(len(poses), 3, 3), (side, side))
 
 
 def _numbered(paths: Sequence[Path], count: int) -> dict[int, Path]:
@@ -251,31 +241,31 @@ def _squared(photos: Sequence[Photo], height: str | None) -> tuple[list[Photo], 
     return squares, float(np.median(heights))
 
 
-def _write_transforms(folder: Path, turn: Turn, direction: int) -> None:
-    """Write `transforms.json`, with OpenGL's axes, for one turn's images in a folder."""
-    cameras = turn.cameras if direction == 1 else mirror(turn.cameras)
+def _write_transforms(folder: Path, cameras: Cameras) -> None:
+    """Write `transforms.json`, with OpenGL's axes, for the images in a folder."""
     poses = invert_rigid(cameras.world_to_camera)
     poses[:, :3, 1:3] *= -1
+    names = [path.stem for path in sorted((folder / "images").iterdir())]
     frames = [
-        {"file_path": f"images/{number:05d}.jpg", "mask_path": f"masks/{number:05d}.png", "transform_matrix": pose}
-        for number, pose in zip(turn.positions, poses.tolist(), strict=True)
+        {"file_path": f"images/{name}.jpg", "mask_path": f"masks/{name}.png", "transform_matrix": pose}
+        for name, pose in zip(names, poses.tolist(), strict=True)
     ]
     focal, (height, width) = float(cameras.intrinsics[0, 0, 0]), cameras.image_size
     lens = {"camera_model": "PINHOLE", "fl_x": focal, "fl_y": focal, "w": width, "h": height}
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}, indent=1) + "\n")
 
 
-def _report(findings: Mapping[str, TurnFindings]) -> int:
+def _report(turns: Mapping[str, Turn]) -> int:
     """Log a summary of all turns and the names of odd ones; return by how many more the flow goes left than right."""
-    left, right, unclear = ([name for name, f in findings.items() if f.flow == flow] for flow in (1, -1, 0))
-    ends, neighbours, opposite = np.median([found.differences for found in findings.values()], axis=0)
-    overlap = np.median([found.overlap for found in findings.values()])
+    left, right, unclear = ([name for name, turn in turns.items() if turn.flow == flow] for flow in (1, -1, 0))
+    ends, neighbours, opposite = np.median([turn.differences for turn in turns.values()], axis=0)
+    overlap = np.median([turn.overlap for turn in turns.values()])
     logger.info(
-        f"{len(findings)} turns; flow in the middle goes left in {len(left)}, right in {len(right)}, is unclear in "
+        f"{len(turns)} turns; flow in the middle goes left in {len(left)}, right in {len(right)}, is unclear in "
         f"{len(unclear)}; last and first photo differ by {ends:.1f} of 255, neighbours by {neighbours:.1f}, opposite "
         f"ones by {opposite:.1f}; the masks overlap by {overlap:.3f} with their visual hull (medians)"
     )
-    low = [name for name, found in findings.items() if found.overlap < LOW_OVERLAP]
+    low = [name for name, turn in turns.items() if turn.overlap < LOW_OVERLAP]
     for names, what in (
         (min(right, left, key=len), f"flow goes {'left' if len(left) < len(right) else 'right'}, unlike in most"),
         (unclear, "flow is unclear, the direction of most is taken"),
