@@ -98,7 +98,10 @@ class CaptureSource(SequenceSource):
         return self._sequences[name]
 
     def _make(self, name: str) -> PosedSequence:
-        """Place the object by all frames, so that all splits have the same scale."""
+        """Place the object by all frames, so that all splits have the same scale, and move it to the origin.
+
+        Float32, which holds all that follows, is too coarse for coordinates such as those of maps.
+        """
         capture = self._captures[name]
         cameras = [frame.camera() for frame in capture.frames]
         if capture.points is None:
@@ -110,10 +113,13 @@ class CaptureSource(SequenceSource):
         numbers = self._members(len(capture.frames))
         read = partial(_read, name, [capture.frames[number] for number in numbers], self.framing.image_size)
         scale = OBJECT_HALF_SIZE / placement.half_size
-        points = None if capture.points is None else torch.from_numpy(scale * capture.points).float()
-        selected = [cameras[number] for number in numbers]
+        center, moved = placement.center, torch.eye(4, dtype=torch.float64)
+        moved[:3, 3] = center
+        selected = [replace(cameras[i], world_to_camera=cameras[i].world_to_camera @ moved) for i in numbers]
+        placement = placement._replace(center=torch.zeros_like(center))
         sequence = placed_sequence(name, numbers, selected, placement, self.framing, read)
-        return replace(sequence, points=points, scale=scale)
+        points = None if capture.points is None else (scale * (torch.from_numpy(capture.points) - center)).float()
+        return replace(sequence, points=points, scale=scale, origin=tuple(center.tolist()))
 
 
 def _read(name: str, frames: list[CapturedFrame], size: int, index: int) -> MaskedImage:

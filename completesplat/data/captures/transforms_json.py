@@ -86,11 +86,12 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
         undistorted, _ = frame.read()  # refuses images that `read_photograph` would turn
         distorts = any(frame.lens.distortion)
         squares.append(read_photograph(undistorted if distorts else frame.image, size).image)
-        camera = frame.camera().to(torch.float32)
+        camera = frame.camera()
         (height, width), side = camera.image_size, min(camera.image_size)
         cameras.append(crop_resize(camera, (width - side) // 2, (height - side) // 2, side, size))
     placed = stack(cameras)
-    return Views(torch.stack(squares), placed.relative_to(placed[0]), torch.ones(len(squares), 1, size, size))
+    relative = placed.relative_to(placed[0]).to(torch.float32)
+    return Views(torch.stack(squares), relative, torch.ones(len(squares), 1, size, size))
 
 
 def read_cameras(path: Path, size: int) -> list[Cameras]:
@@ -153,9 +154,11 @@ def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
     if not np.allclose(pose[3], [0, 0, 0, 1]):
         raise BadCamera(f"transform_matrix ends in the row {pose[3].tolist()}, not in 0, 0, 0, 1")
     require_rotation(pose[:3, :3], "the rotation of transform_matrix")
-    pose[:3, 1:3] *= -1
+    # The nearest rotation: an error of rounding would be multiplied by the distance from the origin.
+    u, _, vt = np.linalg.svd(pose[:3, :3] * [1, -1, -1])
     world_to_camera = np.eye(4)
-    world_to_camera[:3, :3], world_to_camera[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+    world_to_camera[:3, :3] = (u @ vt).T
+    world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ pose[:3, 3]
     return world_to_camera
 
 

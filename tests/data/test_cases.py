@@ -1,0 +1,120 @@
+"""Captures as people really bring them: each is read as the same cameras as the plain capture that it was made from."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from completesplat.baselines.fitting import gaussians_at_points
+from completesplat.data.captures.module import CaptureDataModule
+from completesplat.data.captures.transforms_json import read_photographs
+from completesplat.data.sequences import PosedSequence
+from completesplat.geometry.cameras import Cameras, look_at
+from completesplat.scene import Views
+
+FRAMES, WIDTH, HEIGHT = 8, 16, 12
+POINTS = np.random.default_rng(2).uniform(-1, 1, (40, 3))
+FAR = np.array([447123.3, 5411876.4, 312.5])  # UTM coordinates in metres
+Change = Callable[[Path], object]
+
+
+def world_to_camera() -> np.ndarray:
+    """Cameras on a circle that look at the origin, [frame 4 4] in OpenCV's axes."""
+    angles = torch.arange(FRAMES, dtype=torch.float64) * 2 * torch.pi / FRAMES
+    eyes = torch.stack([3 * angles.cos(), 3 * angles.sin(), torch.full_like(angles, 1.2)], dim=-1)
+    return look_at(eyes, torch.zeros(3).double(), torch.tensor([0, 0, 1.0]).double()).numpy()
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """The quaternion (w, x, y, z) of a rotation, as the eigenvector of Bar-Itzhack's matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    matrix = [[a + e + i, h - f, c - g, d - b], [h - f, a - e - i, b + d, c + g]]
+    matrix += [[c - g, b + d, e - a - i, f + h], [d - b, c + g, f + h, i - a - e]]
+    return np.linalg.eigh(np.array(matrix))[1][:, -1]
+
+
+def write_images(folder: Path) -> None:
+    for number in range(FRAMES):
+        pixels = np.full((HEIGHT, WIDTH, 3), 20 + 20 * number, np.uint8)
+        pixels[: HEIGHT // 2] //= 2  # the upper half is dark, so that a turn shows
+        (folder / f"{number}.png").parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels).save(folder / f"{number}.png")
+
+
+def write_colmap(folder: Path, shift: np.ndarray | float = 0.0) -> None:
+    """A text model and its images, with the world's origin moved by -`shift`."""
+    (model := folder / "sparse/0").mkdir(parents=True)
+    write_images(folder / "images")
+    (model / "cameras.txt").write_text(f"# cameras\n1 PINHOLE {WIDTH} {HEIGHT} 19 19.5 8 6\n")
+    lines = ["# images"]
+    for number, pose in enumerate(world_to_camera()):
+        numbers = *quaternion(pose[:3, :3]), *(pose[:3, 3] - pose[:3, :3] @ (np.zeros(3) + shift))
+        lines += [f"{number + 1} {' '.join(map(repr, map(float, numbers)))} 1 {number}.png", "1.5 2.5 -1"]
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    rows = (f"{number} {x} {y} {z} 9 9 9 0.5 1 0\n" for number, (x, y, z) in enumerate(POINTS + shift))
+    (model / "points3D.txt").write_text("".join(rows))
+
+
+def write_transforms(folder: Path, shift: np.ndarray | float = 0.0, digits: int = 17) -> None:
+    write_images(folder / "images")
+    frames = []
+    for number, pose in enumerate(np.linalg.inv(world_to_camera())):
+        pose[:3, :3] = np.round(pose[:3, :3] * [1, -1, -1], digits)
+        pose[:3, 3] += shift
+        frames.append({"file_path": f"images/{number}.png", "transform_matrix": pose.tolist()})
+    lens = {"fl_x": 19, "fl_y": 19.5, "w": WIDTH, "h": HEIGHT}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+
+
+def sequence(folder: Path, split: str = "train") -> PosedSequence:
+    source = CaptureDataModule(str(folder), image_size=HEIGHT).source(split)
+    return source.read(source.names[0])
+
+
+def must_agree(one: PosedSequence, other: PosedSequence, tolerance: float = 1e-7) -> None:
+    """Check that two captures have the same frames, cameras and points."""
+    assert one.frames == other.frames
+    assert one.scale == pytest.approx(other.scale, rel=tolerance)
+    for name in ("world_to_camera", "intrinsics"):
+        actual, expected = (getattr(sequence.cameras, name) for sequence in (one, other))
+        torch.testing.assert_close(actual, expected, atol=tolerance, rtol=tolerance)
+    if other.points is not None:
+        torch.testing.assert_close(one.points, other.points, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("write", [write_colmap, write_transforms])
+def test_a_capture_far_from_the_origin_is_the_same_as_at_the_origin(tmp_path, write):
+    write(tmp_path / "near/a")
+    write(tmp_path / "far/a", FAR)
+    near, far = (sequence(tmp_path / name / "a") for name in ("near", "far"))
+    must_agree(far, near)
+    np.testing.assert_allclose(np.subtract(far.origin, near.origin), FAR, atol=1e-8)
+
+
+def test_rotations_of_six_digits_move_no_camera_far_from_the_origin(tmp_path):
+    write_transforms(tmp_path / "near")
+    write_transforms(tmp_path / "far", FAR, digits=6)
+    must_agree(sequence(tmp_path / "far"), sequence(tmp_path / "near"), 1e-5)
+
+
+def test_the_first_gaussians_have_the_same_size_wherever_the_points_are():
+    views = Views(
+        torch.zeros(1, 3, 8, 8), Cameras(torch.eye(4)[None], torch.eye(3)[None], (8, 8)), torch.ones(1, 1, 8, 8)
+    )
+    points = torch.randint(-64, 64, (60, 3), generator=torch.Generator().manual_seed(0)) / 64
+    near, far = (gaussians_at_points(points + shift, views, 0.1).log_scales for shift in (0, 8192))  # exact sums
+    torch.testing.assert_close(far, near)
+
+
+def test_photographs_far_from_the_origin_have_the_same_relative_cameras(tmp_path):
+    for name, shift in (("near", 0.0), ("far", FAR)):
+        write_transforms(tmp_path / name, shift)
+    near, far = (
+        read_photographs([tmp_path / name / f"images/{i}.png" for i in (0, 3)], tmp_path / name / "transforms.json", 12)
+        for name in ("near", "far")
+    )
+    torch.testing.assert_close(far.cameras.world_to_camera, near.cameras.world_to_camera)
