@@ -13,6 +13,7 @@ from completesplat.baselines.fitting import gaussians_at_points
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_photographs
 from completesplat.data.sequences import PosedSequence
+from completesplat.data.validation import UnreadableFile
 from completesplat.geometry.cameras import Cameras, look_at
 from completesplat.scene import Views
 
@@ -118,3 +119,57 @@ def test_photographs_far_from_the_origin_have_the_same_relative_cameras(tmp_path
         for name in ("near", "far")
     )
     torch.testing.assert_close(far.cameras.world_to_camera, near.cameras.world_to_camera)
+
+
+def lines_of_images(change: Callable[[list[str]], list[str]]) -> Change:
+    """A change to the lines of `images.txt`."""
+
+    def edit(folder: Path) -> None:
+        path = folder / "sparse/0/images.txt"
+        path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
+
+    return edit
+
+
+def rename_with_two_spaces(folder: Path) -> None:
+    (folder / "images/3.png").rename(folder / "images/3  b.png")
+    lines_of_images(lambda lines: [line.replace("3.png", "3  b.png  ") for line in lines])(folder)
+
+
+def write_byte_order_marks(folder: Path) -> None:
+    for path in (folder / "sparse/0").iterdir():
+        path.write_text(path.read_text(), encoding="utf-8-sig")
+
+
+def write_windows_paths(folder: Path) -> None:
+    (folder / "images/left").mkdir()
+    for number in range(FRAMES):
+        (folder / f"images/{number}.png").rename(folder / f"images/left/{number}.png")
+    lines_of_images(lambda lines: [line.replace(" 1 ", " 1 left\\") for line in lines])(folder)
+
+
+COLMAP: dict[str, Change] = {
+    "a blank line first": lines_of_images(lambda lines: ["", *lines]),
+    "a blank line behind the comment": lines_of_images(lambda lines: [lines[0], "", *lines[1:]]),
+    "blank lines between images": lines_of_images(lambda lines: [part for line in lines for part in ((line, "") if line.startswith("1.5") else (line,))]),
+    "images without features": lines_of_images(lambda lines: ["" if line.startswith("1.5") else line for line in lines]),
+    "Windows' line ends": lines_of_images(lambda lines: [f"{line}\r" for line in lines]),
+    "two spaces in a name": rename_with_two_spaces,
+    "byte order marks": write_byte_order_marks,
+    "backslashes in names": write_windows_paths,
+}
+
+
+@pytest.mark.parametrize("change", COLMAP.values(), ids=COLMAP)
+def test_a_text_model_of_colmap_is_read_whole(tmp_path, change):
+    write_colmap(tmp_path)
+    expected = sequence(tmp_path)
+    change(tmp_path)
+    must_agree(sequence(tmp_path), expected)
+
+
+def test_images_without_lines_for_their_features_are_refused_because_every_second_would_be_lost(tmp_path):
+    write_colmap(tmp_path)
+    lines_of_images(lambda lines: [line for line in lines if not line.startswith("1.5")])(tmp_path)
+    with pytest.raises(UnreadableFile, match=r"images\.txt"):
+        sequence(tmp_path)

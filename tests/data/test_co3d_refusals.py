@@ -176,7 +176,7 @@ def test_images_behind_links_that_leave_the_root_are_refused(category, tmp_path)
     folder.symlink_to(tmp_path / "elsewhere")
     refused = read(category).refused
     assert [place(error) for error in refused] == [(OutsidePath, str(category / FRAMES), "a", n) for n in range(4)]
-    assert all("a link leads outside" in error.reason for error in refused)
+    assert all("leads outside" in error.reason for error in refused)
 
 
 def test_what_nobody_reads_may_be_broken(category):

@@ -85,7 +85,7 @@ def _camera_of(row: Row) -> tuple[int, Lens]:
 
 def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | None) -> CapturedFrame:
     """Return an image with its camera; a row has number, pose (qw, qx, qy, qz, tx, ty, tz), camera and name."""
-    number, camera, name = int(row[0]), int(row[8]), " ".join(map(str, row[9:]))
+    number, camera, name = int(row[0]), int(row[8]), str(row[9])
     with at(frame=number):
         if camera not in lenses:
             raise BadAnnotation(f"no camera {camera}")
@@ -110,10 +110,13 @@ def _find_mask(masks: Path, name: str) -> Path:
 
 def _text_rows(path: Path) -> Iterator[Row]:
     """Yield the entries of a text file; those of images have a second line for their features, which may be empty."""
-    lines = [line for line in read_text(path).split("\n") if not line.startswith("#")]
-    for line in lines[:: 2 if path.stem == "images" else 1]:
-        if line.strip():
-            yield line.split()
+    lines = map(str.strip, read_text(path).split("\n"))
+    for line in lines:
+        if line and not line.startswith("#"):
+            yield line.split(maxsplit=9 if path.stem == "images" else -1)
+            # Features are triples; another number of values is that of an image, and this one's line is missing.
+            if path.stem == "images" and len(next(lines, "").split()) % 3:
+                raise ValueError
 
 
 def _binary_rows(path: Path) -> Iterator[Row]:
