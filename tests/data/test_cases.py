@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from realestate10k_trees import make_clip, module, write_tree
 
 from completesplat.baselines.fitting import gaussians_at_points
 from completesplat.data.captures.module import CaptureDataModule
@@ -173,3 +174,15 @@ def test_images_without_lines_for_their_features_are_refused_because_every_secon
     lines_of_images(lambda lines: [line for line in lines if not line.startswith("1.5")])(tmp_path)
     with pytest.raises(UnreadableFile, match=r"images\.txt"):
         sequence(tmp_path)
+
+
+@pytest.mark.parametrize("first", ["https://video.example/watch?v=x\n", "x\n", "\n", ""])
+def test_a_clip_of_realestate10k_has_its_first_frame_with_and_without_the_line_of_its_address(tmp_path, first):
+    clip = make_clip("a")
+    root = write_tree(tmp_path, "text", [clip], [clip])
+    text = root / "test/a.txt"
+    text.write_text(first + text.read_text().split("\n", 1)[1])
+    read = module(root).source("test").read("a")
+    assert read.frames == tuple(range(6))
+    expected = torch.from_numpy(clip.rows[:, 6:].reshape(-1, 3, 4)).double()
+    torch.testing.assert_close(read.cameras.world_to_camera[:, :3], expected)

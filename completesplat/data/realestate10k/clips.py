@@ -153,10 +153,10 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
-    """Return timestamps and camera rows."""
+    """Return timestamps and camera rows. Above them is the video's address, which some copies lack."""
     timestamps, rows = [], []
-    lines = read_text(path, MOST_BYTES).splitlines()[1:]
-    for frame, columns in enumerate(line.split() for line in lines if line.strip()):
+    lines = [line.split() for line in read_text(path, MOST_BYTES).splitlines() if line.strip()]
+    for frame, columns in enumerate(lines[1:] if lines and len(lines[0]) == 1 else lines):
         with at(frame=frame):
             if len(columns) != 1 + CAMERA_NUMBERS:
                 raise BadAnnotation(f"{len(columns)} columns instead of {1 + CAMERA_NUMBERS}")
