@@ -400,7 +400,7 @@ def test_a_bad_image_is_refused(tmp_path, damage, message):
         sequence.read(3)
 
 
-@pytest.mark.parametrize("k1", [-4.0, -1.0, 4.0, 1e300])
+@pytest.mark.parametrize("k1", [-4.0, -1.0, 4.0, 1e15])
 def test_distortion_that_leaves_no_image_is_refused(tmp_path, k1):
     write_transforms(tmp_path, change=lambda content: content.update(k1=k1))
     with pytest.raises(BadCamera, match=r"r_0\.png, .*, frame 0: distortion .* leaves no usable image"):

@@ -1,6 +1,7 @@
 """Captures as people really bring them: each is read as the same cameras as the plain capture that it was made from."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from completesplat.baselines.fitting import gaussians_at_points
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_photographs
 from completesplat.data.sequences import PosedSequence
-from completesplat.data.validation import UnreadableFile
+from completesplat.data.validation import BadAnnotation, UnreadableFile
 from completesplat.geometry.cameras import Cameras, look_at
 from completesplat.scene import Views
 
@@ -152,8 +153,12 @@ def write_windows_paths(folder: Path) -> None:
 COLMAP: dict[str, Change] = {
     "a blank line first": lines_of_images(lambda lines: ["", *lines]),
     "a blank line behind the comment": lines_of_images(lambda lines: [lines[0], "", *lines[1:]]),
-    "blank lines between images": lines_of_images(lambda lines: [part for line in lines for part in ((line, "") if line.startswith("1.5") else (line,))]),
-    "images without features": lines_of_images(lambda lines: ["" if line.startswith("1.5") else line for line in lines]),
+    "blank lines between images": lines_of_images(
+        lambda lines: [part for line in lines for part in ((line, "") if line.startswith("1.5") else (line,))]
+    ),
+    "images without features": lines_of_images(
+        lambda lines: ["" if line.startswith("1.5") else line for line in lines]
+    ),
     "Windows' line ends": lines_of_images(lambda lines: [f"{line}\r" for line in lines]),
     "two spaces in a name": rename_with_two_spaces,
     "byte order marks": write_byte_order_marks,
@@ -186,3 +191,28 @@ def test_a_clip_of_realestate10k_has_its_first_frame_with_and_without_the_line_o
     assert read.frames == tuple(range(6))
     expected = torch.from_numpy(clip.rows[:, 6:].reshape(-1, 3, 4)).double()
     torch.testing.assert_close(read.cameras.world_to_camera[:, :3], expected)
+
+
+def test_points_that_float32_cannot_hold_are_left_out_with_a_word(tmp_path, caplog):
+    write_colmap(tmp_path)
+    expected = sequence(tmp_path)
+    with (tmp_path / "sparse/0/points3D.txt").open("a") as file:
+        file.write("98 1e200 0 0 9 9 9 0.5\n99 0 -1e30 0 9 9 9 0.5\n")
+    must_agree(sequence(tmp_path), expected, 0.2)  # the median is another
+    assert sequence(tmp_path).points.shape == expected.points.shape
+    assert "2 of 42 points are more than 100,000 scene radii away and are left out" in caplog.text
+
+
+@pytest.mark.parametrize("value", [1e200, -1e300, 1e25])
+def test_cameras_that_float32_cannot_hold_are_refused_on_reading(tmp_path, value):
+    write_colmap(tmp_path / "a")
+    lines_of_images(lambda lines: [re.sub(r"\S+ 1 2.png", f"{value} 1 2.png", line) for line in lines])(tmp_path / "a")
+    with pytest.raises(BadAnnotation, match=r"images\.txt, a, frame 3: the pose is not finite in float32: "):
+        sequence(tmp_path / "a")
+    write_transforms(tmp_path / "b")
+    path = tmp_path / "b/transforms.json"
+    content = json.loads(path.read_text())
+    content["frames"][5]["transform_matrix"][0][3] = value
+    path.write_text(json.dumps(content))
+    with pytest.raises(BadAnnotation, match=r"json, b, frame 5: transform_matrix is not finite in float32: "):
+        sequence(tmp_path / "b")

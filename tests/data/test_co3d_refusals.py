@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET, change, depth_bits, write_tree
+from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SIZE, SUBSET, change, depth_bits, write_tree
 from PIL import Image
 
 from completesplat.data.co3d.module import CO3DDataModule
@@ -86,6 +86,7 @@ R, FOCAL, CENTER = ((CAMERA, key) for key in ("R", "focal_length", "principal_po
         (R, turned(0.3, 1.001), BadCamera, "R is not orthonormal"),
         (R, turned(0.3, -1.0), BadCamera, "R is a reflection"),
         (R, turned(0.3, NAN), BadAnnotation, "R is not finite"),
+        ((CAMERA, "T"), [0.0, 1e200, 4.0], BadAnnotation, "T is not finite in float32"),
         (FOCAL, [0, 2], BadCamera, "focal_length must be positive"),
         (CENTER, [0, 1.2], BadCamera, "lies outside of the 32 x 24 image"),
         ((CAMERA, "intrinsics_format"), "screen", BadAnnotation, "unknown intrinsics format 'screen'"),
@@ -177,6 +178,16 @@ def test_images_behind_links_that_leave_the_root_are_refused(category, tmp_path)
     refused = read(category).refused
     assert [place(error) for error in refused] == [(OutsidePath, str(category / FRAMES), "a", n) for n in range(4)]
     assert all("leads outside" in error.reason for error in refused)
+
+
+def test_black_images_and_masks_without_an_object_are_unusable(category):
+    black, unmasked = category / "a/images/frame000002.png", category / "b/masks/frame000004.png"
+    Image.new("RGB", SIZE[::-1]).save(black)
+    Image.new("L", SIZE[::-1]).save(unmasked)
+    findings = check(CO3DDataModule(str(category.parent), CATEGORY, image_size=16).open("train"), 1, progress=False)
+    expected = [(BadImage, str(black), "a", 1), (BadImage, str(unmasked), "b", 3)]
+    assert [place(error) for error in findings.refused] == expected
+    assert findings.frames == 16 - 2
 
 
 def test_what_nobody_reads_may_be_broken(category):

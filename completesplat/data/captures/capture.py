@@ -27,7 +27,7 @@ from completesplat.data.images.files import (
     refused_as_bad,
 )
 from completesplat.data.sequences import shortened
-from completesplat.data.validation import BadAnnotation, BadCamera, TooFewFrames, at, require_file
+from completesplat.data.validation import LARGEST, BadAnnotation, BadCamera, TooFewFrames, at, require_file
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.geometry.cameras import Cameras
 
@@ -52,7 +52,7 @@ class Lens:
 
     def __post_init__(self) -> None:
         (height, width), (x, y) = self.image_size, self.center
-        if not np.isfinite([*self.focal, *self.center, *self.distortion]).all():
+        if not (np.abs([*self.focal, *self.center, *self.distortion]) < LARGEST).all():
             raise BadCamera(f"intrinsics are not finite: {self.focal}, {self.center}, {self.distortion}")
         if min(height, width) <= 0 or min(self.focal) <= 0:
             raise BadCamera(f"sizes and focal lengths must be positive, not {width} x {height} and {self.focal}")

@@ -1,6 +1,7 @@
 """Data module of a user's captures, which are read in place."""
 
 import hashlib
+import logging
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -31,9 +32,11 @@ from completesplat.data.validation import MissingFile, at, refused_to
 from completesplat.errors import DataError
 from completesplat.settings.schema import Range
 
+logger = logging.getLogger(__name__)
+
 # Points whose distance from the median point exceeds this multiple of the median distance are outliers, because the
-# farthest point determines the scale of the scene.
-FARTHEST = 5.0
+# farthest point determines the scale of the scene. Beyond the second multiple, they are errors of the reconstruction.
+FARTHEST, FARTHEST_USED = 5.0, 100_000
 FEWEST_HELD_OUT = 2
 Members = Callable[[int], list[int]]
 
@@ -104,12 +107,18 @@ class CaptureSource(SequenceSource):
         """
         capture = self._captures[name]
         cameras = [frame.camera() for frame in capture.frames]
-        if capture.points is None:
+        points = capture.points
+        if points is None:
             placement = from_cameras(cameras)
         else:
-            distance = np.linalg.norm(capture.points - np.median(capture.points, axis=0), axis=-1)
-            near = capture.points[distance <= FARTHEST * np.median(distance)]
-            placement = from_points(near, upright_axes(cameras), "the point cloud")
+            with np.errstate(all="ignore"):
+                distance = np.linalg.norm(points - np.median(points, axis=0), axis=-1)
+                distance /= np.median(distance)
+            placement = from_points(points[distance <= FARTHEST], upright_axes(cameras), "the point cloud")
+            if lost := int((~(distance <= FARTHEST_USED)).sum()):
+                beyond = f"more than {FARTHEST_USED:,} scene radii away and are left out"
+                logger.warning("%s: %d of %d points are %s", name, lost, len(points), beyond)
+            points = points[distance <= FARTHEST_USED]
         numbers = self._members(len(capture.frames))
         read = partial(_read, name, [capture.frames[number] for number in numbers], self.framing.image_size)
         scale = OBJECT_HALF_SIZE / placement.half_size
@@ -118,8 +127,8 @@ class CaptureSource(SequenceSource):
         selected = [replace(cameras[i], world_to_camera=cameras[i].world_to_camera @ moved) for i in numbers]
         placement = placement._replace(center=torch.zeros_like(center))
         sequence = placed_sequence(name, numbers, selected, placement, self.framing, read)
-        points = None if capture.points is None else (scale * (torch.from_numpy(capture.points) - center)).float()
-        return replace(sequence, points=points, scale=scale, origin=tuple(center.tolist()))
+        seeds = None if points is None else (scale * (torch.from_numpy(points) - center)).float()
+        return replace(sequence, points=seeds, scale=scale, origin=tuple(center.tolist()))
 
 
 def _read(name: str, frames: list[CapturedFrame], size: int, index: int) -> MaskedImage:

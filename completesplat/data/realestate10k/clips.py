@@ -22,6 +22,7 @@ from torch import Tensor
 from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.files import decode, stored_size
 from completesplat.data.validation import (
+    LARGEST,
     ROTATION_TOLERANCE,
     BadAnnotation,
     BadCamera,
@@ -90,7 +91,7 @@ def make_clip(key: str, source: Path, timestamps: Sequence[int], rows: Float[Ten
     rigid = (deviation <= ROTATION_TOLERANCE) & (torch.linalg.det(rotation) > 0)
     for bad, kind, reason in (
         (torch.tensor([count[time] > 1 for time in timestamps]), BadAnnotation, "another frame has its timestamp"),
-        (~rows.isfinite().all(dim=1), BadAnnotation, "camera with numbers that are not finite"),
+        (~(rows.abs() < LARGEST).all(dim=1), BadAnnotation, "camera with numbers that are not finite in float32"),
         ((rows[:, :2] <= 0).any(dim=1), BadCamera, "focal length is not positive"),
         ((rows[:, 4:6] != 0).any(dim=1), BadCamera, "lens distortion is not supported"),
         (~rigid, BadCamera, "pose is not a rotation and translation"),

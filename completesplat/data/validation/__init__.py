@@ -21,6 +21,7 @@ MOST_BYTES = 2**32
 BYTES_OF_ANY_RATIO, LARGEST_RATIO = 2**24, 40
 CHUNK = 2**20  # bytes that are read at once
 ROTATION_TOLERANCE = 1e-3
+LARGEST = 2.0**60  # numbers whose squares float32 holds, too
 
 T = TypeVar("T")
 Refuse = Callable[[DataError], None]
@@ -164,7 +165,7 @@ def field(entry: object, key: str, kind: type[T]) -> T:
 
 
 def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert numbers from JSON to a float64 array, and refuse other types, another shape, NaN and infinity."""
+    """Convert numbers from JSON to a float64 array, and refuse other types, another shape, and what is not finite in float32."""
     try:
         array = np.array(value)
     except ValueError:  # Lists of unequal length.
@@ -173,9 +174,10 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
     if array.shape != shape or array.dtype.kind not in "iuf":
         numbers = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
         raise BadAnnotation(f"{what} must be {numbers}, not {_shortened(value)}")
-    if not np.isfinite(array).all():
-        raise BadAnnotation(f"{what} is not finite: {_shortened(value)}")
-    return array.astype(np.float64)
+    array = array.astype(np.float64)
+    if not (np.abs(array) < LARGEST).all():
+        raise BadAnnotation(f"{what} is not finite in float32: {_shortened(value)}")
+    return array
 
 
 def require_rotation(matrix: np.ndarray, what: str) -> None:
