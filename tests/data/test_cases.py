@@ -12,10 +12,11 @@ from PIL import Image
 from realestate10k_trees import make_clip, module, write_tree
 
 from completesplat.baselines.fitting import gaussians_at_points
+from completesplat.data.captures.importing import import_capture
 from completesplat.data.captures.module import CaptureDataModule
-from completesplat.data.captures.transforms_json import read_photographs
+from completesplat.data.captures.transforms_json import read_photographs, read_transforms
 from completesplat.data.sequences import PosedSequence
-from completesplat.data.validation import BadAnnotation, UnreadableFile
+from completesplat.data.validation import BadAnnotation, BadImage, UnreadableFile
 from completesplat.geometry.cameras import Cameras, look_at
 from completesplat.scene import Views
 
@@ -216,3 +217,103 @@ def test_cameras_that_float32_cannot_hold_are_refused_on_reading(tmp_path, value
     path.write_text(json.dumps(content))
     with pytest.raises(BadAnnotation, match=r"json, b, frame 5: transform_matrix is not finite in float32: "):
         sequence(tmp_path / "b")
+
+
+def resave(folder: Path, change: Callable[[Image.Image], Image.Image], orientation: int = 1, suffix: str = "") -> None:
+    """Change all images, and tag them to be turned."""
+    exif = Image.Exif()
+    exif[274] = orientation
+    for path in sorted((folder / "images").iterdir()):
+        change(Image.open(path)).save(path.with_suffix(suffix or path.suffix), exif=exif)
+
+
+def resized(width: int, height: int) -> Callable[[Image.Image], Image.Image]:
+    return lambda image: image.resize((width, height), Image.Resampling.NEAREST)
+
+
+@pytest.mark.parametrize("write", [write_colmap, write_transforms])
+@pytest.mark.parametrize("factor", [2, 0.5])
+def test_images_of_another_size_have_scaled_cameras(tmp_path, write, factor):
+    write(tmp_path)
+    expected, images = sequence(tmp_path), [sequence(tmp_path).read(i).image for i in range(6)]
+    resave(tmp_path, resized(int(factor * WIDTH), int(factor * HEIGHT)))
+    must_agree(sequence(tmp_path), expected, 1e-12)
+    for index, image in enumerate(images):
+        assert (sequence(tmp_path).read(index).image - image.float()).abs().mean() < 9
+
+
+def test_sides_may_be_rounded_and_each_has_its_own_factor(tmp_path):
+    write_transforms(tmp_path)
+    resave(tmp_path, resized(11, 8))  # 2/3 of 16 x 12 are 10.67 x 8
+    lens = read_transforms(tmp_path / "transforms.json").frames[0].lens
+    assert lens.focal == pytest.approx((19 * 11 / 16, 19.5 * 8 / 12))
+    assert lens.center == pytest.approx((5.5, 4))
+
+
+TURN_BACK = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}
+
+
+@pytest.mark.parametrize(("write", "orientation"), [(write_colmap, 3), (write_colmap, 6), (write_transforms, 6)])
+def test_poses_are_of_the_stored_pixels_where_their_size_is_the_cameras(tmp_path, write, orientation):
+    write(tmp_path)
+    expected = sequence(tmp_path).read(0).image
+    resave(tmp_path, lambda image: image, orientation)
+    assert torch.equal(sequence(tmp_path).read(0).image, expected)
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+@pytest.mark.parametrize("write", [write_colmap, write_transforms])
+def test_poses_are_of_the_upright_image_where_its_size_is_the_cameras(tmp_path, write, factor):
+    write(tmp_path)
+    expected = sequence(tmp_path).read(0).image.float()
+    change = resized(factor * WIDTH, factor * HEIGHT)
+    resave(tmp_path, lambda image: change(image).transpose(TURN_BACK[6]), 6)
+    assert (sequence(tmp_path).read(0).image - expected).abs().mean() < 9
+
+
+def test_photographs_with_stored_pixels_are_not_turned(tmp_path):
+    write_transforms(tmp_path)
+    given = [tmp_path / "images/3.png"], tmp_path / "transforms.json", HEIGHT
+    expected = read_photographs(*given).images
+    resave(tmp_path, lambda image: image, 6)
+    torch.testing.assert_close(read_photographs(*given).images, expected)
+
+
+def without_size(content: dict) -> None:
+    del content["w"], content["h"]
+
+
+@pytest.mark.parametrize(
+    ("orientation", "size", "change", "reason"),
+    [
+        (3, (WIDTH, HEIGHT), None, "EXIF orientation 3"),
+        (6, (WIDTH, HEIGHT), without_size, "EXIF orientation 6"),
+        (6, (12, 12), lambda content: content.update(w=12), "EXIF orientation 6"),
+        (1, (WIDTH, 9), None, "has 9 x 16 pixels, its camera 12 x 16"),
+    ],
+)
+def test_import_names_photos_whose_pixels_are_not_the_cameras(tmp_path, orientation, size, change, reason):
+    write_transforms(tmp_path)
+    resave(tmp_path, resized(*size), orientation)
+    if change:
+        content = json.loads((tmp_path / "transforms.json").read_text())
+        change(content)
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(BadImage, match=rf"images/0\.png, .*frame 0: .*{reason}"):
+        import_capture(str(tmp_path), None, 100, 1000, tmp_path / "out")
+
+
+def test_import_names_a_turned_tiff_and_a_mask_of_another_shape(tmp_path):
+    write_transforms(tmp_path)
+    resave(tmp_path, lambda image: image, 6, ".tif")
+    text = (tmp_path / "transforms.json").read_text()
+    (tmp_path / "transforms.json").write_text(text.replace(".png", ".tif"))
+    with pytest.raises(BadImage, match=r"0\.tif, .*EXIF orientation 6"):
+        import_capture(str(tmp_path), None, 100, 1000, tmp_path / "out")
+    (tmp_path / "transforms.json").write_text(text.replace('"transform', '"mask_path": "m.png", "transform'))
+    Image.new("L", (9, 9), 255).save(tmp_path / "m.png")
+    with pytest.raises(BadImage, match=r"m\.png, .*has 9 x 9 pixels"):
+        import_capture(str(tmp_path), None, 100, 1000, tmp_path / "out")
+    Image.new("L", (2 * WIDTH, 2 * HEIGHT), 255).save(tmp_path / "m.png")
+    import_capture(str(tmp_path), None, 100, 1000, tmp_path / "out")
+    assert sequence(tmp_path).read(0).mask.min() == 255

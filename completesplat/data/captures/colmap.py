@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, in_order, warn_of_missing
+from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fitted, in_order, warn_of_missing
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
@@ -56,7 +56,7 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
         posed = _parsed(partial(_frame_of, lenses=lenses, images=images, masks=masks), read, files[1])
         missing = sorted(str(frame.image.relative_to(images)) for frame in posed if not isfile(frame.image))
         warn_of_missing(files[1], missing, len(posed))
-        frames = in_order([frame for frame in posed if isfile(frame.image)])
+        frames = in_order([fitted(frame) for frame in posed if isfile(frame.image)])
     points = np.array(_parsed(lambda row: [float(coordinate) for coordinate in row[1:4]], read, files[2]))
     return Capture(files, frames, points if len(points) else None)
 
@@ -97,7 +97,7 @@ def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | 
         world_to_camera[:3, 3] = pose[4:]
         image = inside(images, name)
         mask = None if masks is None or not isfile(image) else _find_mask(masks, name)
-        return CapturedFrame(number, image, mask, lenses[camera], world_to_camera)
+        return CapturedFrame(number, image, mask, lenses[camera], world_to_camera, "ignored")
 
 
 def _find_mask(masks: Path, name: str) -> Path:

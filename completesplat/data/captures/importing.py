@@ -37,6 +37,7 @@ def import_capture(
     for error in sources["train"].refused:
         leave_out(error)
     for name in sources["train"].names:
+        sources["train"].check(name)
         counts = [len(sources[split].read(name).frames) for split in ("train", "test")]
         logger.info("%s: %d images with cameras, of which %d are held out", name, sum(counts), counts[1])
     names = sources["train"].names

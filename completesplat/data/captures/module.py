@@ -100,6 +100,12 @@ class CaptureSource(SequenceSource):
                 self._sequences[name] = self._make(name)
         return self._sequences[name]
 
+    def check(self, name: str) -> None:
+        """Check the headers of all images of a capture, or raise a DataError."""
+        with at(sequence=name):
+            for frame in self._captures[name].frames:
+                frame.check()
+
     def _make(self, name: str) -> PosedSequence:
         """Place the object by all frames, so that all splits have the same scale, and move it to the origin.
 

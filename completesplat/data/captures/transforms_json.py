@@ -2,14 +2,17 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from os.path import isfile
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, in_order, warn_of_missing
+from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fitted, in_order, warn_of_missing
+from completesplat.data.images.exif import ORIENTATION, read_exif
 from completesplat.data.images.files import stored_size
 from completesplat.data.images.photograph import read_photograph
 from completesplat.data.validation import (
@@ -83,9 +86,10 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
         frame = frames.get(image.resolve())
         if frame is None:
             raise CompleteSplatError(f"{image}: {path} has no frame with this image")
-        undistorted, _ = frame.read()  # refuses images that `read_photograph` would turn
-        distorts = any(frame.lens.distortion)
-        squares.append(read_photograph(undistorted if distorts else frame.image, size).image)
+        undistorted, _ = frame.read()
+        if ORIENTATION in read_exif(undistorted):  # `read_photograph` would turn it
+            undistorted = Image.fromarray(np.array(undistorted))
+        squares.append(read_photograph(undistorted, size).image)
         camera = frame.camera()
         (height, width), side = camera.image_size, min(camera.image_size)
         cameras.append(crop_resize(camera, (width - side) // 2, (height - side) // 2, side, size))
@@ -142,8 +146,10 @@ def _read_frames(path: Path) -> tuple[list[CapturedFrame], Entry]:
                     continue
                 masked = entry.get("mask_path") is not None
                 mask = require_file(inside(root, field(entry, "mask_path", str))) if masked else None
-                lens, pose = _read_lens({**content, **entry}, image), _read_pose(entry.get("transform_matrix"))
-                frames.append(CapturedFrame(number, image, mask, lens, pose))
+                values, pose = {**content, **entry}, _read_pose(entry.get("transform_matrix"))
+                frame = CapturedFrame(number, image, mask, _read_lens(values, image), pose)
+                sized = {"w", "h"} <= values.keys()
+                frames.append(fitted(frame) if sized else replace(frame, orientation="unknown"))
     warn_of_missing(path, missing, len(entries))
     return frames, content
 
