@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from completesplat.data.captures.importing import import_capture
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_photographs, read_transforms
 from completesplat.data.sequences import PosedSequence
-from completesplat.data.validation import BadAnnotation, BadImage, UnreadableFile
+from completesplat.data.validation import BadAnnotation, BadImage, MissingFile, UnreadableFile
 from completesplat.geometry.cameras import Cameras, look_at
 from completesplat.scene import Views
 
@@ -317,3 +318,85 @@ def test_import_names_a_turned_tiff_and_a_mask_of_another_shape(tmp_path):
     Image.new("L", (2 * WIDTH, 2 * HEIGHT), 255).save(tmp_path / "m.png")
     import_capture(str(tmp_path), None, 100, 1000, tmp_path / "out")
     assert sequence(tmp_path).read(0).mask.min() == 255
+
+
+def move(old: str, new: str) -> Change:
+    """Move a file or folder."""
+
+    def edit(folder: Path) -> None:
+        (folder / new).parent.mkdir(parents=True, exist_ok=True)
+        (folder / old).rename(folder / new)
+
+    return edit
+
+
+def in_turn(*changes: Change) -> Change:
+    return lambda folder: [change(folder) for change in changes]
+
+
+def add_smaller_model(folder: Path) -> None:
+    """COLMAP's first model has half of the images, and the second all."""
+    move("sparse/0", "sparse/1")(folder)
+    shutil.copytree(folder / "sparse/1", folder / "sparse/0")
+    lines_of_images(lambda lines: lines[:9])(folder)
+
+
+LAYOUTS: dict[str, Change] = {
+    "sparse": in_turn(move("sparse/0", "model"), lambda folder: (folder / "sparse").rmdir(), move("model", "sparse")),
+    "a larger sparse/1": add_smaller_model,
+    "nerfstudio's colmap/sparse/0": move("sparse", "colmap/sparse"),
+    "COLMAP's dense/0": in_turn(move("sparse/0", "dense/0/sparse"), move("images", "dense/0/images")),
+    "dense": in_turn(move("sparse/0", "dense/sparse"), move("images", "dense/images")),
+}
+
+
+@pytest.mark.parametrize("change", LAYOUTS.values(), ids=LAYOUTS)
+def test_models_of_colmap_are_found_in_the_folders_that_programs_make(tmp_path, change):
+    write_colmap(tmp_path)
+    expected = sequence(tmp_path)
+    change(tmp_path)
+    must_agree(sequence(tmp_path), expected)
+    assert sequence(tmp_path).read(0).image.shape == (3, HEIGHT, HEIGHT)
+
+
+def test_the_larger_of_several_models_is_named(tmp_path, caplog):
+    write_colmap(tmp_path)
+    add_smaller_model(tmp_path)
+    sequence(tmp_path)
+    assert f"{tmp_path}/sparse/1: the largest of 2 models, with 8 images" in caplog.text
+
+
+def test_a_folder_of_nerf_synthetic_is_a_capture_of_its_training_images(tmp_path):
+    write_transforms(tmp_path)
+    expected = sequence(tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    move("images", "train")(tmp_path)
+    for frame in content["frames"]:
+        frame["file_path"] = f"./train/{Path(frame['file_path']).stem}"
+    for split in ("train", "val", "test"):
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(content))
+    (tmp_path / "transforms.json").unlink()
+    must_agree(sequence(tmp_path), expected)
+
+
+@pytest.mark.parametrize("kind", ["", "corrected_"])
+def test_keyframes_of_polycam_are_a_capture(tmp_path, kind):
+    write_transforms(tmp_path)
+    expected = sequence(tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    (tmp_path / "transforms.json").unlink()
+    (cameras := tmp_path / f"keyframes/{kind}cameras").mkdir(parents=True)
+    move("images", f"keyframes/{kind}images")(tmp_path)
+    for number, frame in enumerate(content["frames"]):
+        entry = {f"t_{row}{column}": frame["transform_matrix"][row][column] for row in range(3) for column in range(4)}
+        entry |= {"fx": 19, "fy": 19.5, "cx": 8, "cy": 6, "width": WIDTH, "height": HEIGHT, "blur_score": 80}
+        (cameras / f"{number}.json").write_text(json.dumps(entry))
+    must_agree(sequence(tmp_path), expected)
+    assert len(sequence(tmp_path).read(0).image)
+
+
+def test_a_model_without_images_is_refused_and_takes_none_from_outside(tmp_path):
+    write_colmap(tmp_path / "a")
+    move("a/images", "images")(tmp_path)
+    with pytest.raises(MissingFile, match=r"a/images, a: no such folder"):
+        sequence(tmp_path / "a")

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from os.path import isfile
 from pathlib import Path
@@ -22,6 +23,7 @@ from completesplat.data.validation import (
     read_text,
     require_file,
 )
+from completesplat.errors import DataError
 from completesplat.geometry.rotations import quaternion_to_matrix
 
 # Names and numbers of parameters by model id (colmap, `src/colmap/sensor/models.h`); other models are refused.
@@ -49,7 +51,7 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
     """
     if not images.is_dir():
         raise MissingFile("no such folder", str(images))
-    suffix, read = ("bin", _binary_rows) if (model / "images.bin").is_file() else ("txt", _text_rows)
+    suffix, read = _form(model)
     files = tuple(require_file(model / f"{name}.{suffix}") for name in ("cameras", "images", "points3D"))
     lenses = dict(_parsed(_camera_of, read, files[0]))
     with at(files[1]):
@@ -59,6 +61,23 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
         frames = in_order([fitted(frame) for frame in posed if isfile(frame.image)])
     points = np.array(_parsed(lambda row: [float(coordinate) for coordinate in row[1:4]], read, files[2]))
     return Capture(files, frames, points if len(points) else None)
+
+
+def is_model(folder: Path) -> bool:
+    """Return whether a folder has a model."""
+    return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
+
+
+def image_count(model: Path) -> int:
+    """Return the number of a model's images, 0 if they cannot be read."""
+    suffix, read = _form(model)
+    with suppress(DataError):
+        return len(_parsed(len, read, model / f"images.{suffix}"))
+    return 0
+
+
+def _form(model: Path) -> tuple[str, Callable[[Path], Iterator[Row]]]:
+    return ("bin", _binary_rows) if (model / "images.bin").is_file() else ("txt", _text_rows)
 
 
 def _parsed(parse: Callable[[Row], T], read: Callable[[Path], Iterator[Row]], path: Path) -> list[T]:

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from completesplat.data.captures.capture import Capture, CapturedFrame
-from completesplat.data.captures.colmap import read_colmap
-from completesplat.data.captures.transforms_json import read_transforms
+from completesplat.data.captures.colmap import image_count, is_model, read_colmap
+from completesplat.data.captures.transforms_json import read_polycam, read_transforms
 from completesplat.data.images.crop import cut_square
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
@@ -38,6 +38,9 @@ logger = logging.getLogger(__name__)
 # farthest point determines the scale of the scene. Beyond the second multiple, they are errors of the reconstruction.
 FARTHEST, FARTHEST_USED = 5.0, 100_000
 FEWEST_HELD_OUT = 2
+TRANSFORMS = ("transforms.json", "transforms_train.json")  # the second is NeRF's (synthetic)
+# Of COLMAP, nerfstudio, and COLMAP's undistorter.
+MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "dense/*/sparse", "dense/sparse")
 Members = Callable[[int], list[int]]
 
 
@@ -51,21 +54,34 @@ def members(hold_out: int, held_out: bool, frames: int) -> list[int]:
 
 
 def read_capture(folder: Path) -> Capture | None:
-    """Read the capture in a folder: `transforms.json`, or `sparse/0` or `sparse` with `images` and perhaps `masks`.
+    """Read the capture in a folder: `TRANSFORMS`, Polycam's `keyframes`, or the largest model of COLMAP in `MODELS`.
 
-    `folder` may also be a JSON file, such as `transforms_train.json` of NeRF.
+    A model has its `images`, and perhaps `masks`, beside it or in a folder above. `folder` may also be a JSON file.
 
     Returns:
         The capture, or None if the folder has none.
     """
-    transforms = folder if folder.suffix == ".json" else folder / "transforms.json"
-    if transforms.is_file():
-        return read_transforms(transforms)
-    for model in (folder / "sparse/0", folder / "sparse"):
-        if any((model / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            masks = folder / "masks"
-            return read_colmap(model, folder / "images", masks if masks.is_dir() else None)
-    return None
+    for transforms in (folder / name for name in TRANSFORMS) if folder.suffix != ".json" else (folder,):
+        if transforms.is_file():
+            return read_transforms(transforms)
+    if (folder / "keyframes/cameras").is_dir() or (folder / "keyframes/corrected_cameras").is_dir():
+        return read_polycam(folder / "keyframes")
+    groups = ([path for path in sorted(folder.glob(pattern)) if is_model(path)] for pattern in MODELS)
+    if not (found := [models for models in groups if models]):
+        return None
+    models = next((models for models in found if _images(models[0], folder).is_dir()), found[0])
+    model = max(models, key=image_count) if len(models) > 1 else models[0]
+    if len(models) > 1:
+        logger.warning("%s: the largest of %d models, with %d images", model, len(models), image_count(model))
+    images = _images(model, folder)
+    masks = images.with_name("masks")
+    return read_colmap(model, images, masks if masks.is_dir() else None)
+
+
+def _images(model: Path, folder: Path) -> Path:
+    """Return the folder `images` beside a model, or in a folder above it, but not above `folder`."""
+    above = [parent / "images" for parent in model.parents if parent.is_relative_to(folder)]
+    return next((images for images in above if images.is_dir()), folder / "images")
 
 
 class CaptureSource(SequenceSource):

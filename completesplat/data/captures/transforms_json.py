@@ -41,6 +41,7 @@ OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
 Entry = Mapping[str, object]
 FEWEST_CAMERAS = 2
 SAME_FOCAL = 1e-3
+POLYCAM = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # NeRF (synthetic) leaves the suffix out.
 
 
@@ -60,7 +61,8 @@ def read_transforms(path: Path) -> Capture:
     Raises:
         DataError: something is missing, malformed or impossible; the error names the file and the frame's number.
     """
-    frames, content = _read_frames(path)
+    content = read_json(path, allow_nan=True)  # NaN is refused later, with the number of its frame.
+    frames = _read_frames(path, content)
     with at(path):
         ordered = in_order(frames)
         if content.get("ply_file_path") is None:
@@ -68,6 +70,26 @@ def read_transforms(path: Path) -> Capture:
         cloud = inside(path.parent, field(content, "ply_file_path", str))
         points = read_points(cloud)
     return Capture((path, cloud), ordered, points if len(points) else None)
+
+
+def read_polycam(keyframes: Path) -> Capture:
+    """Read the images and cameras, one file for each, of Polycam's raw data, corrected by Polycam or else by the phone.
+
+    `t_00` to `t_23` are the rows of `transform_matrix` (nerfstudio, `process_data/polycam_utils.py`).
+
+    Raises:
+        DataError: as in `read_transforms`.
+    """
+    kind = "corrected_" if (keyframes / "corrected_cameras").is_dir() else ""
+    files, entries = sorted((keyframes / f"{kind}cameras").glob("*.json")), []
+    for file in files:
+        camera = read_json(file, allow_nan=True)
+        with at(file):
+            rows = [[field(camera, f"t_{row}{column}", float) for column in range(4)] for row in range(3)]
+        values = {name: camera.get(key) for name, key in POLYCAM.items()}
+        entries.append({**values, "file_path": f"{kind}images/{file.stem}", "transform_matrix": [*rows, [0, 0, 0, 1]]})
+    frames = _read_frames(keyframes / f"{kind}cameras", {"frames": entries})
+    return Capture(tuple(files), in_order(frames), None)
 
 
 def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
@@ -80,7 +102,7 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
         DataError: as in `read_transforms`, but few frames suffice; or a photo is turned by EXIF or has another size.
         CompleteSplatError: a photo is not in the file.
     """
-    frames = {frame.image.resolve(): frame for frame in _read_frames(path)[0]}
+    frames = {frame.image.resolve(): frame for frame in _read_frames(path, read_json(path, allow_nan=True))}
     squares, cameras = [], []
     for image in images:
         frame = frames.get(image.resolve())
@@ -129,9 +151,8 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
     return cameras
 
 
-def _read_frames(path: Path) -> tuple[list[CapturedFrame], Entry]:
-    """Return all frames that have images, and the file's content."""
-    content = read_json(path, allow_nan=True)  # NaN is refused later, with the number of its frame.
+def _read_frames(path: Path, content: Entry) -> list[CapturedFrame]:
+    """Return all frames of a file's content that have images."""
     root, frames, missing = path.parent, [], []
     with at(path):
         entries = field(content, "frames", list)
@@ -151,7 +172,7 @@ def _read_frames(path: Path) -> tuple[list[CapturedFrame], Entry]:
                 sized = {"w", "h"} <= values.keys()
                 frames.append(fitted(frame) if sized else replace(frame, orientation="unknown"))
     warn_of_missing(path, missing, len(entries))
-    return frames, content
+    return frames
 
 
 def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
