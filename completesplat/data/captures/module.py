@@ -192,11 +192,14 @@ class CaptureDataModule(ObjectDataModule):
 
     def open(self, split: str) -> Mapping[str, CaptureSource]:
         """Read the cameras of all captures; the error of one capture is only raised if no other can be read."""
+        for left in (self.root.with_name(f".{self.root.name}.unfinished"), *self.root.glob(".*.unfinished")):
+            if left.is_dir():
+                logger.warning("%s: left by an import that was interrupted: start it again", left)
         if not self.root.exists():
             raise MissingFile("no such file or folder", str(self.root))
         captures: dict[str, Capture] = {}
         refused: list[DataError] = []
-        folders = [self.root, *sorted(path for path in self.root.glob("*/") if path.is_dir())]
+        folders = [self.root, *sorted(path for path in self.root.glob("[!.]*/") if path.is_dir())]
         for folder in folders:
             name = folder.resolve().name or "capture"
             with refused_to(refused.append), at(sequence=name):
