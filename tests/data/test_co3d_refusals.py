@@ -249,3 +249,20 @@ def module(root: Path, policy: str, **settings: Any) -> CO3DDataModule:
     """Small images, one scene in a batch that shows all frames, and no limit on what is skipped."""
     defaults = {"image_size": 8, "batch_size": 1, "targets": 3, "subset": SUBSET}
     return CO3DDataModule(str(root), CATEGORY, **{**defaults, "on_bad": policy, "max_bad_fraction": 10.0, **settings})
+
+
+def test_a_partial_download_is_refused_at_once_with_the_setting_that_uses_what_is_there(category):
+    for name in "bc":
+        shutil.rmtree(category / name)
+    given = str(category.parent), CATEGORY
+    with pytest.raises(DataError) as caught:
+        CO3DDataModule(*given, batch_size=1).setup("fit")
+    message = f"{category}: 2 of 4 sequences have no images, as after a partial download; "
+    assert str(caught.value) == message + "data.max_bad_fraction=1 uses the others"
+    data = CO3DDataModule(*given, batch_size=1, max_bad_fraction=1.0, image_size=16)
+    data.setup("test")
+    source = data.source("train")
+    assert (source.names, source.left_out) == (["a"], {"not downloaded": ["b"]})
+    assert [batch.names for batch in data.train_dataloader()] == [("a",)]
+    with pytest.raises(DataError, match="2 of 4 sequences have no images"):
+        CO3DDataModule(*given, on_bad="raise").source("test")
