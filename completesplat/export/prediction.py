@@ -104,16 +104,15 @@ class FileUnits:
 
     def stored(self, scene: Gaussians, camera: Cameras) -> tuple[Gaussians, Cameras]:
         """Return a scene and a camera of the world in the files' units."""
-        shift, moved = self.points(torch.zeros(1, 3)).to(scene.means), torch.eye(4).to(camera.intrinsics)
-        moved[:3, 3] = -shift[0].to(moved)
+        moved = torch.eye(4).to(camera.intrinsics)
+        moved[:3, 3] = -self.points(torch.zeros(3))
         camera = camera.scale_world(torch.tensor(1 / self.scale).to(moved))
         scene = replace(scene, means=self.points(scene.means), scales=scene.scales / self.scale)
         return scene, replace(camera, world_to_camera=camera.world_to_camera @ moved)
 
     def points(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
         """Return points of the world in the files' units."""
-        shift = torch.tensor(self.origin, dtype=torch.float64) - torch.tensor(self.offset, dtype=torch.float64)
-        return points / self.scale + shift.to(points)
+        return points / self.scale + torch.tensor(self.origin).sub(torch.tensor(self.offset)).to(points)
 
 
 def write_prediction(

@@ -103,7 +103,7 @@ def test_views_that_clips_lack_are_refused_before_training_and_by_the_check(root
     assert (found.sequences, found.frames) == (2, 16)
     lacking = "test2, frame 8: the frame is in the evaluation index, not in the data"
     assert [str(error) for error in found.refused] == [lacking, lacking.replace("test2", "test3")]
-    with pytest.raises(DataError, match="2 of 4 items cannot be read.*test3, frame 8: the frame is in the evaluation"):
+    with pytest.raises(DataError, match=r"2 of 4 items cannot be read.*test3, frame 8: the frame is in the evaluation"):
         data.check_test()
     index["test2"] = PAIR  # one that is skipped is reported by the test
     data_of(root, index, tmp_path).check_test()

@@ -105,9 +105,8 @@ class CapturedFrame:
             DataError: a file is missing, unusable or of another aspect, or its EXIF orientation leaves two images.
         """
         with at(self.image, frame=self.number):
-            self.check()
+            orientation, mask = self.check(), None
             with refused_as_bad(str(self.image)), opened(self.image, FORMATS) as stored:
-                orientation, mask = self._turn(stored), None
                 check_sums(stored, self.image)
                 stored.load()
                 if stored.has_transparency_data and stored.mode in EIGHT_BIT_MODES:
@@ -120,36 +119,32 @@ class CapturedFrame:
             image = undistort(image, self.lens)
             return image, Image.new("L", image.size, 255) if mask is None else undistort(mask, self.lens)
 
-    def check(self) -> None:
-        """Check the headers of the image and of its mask; errors as in `read`."""
-        with at(require_file(self.image), frame=self.number):
-            with refused_as_bad(str(self.image)), opened(self.image, FORMATS) as image:
-                self._turn(image)
-            if self.mask is not None and not _same_aspect(
-                size := stored_size(self.mask, str(self.mask)), self.lens.image_size
-            ):
-                raise BadImage(
-                    "has {} x {} pixels, its image {} x {}".format(*size, *self.lens.image_size), str(self.mask)
-                )
+    def check(self) -> object:
+        """Check the headers of image and mask, with the errors of `read`.
 
-    def _turn(self, image: Image.Image) -> object:
-        """Return the EXIF orientation by which an opened image is turned, None for the pixels as they are stored."""
-        orientation, (height, width) = read_exif(image).get(ORIENTATION), self.lens.image_size
-        stored, upright = image.size == (width, height), image.size == (height, width) and orientation in SIDEWAYS
-        if not stored and not upright:
-            raise ImageError(
-                f"has {image.height} x {image.width} pixels, its camera {height} x {width}: "
-                "give the photos that the cameras were computed for, of any size"
-            )
-        either = upright or orientation not in SIDEWAYS or self.orientation == "unknown"
-        # Decoding turns a TIFF.
-        unclear = image.format == "TIFF" or (stored and either and self.orientation != "ignored")
-        if orientation in TRANSPOSITIONS and unclear:
-            raise ImageError(
-                f"is to be turned (EXIF orientation {orientation}), and its camera may be that of the pixels as they are "
-                "stored: save the pixels as the camera sees them, without that tag"
-            )
-        return orientation if orientation in TRANSPOSITIONS and not stored else None
+        Returns:
+            The EXIF orientation by which the image is to be turned; None: its pixels stay as they are stored.
+        """
+        height, width = self.lens.image_size
+        with at(require_file(self.image), frame=self.number):
+            if self.mask is not None and not _same_aspect(
+                size := stored_size(self.mask, str(self.mask)), (height, width)
+            ):
+                raise BadImage(f"has {size[0]} x {size[1]} pixels, its image {height} x {width}", str(self.mask))
+            with refused_as_bad(str(self.image)), opened(self.image, FORMATS) as image:
+                orientation = read_exif(image).get(ORIENTATION)
+                as_stored, sideways = image.size == (width, height), orientation in SIDEWAYS
+                as_upright = image.size == (height, width) if sideways else as_stored
+                if not as_stored and not as_upright:
+                    size = f"has {image.height} x {image.width} pixels, its camera {height} x {width}"
+                    raise ImageError(f"{size}: give the photos that the cameras were computed for, of any size")
+                if orientation not in TRANSPOSITIONS:
+                    return None
+                unclear = as_stored and (as_upright or self.orientation == "unknown") and self.orientation != "ignored"
+                if unclear or image.format == "TIFF":  # decoding turns a TIFF
+                    turned = f"is to be turned (EXIF orientation {orientation}), its camera's pose perhaps not"
+                    raise ImageError(f"{turned}: save the pixels as the pose sees them, without that tag")
+                return None if as_stored else orientation
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ leave_out = partial(logger.warning, "left out: %s")
 MOST_FEATURES = 4096  # of an image; the time of matching grows with their square
 MOST_WITH_ALL_PAIRS = 100  # photos; of more, as of a video, neighbours are matched
 NEAR = 10  # frames
-UNREADABLE = (".heic", ".heif", ".hif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 
 
 def import_capture(
@@ -82,30 +81,27 @@ def _copy_photos(folder: Path, images: Path) -> None:
     If there are none in the folder itself, those in folders below it are taken, each the photos of one camera.
     """
     formats = _photo_formats()
-    suffixes = {suffix: kind in formats for suffix, kind in Image.registered_extensions().items()}
-    readable = {**dict.fromkeys(UNREADABLE, False), **suffixes}
-    found = (
-        sorted(path for path in folder.glob(p) if path.suffix.lower() in readable) for p in ("[!.]*", "[!.]*/[!.]*")
-    )
-    found_photos = next(filter(None, found), [])
-    photos = [path for path in found_photos if readable[path.suffix.lower()]]
-    if skipped := [path.name for path in found_photos if path not in photos]:
-        advice = "" if "HEIF" in formats else "; HEIC photos are read after: pip install pillow-heif"
-        logger.warning("left out: %d files of other formats: %s%s", len(skipped), shortened(skipped), advice)
+    suffixes = {suffix for suffix, kind in Image.registered_extensions().items() if kind in formats}
+    levels = [sorted(filter(Path.is_file, folder.glob(level))) for level in ("[!.]*", "[!.]*/[!.]*")]
+    photos = [[path for path in files if path.suffix.lower() in suffixes] for files in levels]
+    level = int(not photos[0] and bool(photos[1] or not levels[0]))
+    if others := sorted({path.name for path in levels[level]} - {path.name for path in photos[level]}):
+        advice = "" if "HEIF" in formats else '; HEIC needs: pip install "completesplat[heic]"'
+        logger.warning("left out: %d files of other formats: %s%s", len(others), shortened(others), advice)
     # COLMAP lists pairs with a space between.
-    folders = sorted({photo.parent for photo in photos} - {folder})
+    folders = sorted({photo.parent for photo in photos[level]})
     names = dict(zip(folders, folder_names("_".join(path.name.split()) for path in folders), strict=True))
-    stems = folder_names("_".join(path.stem.split()) for path in photos)
-    for photo, stem in track(list(zip(photos, stems, strict=True)), "photos"):
+    stems = folder_names("_".join(path.stem.split()) for path in photos[level])
+    for photo, stem in track(list(zip(photos[level], stems, strict=True)), "photos"):
         with refused_to(leave_out), refused_as_bad(str(photo)):
             with opened(photo, formats) as image:
                 check_sums(image, photo)
                 upright = ImageOps.exif_transpose(image)
             options = {"quality": 95, "subsampling": 0, "exif": upright.info.get("exif", b"")}
-            (place := images / names.get(photo.parent, "")).mkdir(exist_ok=True)
-            save_image(
-                upright, place / f"{stem}{'.jpg' if image.format == 'HEIF' else photo.suffix.lower()}", **options
-            )
+            place = images / names[photo.parent] if level else images
+            place.mkdir(exist_ok=True)
+            suffix = ".jpg" if image.format == "HEIF" else photo.suffix.lower()
+            save_image(upright, place / f"{stem}{suffix}", **options)
 
 
 def _photo_formats() -> tuple[str, ...]:
@@ -140,7 +136,7 @@ def image_pairs(images: int, sequential: bool) -> list[tuple[int, int]]:
 
 
 def _find_cameras(folder: Path, names: list[str], sequential: bool, max_image_size: int) -> set[str]:
-    """Write COLMAP's largest model as `folder`/sparse/0; return its images. Images of one folder and size share a lens."""
+    """Write COLMAP's largest model as `folder`/sparse/0; return its images. Those of a folder and size share a lens."""
     pycolmap = import_pycolmap()
     images, database, pairs, at_a_time = folder / "images", folder / "db", folder / "pairs", os.cpu_count() or 1
     pycolmap.Database.open(database).close()

@@ -188,7 +188,7 @@ class RE10KDataModule(SceneDataModule):
         return chosen
 
     def check_test(self) -> None:
-        """Read the cameras of all clips of an evaluation index (chunks as a whole), because clips may lack its frames."""
+        """Read all clips of an evaluation index, chunks as a whole, because clips may lack its frames."""
         if self.index is not None:
             loader, refused = self.test_dataloader(), list[DataError]()
             for name in loader.dataset.names:

@@ -165,7 +165,7 @@ def field(entry: object, key: str, kind: type[T]) -> T:
 
 
 def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert numbers from JSON to a float64 array, and refuse other types, another shape, and what is not finite in float32."""
+    """Convert numbers from JSON to float64; refuse other types, another shape, and what is not finite in float32."""
     try:
         array = np.array(value)
     except ValueError:  # Lists of unequal length.
