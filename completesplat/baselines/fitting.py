@@ -99,7 +99,9 @@ def gaussians_at_points(points: Float[Tensor, "gaussian 3"], views: Views, opaci
     Colours are means over the views [view] that contain the point, whether it is seen or hidden there.
     """
     parts = torch.split(points, 500)
-    nearest = [torch.cdist(part, points).topk(NEIGHBOURS + 1, largest=False).values[:, 1:] for part in parts]
+    exact = "donot_use_mm_for_euclid_dist"  # the default cancels far from the origin
+    distances = (torch.cdist(part, points, compute_mode=exact) for part in parts)
+    nearest = [part.topk(NEIGHBOURS + 1, largest=False).values[:, 1:] for part in distances]
     pixels, depth = project(views.cameras, points.expand(len(views.images), -1, -1))
     grid = 2 * pixels / pixels.new_tensor(views.cameras.image_size[::-1]) - 1
     inside = ((depth > 0) & (grid.abs() < 1).all(-1))[..., None]

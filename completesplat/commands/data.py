@@ -21,7 +21,8 @@ def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> Non
     from completesplat.data.validation import audit
 
     try:
-        findings = audit.check(_sources(data, splits), workers, splits_share_sequences=data.splits_share_sequences)
+        sources = {split: data.evaluated(split, source) for split, source in _sources(data, splits).items()}
+        findings = audit.check(sources, workers, splits_share_sequences=data.splits_share_sequences)
     except DataError as error:  # concerns the data set as a whole
         findings = audit.Findings(0, 0, [error], {}, {})
     findings.write(out / "check.json")

@@ -80,6 +80,8 @@ def run(config: DictConfig, out: Path) -> None:
     )
     trainer = build(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
+    if tested is not None:
+        tested.check_test()
     if trainer.is_global_zero:
         print(ModelSummary(module, max_depth=2))
         logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, share)

@@ -35,6 +35,7 @@ class PosedSequence:
             DataError if it cannot be read; None: there is no depth.
         points: points of a reconstruction in the cameras' world and units, if the data set has them.
         scale: units of the cameras in one unit of the data set's own files, where it is known.
+        origin: the cameras' origin in the coordinates and units of these files.
     """
 
     name: str
@@ -45,6 +46,7 @@ class PosedSequence:
     read_depth: Callable[[int], Float[Tensor, "1 size size"]] | None = None
     points: Float[Tensor, "n 3"] | None = None
     scale: float = 1.0
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 @runtime_checkable

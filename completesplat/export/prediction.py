@@ -1,6 +1,8 @@
 """All files of one prediction: splats, videos, a contact sheet, maps and a description."""
 
 import json
+import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,13 +37,17 @@ from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.geometry.trajectories import PATHS
 from completesplat.rasterizers import Rasterizer
 
+logger = logging.getLogger(__name__)
+
 DIRECTIONS = 8
+FARTHEST = 1000.0  # scene radii from the origin, about, where float32 is still finer than a hundredth of a pixel
 CONVENTIONS = {
     "axes": "OpenCV's for cameras: +x right, +y down, +z forward; world_to_camera gives the world's",
     "world_to_camera": "4 x 4, rows first; maps homogeneous world points (as columns) to camera points",
     "intrinsics": "3 x 3, rows first, in pixels; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)",
     "image_size": "(height, width) in pixels",
     "units": "the data set's or model's own scale; not metres",
+    "offset": "if settings have one: add it to all positions, in float64, for the capture's own coordinates",
     "quaternions": "(w, x, y, z), unit length",
     "colors": "sRGB, 0 to 1, the same from every direction",
 }
@@ -77,6 +83,36 @@ class Wanted:
                     raise CompleteSplatError(f"{name}={kind}: choose from {', '.join(known)}")
         if "mesh" in self.formats:
             check_available()
+
+
+@dataclass(frozen=True)
+class FileUnits:
+    """Units and origin of files.
+
+    Attributes:
+        scale: units of the world in one unit of the files.
+        origin: the world's origin in the user's coordinates, which the files have too, unless they are too far away.
+    """
+
+    scale: float = 1.0
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @property
+    def offset(self) -> tuple[float, ...]:
+        """The files' origin in the user's coordinates: 0 unless float32 would be too coarse for these."""
+        return self.origin if math.hypot(*self.origin) * self.scale > FARTHEST else (0.0, 0.0, 0.0)
+
+    def stored(self, scene: Gaussians, camera: Cameras) -> tuple[Gaussians, Cameras]:
+        """Return a scene and a camera of the world in the files' units."""
+        moved = torch.eye(4).to(camera.intrinsics)
+        moved[:3, 3] = -self.points(torch.zeros(3))
+        camera = camera.scale_world(torch.tensor(1 / self.scale).to(moved))
+        scene = replace(scene, means=self.points(scene.means), scales=scene.scales / self.scale)
+        return scene, replace(camera, world_to_camera=camera.world_to_camera @ moved)
+
+    def points(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Return points of the world in the files' units."""
+        return points / self.scale + torch.tensor(self.origin).sub(torch.tensor(self.offset)).to(points)
 
 
 def write_prediction(
@@ -138,7 +174,7 @@ def write_fitted_scene(
     images: Frames,
     truth: Frames,
     seed: int,
-    scale: float = 1.0,
+    units: FileUnits = FileUnits(),
     up: Sequence[float] = (0.0, -1.0, 0.0),
     more: Mapping[str, str] | None = None,
 ) -> None:
@@ -148,7 +184,7 @@ def write_fitted_scene(
         title: heading of the sheet; says what the scene was fitted to.
         scene: in the world of the cameras.
         images, truth: rendered and true images of the cameras.
-        scale: units of the world in one unit of the files.
+        units: of the files; an offset is recorded in `scene.json`, and a line says so.
         up: direction up in the world.
         more: other files of the scene by purpose, for `scene.json`.
 
@@ -157,7 +193,7 @@ def write_fitted_scene(
     """
     from completesplat.metrics.images import psnr  # `predict` needs no metrics
 
-    stored, reference = in_units(with_screen_space_dilation(cleaned(scene, name), cameras[0]), cameras[0], scale)
+    stored, reference = units.stored(with_screen_space_dilation(cleaned(scene, name), cameras[0]), cameras[0])
     write_ply(folder / "scene.ply", stored, [f"scene {name}"])
     indices = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
     rows = [strip(truth[indices].clamp(0, 1), "true"), strip(images[indices].clamp(0, 1), "fitted")]
@@ -165,6 +201,10 @@ def write_fitted_scene(
     headings = [f"view {i}: {score:.2f} dB" for i, score in zip(indices, scores, strict=True)]
     write_png(folder / "sheet.png", image_sheet(headings, rows, title))
     settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True, "up": list(up)}
+    if any(units.offset):
+        settings["offset"] = list(units.offset)
+        place = ", ".join(f"{coordinate:g}" for coordinate in units.offset)
+        logger.warning("%s: too far from its origin for float32: add offset (%s) of scene.json", name, place)
     files = {"scene": "scene.ply", "sheet": "sheet.png", **(more or {})}
     write_scene_json(folder / "scene.json", reference, settings, seed, files)
 
@@ -179,17 +219,17 @@ def write_scene(
     up: Float[Tensor, "3"],
     wanted: Wanted,
     comments: Sequence[str],
-    scale: float = 1.0,
+    units: FileUnits = FileUnits(),
 ) -> tuple[Frames, Float[Tensor, "1 height width"], dict[str, str]]:
-    """Write a scene's splats (`NAME.ply`, ...), with `scale` units of its world as one, and videos (`orbitSUFFIX.mp4`).
+    """Write a scene's splats (`NAME.ply`, ...) in the units of files, and videos (`orbitSUFFIX.mp4`).
 
     Returns:
         Views around the scene, the first view's depth, and file names by purpose.
     """
     pivot = seen_center(rasterizer, scene, reference)
     dilated = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
-    stored, camera = in_units(dilated, reference, scale)
-    view = PageView(camera, pivot / scale, up, wanted.background)
+    stored, camera = units.stored(dilated, reference)
+    view = PageView(camera, units.points(pivot), up, wanted.background)
     files = write_formats(folder, name, stored, wanted.formats, view, wanted.converter, comments, rasterizer)
     for kind in wanted.videos:
         files[f"{kind}{suffix}"] = f"{kind}{suffix}.mp4"
@@ -198,12 +238,6 @@ def write_scene(
         write_video(folder / f"{kind}{suffix}.mp4", frames)
     views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
     return views, depths[0], files
-
-
-def in_units(scene: Gaussians, camera: Cameras, scale: float) -> tuple[Gaussians, Cameras]:
-    """Return a scene and a camera in a unit of `scale` units of their world."""
-    factor = torch.tensor(1 / scale).to(camera.intrinsics)
-    return replace(scene, means=scene.means / scale, scales=scene.scales / scale), camera.scale_world(factor)
 
 
 @torch.no_grad()

@@ -29,7 +29,7 @@ from completesplat.data.packed.manifest import is_packed
 from completesplat.data.sequences import PosedSequence, shortened
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED
-from completesplat.export.prediction import Wanted, write_fitted_scene, write_scene
+from completesplat.export.prediction import FileUnits, Wanted, write_fitted_scene, write_scene
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -74,8 +74,7 @@ class CaptureFit(Stage):
     """Gaussians of one capture, fitted to its training frames (Kerbl et al. 2023; Kheradmand et al. 2024).
 
     All parameters have rows for `most` Gaussians, of which the first `count` are used, so that checkpoints and the
-    optimizer's state keep their shapes while the number of Gaussians grows. They are in the capture's world, in the
-    data module's units.
+    optimizer's state keep their shapes while the number of Gaussians grows. They are in the data module's world.
 
     Args:
         scene_folder: folder of the result in the capture's own world and units, by `write_fitted_scene` and
@@ -208,13 +207,13 @@ class CaptureFit(Stage):
         self.scene_folder.mkdir(parents=True, exist_ok=True)
         write = partial(write_scene, self.scene_folder, "scene", "", scene, placed[0], self.rasterizer, up)
         parts = [replace(wanted, formats=()), *(replace(wanted, formats=[kind], videos=()) for kind in wanted.formats)]
-        files: dict[str, str] = {}
+        files, units = dict[str, str](), FileUnits(sequence.scale, sequence.origin)
         for part in parts:
             try:
                 converter = find_splat_transform() if set(part.formats) & set(CONVERTED) else None
-                files |= write(replace(part, converter=converter), [f"scene {name}"], sequence.scale)[-1]
+                files |= write(replace(part, converter=converter), [f"scene {name}"], units)[-1]
             except CompleteSplatError as error:
                 logger.warning("left out: %s", error)
         title = f"{name}: held-out photos, Gaussians fitted to the {len(self.sequence('train').frames)} others"
         shown = scene, placed, images[0], truth.images, self.evaluation.scene_seed(name)
-        write_fitted_scene(self.scene_folder, name, title, *shown, sequence.scale, up.tolist(), files)
+        write_fitted_scene(self.scene_folder, name, title, *shown, units, up.tolist(), files)

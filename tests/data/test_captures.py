@@ -126,14 +126,14 @@ def write_model(folder: Path, model: str, binary: bool = True) -> Path:
 
 def reprojection_errors(folder: Path, kind: str = "image", size: int = SQUARE) -> np.ndarray:
     """Distances in pixels between projections by the cameras and the blobs in the images or masks, in both splits."""
-    data, errors, eyes = CaptureDataModule(str(folder), image_size=size), [], opengl_poses()[:, :3, 3]
+    data, errors = CaptureDataModule(str(folder), image_size=size), list[float]()
     for split, frames in {"train": (1, 2, 3, 5, 6, 7), "test": (0, 4)}.items():
         (name,) = data.source(split).names
         sequence = data.source(split).read(name)
         assert sequence.frames == frames
-        factor = sequence.cameras.centers[0].norm().item() / np.linalg.norm(eyes[frames[0]])
+        points = sequence.scale * (POINTS - sequence.origin)
         for index in range(len(frames)):
-            projected = project(sequence.cameras[index], torch.from_numpy(factor * POINTS))[0].numpy()
+            projected = project(sequence.cameras[index], torch.from_numpy(points))[0].numpy()
             pixels = getattr(sequence.read(index), kind)[0].numpy().astype(float)
             for number, (u, v) in enumerate(projected):
                 distances = np.abs(np.delete(projected, number, axis=0) - [u, v]).max(axis=1)
@@ -178,9 +178,8 @@ def test_the_object_fills_its_half_size_and_stray_points_are_left_out(tmp_path):
 
     write_transforms(tmp_path, change=add_points)
     sequence = CaptureDataModule(str(tmp_path / "transforms.json")).source("train").read("transforms.json")
-    factor = sequence.cameras.centers[0].norm().item() / np.linalg.norm(opengl_poses()[1, :3, 3])
     extent = np.abs(POINTS - POINTS.mean(axis=0)).max()
-    assert factor == pytest.approx(0.57 / extent, rel=0.3)  # Its axes are turned.
+    assert sequence.scale == pytest.approx(0.57 / extent, rel=0.3)  # Its axes are turned.
 
 
 def test_the_field_of_view_gives_the_same_cameras_as_the_focal_length(tmp_path, caplog):
@@ -401,7 +400,7 @@ def test_a_bad_image_is_refused(tmp_path, damage, message):
         sequence.read(3)
 
 
-@pytest.mark.parametrize("k1", [-4.0, -1.0, 4.0, 1e300])
+@pytest.mark.parametrize("k1", [-4.0, -1.0, 4.0, 1e15])
 def test_distortion_that_leaves_no_image_is_refused(tmp_path, k1):
     write_transforms(tmp_path, change=lambda content: content.update(k1=k1))
     with pytest.raises(BadCamera, match=r"r_0\.png, .*, frame 0: distortion .* leaves no usable image"):

@@ -17,6 +17,7 @@ from completesplat.data.validation import (
     finite_array,
     inside,
     read_json,
+    read_text,
     require_rotation,
 )
 
@@ -63,6 +64,8 @@ def test_good_files_are_read_and_missing_ones_refused(tmp_path):
     (tmp_path / "a.json").write_bytes(TEXT)
     (tmp_path / "a.jgz").write_bytes(gzip.compress(TEXT[:100]) + gzip.compress(TEXT[100:]))
     assert read_json(tmp_path / "a.json") == read_json(tmp_path / "a.jgz") == CONTENT
+    (tmp_path / "mark.json").write_bytes(b"\xef\xbb\xbf" + TEXT)
+    assert read_json(tmp_path / "mark.json") == json.loads(read_text(tmp_path / "mark.json")) == CONTENT
     (tmp_path / "nan.json").write_text("[NaN]")
     assert np.isnan(read_json(tmp_path / "nan.json", allow_nan=True)[0])
     for path in (tmp_path / "b.json", tmp_path / "b.jgz", tmp_path):
@@ -71,11 +74,27 @@ def test_good_files_are_read_and_missing_ones_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "relative", ["../a", "a/../../b", "/a", "C:/a", "\\\\server\\a", "a\\..\\b", "file:///a", "a\0", "", "."]
+    "relative", ["../a", "a/../../b", "/a", "C:/a", "\\\\server\\a", "..\\b", "a\\..\\b", "file:///a", "a\0", "", "."]
 )
 def test_paths_that_are_not_plainly_below_the_root_are_refused(tmp_path, relative):
     with pytest.raises(OutsidePath):
         inside(tmp_path, relative)
+
+
+def test_backslashes_are_separators_and_absolute_paths_may_lead_inside(tmp_path: Path, monkeypatch):
+    (tmp_path / "link").symlink_to(tmp_path / "root")
+    (tmp_path / "root/a").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    for root in (tmp_path / "root", tmp_path / "link", Path("link")):
+        assert inside(root, "a\\b.png") == root / "a/b.png"
+        for absolute in ("root/a/b.png", "link/a/b.png"):
+            assert inside(root, str(tmp_path / absolute)) == root / "a/b.png"
+    for elsewhere in ("/home/somebody/a.png", "C:\\Users\\somebody\\a.png", "D:/a.png"):
+        with pytest.raises(OutsidePath, match="another machine; make it relative to link"):
+            inside(Path("link"), elsewhere)
+    (tmp_path / "b.png").touch()
+    with pytest.raises(OutsidePath, match="outside of link"):
+        inside(Path("link"), str(tmp_path / "b.png"))
 
 
 def test_links_must_not_leave_the_root_which_may_be_a_link(tmp_path: Path):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET, change, depth_bits, write_tree
+from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SIZE, SUBSET, change, depth_bits, write_tree
 from PIL import Image
 
 from completesplat.data.co3d.module import CO3DDataModule
@@ -86,6 +86,7 @@ R, FOCAL, CENTER = ((CAMERA, key) for key in ("R", "focal_length", "principal_po
         (R, turned(0.3, 1.001), BadCamera, "R is not orthonormal"),
         (R, turned(0.3, -1.0), BadCamera, "R is a reflection"),
         (R, turned(0.3, NAN), BadAnnotation, "R is not finite"),
+        ((CAMERA, "T"), [0.0, 1e200, 4.0], BadAnnotation, "T is not finite in float32"),
         (FOCAL, [0, 2], BadCamera, "focal_length must be positive"),
         (CENTER, [0, 1.2], BadCamera, "lies outside of the 32 x 24 image"),
         ((CAMERA, "intrinsics_format"), "screen", BadAnnotation, "unknown intrinsics format 'screen'"),
@@ -176,7 +177,17 @@ def test_images_behind_links_that_leave_the_root_are_refused(category, tmp_path)
     folder.symlink_to(tmp_path / "elsewhere")
     refused = read(category).refused
     assert [place(error) for error in refused] == [(OutsidePath, str(category / FRAMES), "a", n) for n in range(4)]
-    assert all("a link leads outside" in error.reason for error in refused)
+    assert all("leads outside" in error.reason for error in refused)
+
+
+def test_black_images_and_masks_without_an_object_are_unusable(category):
+    black, unmasked = category / "a/images/frame000002.png", category / "b/masks/frame000004.png"
+    Image.new("RGB", SIZE[::-1]).save(black)
+    Image.new("L", SIZE[::-1]).save(unmasked)
+    findings = check(CO3DDataModule(str(category.parent), CATEGORY, image_size=16).open("train"), 1, progress=False)
+    expected = [(BadImage, str(black), "a", 1), (BadImage, str(unmasked), "b", 3)]
+    assert [place(error) for error in findings.refused] == expected
+    assert findings.frames == 16 - 2
 
 
 def test_what_nobody_reads_may_be_broken(category):
@@ -238,3 +249,20 @@ def module(root: Path, policy: str, **settings: Any) -> CO3DDataModule:
     """Small images, one scene in a batch that shows all frames, and no limit on what is skipped."""
     defaults = {"image_size": 8, "batch_size": 1, "targets": 3, "subset": SUBSET}
     return CO3DDataModule(str(root), CATEGORY, **{**defaults, "on_bad": policy, "max_bad_fraction": 10.0, **settings})
+
+
+def test_a_partial_download_is_refused_at_once_with_the_setting_that_uses_what_is_there(category):
+    for name in "bc":
+        shutil.rmtree(category / name)
+    given = str(category.parent), CATEGORY
+    with pytest.raises(DataError) as caught:
+        CO3DDataModule(*given, batch_size=1).setup("fit")
+    message = f"{category}: 2 of 4 sequences have no images, as after a partial download; "
+    assert str(caught.value) == message + "data.max_bad_fraction=1 uses the others"
+    data = CO3DDataModule(*given, batch_size=1, max_bad_fraction=1.0, image_size=16)
+    data.setup("test")
+    source = data.source("train")
+    assert (source.names, source.left_out) == (["a"], {"not downloaded": ["b"]})
+    assert [batch.names for batch in data.train_dataloader()] == [("a",)]
+    with pytest.raises(DataError, match="2 of 4 sequences have no images"):
+        CO3DDataModule(*given, on_bad="raise").source("test")

@@ -1,15 +1,17 @@
 """Import of captures: cameras by COLMAP against those that the photos were drawn with, and what is refused."""
 
 import errno
+import io
 import logging
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFile
 from support import write_capture
 
 from completesplat.data.captures import importing
@@ -116,7 +118,8 @@ def test_photos_become_upright_keep_their_focal_length_and_the_unreadable_are_na
         assert upper > 250 > 5 > lower
         assert image.getexif().get(274) is None
         assert copy.suffix == ".tiff" or image.getexif().get_ifd(0x8769)[41989] == 28
-    assert caplog.text.count("left out: ") == 1
+    assert caplog.text.count("left out: ") == 2
+    assert "left out: 1 files of other formats: notes.txt" in caplog.text
     assert f"left out: {tmp_path / 'cut.jpg'}: cannot be decoded" in caplog.text
 
     def full(*_, **__):
@@ -186,3 +189,83 @@ def test_pycolmap_leaves_the_signal_that_ends_a_program_to_the_program():
         "os.kill(os.getpid(), signal.SIGTERM)",
     ]
     assert subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True).returncode == 9
+
+
+def write_photos(folder: Path, names: list[str]) -> None:
+    folder.mkdir(parents=True)
+    for name in names:
+        Image.new("RGB", (40, 30), (90, 90, 90)).save(folder / name, "JPEG")
+
+
+class HeifOfTests(ImageFile.ImageFile):
+    """A stand-in for pillow-heif's reader: a JPEG behind the first bytes of a HEIC file."""
+
+    format = "HEIF"
+
+    def _open(self) -> None:
+        self.fp.seek(len(HEIC))
+        inner = Image.open(io.BytesIO(self.fp.read()))
+        inner.load()
+        self._size, self._mode, self.im, self.tile = inner.size, inner.mode, inner.im, []
+
+
+HEIC = b"\0\0\0\x18ftypheic"
+
+
+@pytest.mark.parametrize("installed", [False, True])
+def test_heic_photos_are_read_with_pillow_heif_and_otherwise_counted_and_named(
+    tmp_path, caplog, monkeypatch, installed
+):
+    write_photos(tmp_path / "photos", [f"IMG_{number}.{suffix}" for number in range(7) for suffix in ("jpg", "HEIC")])
+    for path in (tmp_path / "photos").glob("*.HEIC"):
+        path.write_bytes(HEIC + path.read_bytes())
+    Image.init()
+    for name in ("ID", "OPEN", "EXTENSION"):
+        monkeypatch.setattr(Image, name, getattr(Image, name).copy())
+
+    def register() -> None:
+        Image.register_open("HEIF", HeifOfTests, lambda start: start.startswith(HEIC))
+        Image.register_extension("HEIF", ".heic")
+
+    stand_in = SimpleNamespace(register_heif_opener=register) if installed else None
+    monkeypatch.setitem(sys.modules, "pillow_heif", stand_in)
+    (tmp_path / "images").mkdir()
+    importing._copy_photos(tmp_path / "photos", tmp_path / "images")
+    named = "left out: 7 files of other formats: IMG_0.HEIC, IMG_1.HEIC, IMG_2.HEIC, IMG_3.HEIC, IMG_4.HEIC, ...; "
+    named += 'HEIC needs: pip install "completesplat[heic]"'
+    assert (named in caplog.text) is not installed
+    copies = sorted(path.name for path in (tmp_path / "images").iterdir())
+    assert len(copies) == (14 if installed else 7)
+    assert all(Image.open(tmp_path / "images" / name).format == "JPEG" for name in copies)
+
+
+def test_photos_in_folders_are_those_of_one_camera_each(tmp_path, monkeypatch):
+    for name in ("left eye", "right"):
+        write_photos(tmp_path / "photos" / name, ["0 a.jpg", "1.jpg", "2.jpg"])
+    write_photos(tmp_path / "photos/.thumbnails", ["0.jpg"])
+    (tmp_path / "photos/right/._2.jpg").touch()  # as macOS leaves them
+    (tmp_path / "images").mkdir()
+    importing._copy_photos(tmp_path / "photos", tmp_path / "images")
+    names = sorted(path.relative_to(tmp_path / "images").as_posix() for path in (tmp_path / "images").glob("*/*"))
+    assert [name.partition("/")[0] for name in names] == ["left_eye"] * 3 + ["right"] * 3
+    assert not any(" " in name for name in names)
+    modes = []
+
+    def stop(database, images, mode, names):
+        modes.append(mode)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pycolmap, "import_images", stop)
+    with pytest.raises(KeyboardInterrupt):
+        importing._find_cameras(tmp_path, names, False, 1000)
+    assert modes == [pycolmap.CameraMode.PER_FOLDER]
+
+
+def test_what_an_interrupted_import_leaves_is_no_capture_and_the_way_out_is_said(tmp_path, caplog):
+    write_capture(tmp_path / "out", 9)
+    (tmp_path / "out").rename(tmp_path / ".fox.unfinished")
+    for root in (tmp_path, tmp_path / "fox"):
+        caplog.clear()
+        with pytest.raises(DataError, match=r"no cameras there|no such file"):
+            import_capture(str(root), None, 100, 1000, Path("out"))
+        assert f"{tmp_path}/.fox.unfinished: left by an import that was interrupted: start it again" in caplog.text

@@ -7,6 +7,7 @@ import pytest
 from realestate10k_trees import make_clip, module, same, write_tree
 
 from completesplat.data.realestate10k.module import RE10KDataModule
+from completesplat.data.validation.audit import check
 from completesplat.errors import DataError
 
 PAIR = {"context": [2, 7], "target": [3, 5]}
@@ -93,3 +94,16 @@ def test_a_list_of_keys_is_one_key_a_line(root, tmp_path):
     assert "targets" in chosen.describe()["protocol_views"]
     with pytest.raises(DataError, match=r"list: line 2: 5 columns.*data.evaluation_index"):
         data_of(root, "test0\n" + FLASH3D, tmp_path, "scene_list").store("test")
+
+
+def test_views_that_clips_lack_are_refused_before_training_and_by_the_check(root, tmp_path):
+    index = {f"test{i}": PAIR if i < 2 else {"context": [2], "target": [3, 8]} for i in range(4)}
+    data = data_of(root, index, tmp_path)
+    found = check({"test": data.evaluated("test", data.source("test"))}, workers=1, progress=False)
+    assert (found.sequences, found.frames) == (2, 16)
+    lacking = "test2, frame 8: the frame is in the evaluation index, not in the data"
+    assert [str(error) for error in found.refused] == [lacking, lacking.replace("test2", "test3")]
+    with pytest.raises(DataError, match=r"2 of 4 items cannot be read.*test3, frame 8: the frame is in the evaluation"):
+        data.check_test()
+    index["test2"] = PAIR  # one that is skipped is reported by the test
+    data_of(root, index, tmp_path).check_test()

@@ -80,6 +80,7 @@ def first(count: int) -> Callable[[StoredClip], object]:
 # name: (change, kind, frame), in whichever form a clip is stored.
 BAD_CLIPS: dict[str, tuple[Callable[[StoredClip], object], type[DataError], int | None]] = {
     "nan_in_a_pose": (entry(2, 9, np.nan), BadAnnotation, 2),
+    "a_pose_beyond_float32_squared": (entry(2, 9, 1e30), BadAnnotation, 2),
     "reflection": (mirrored, BadCamera, 2),
     "sheared_rotation": (entry(2, 6, 1.01), BadCamera, 2),
     "zero_focal_length": (entry(3, 1, 0), BadCamera, 3),

@@ -13,8 +13,10 @@ from support import some_gaussians, strict_json
 from completesplat.export.images import color_depth, surface_depth
 from completesplat.export.ply import read_ply
 from completesplat.export.prediction import (
+    FileUnits,
     Wanted,
     contact_sheet,
+    write_fitted_scene,
     write_maps,
     write_prediction,
     write_scene_json,
@@ -98,3 +100,19 @@ def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path):
     counted = [recorded[name] for name in ("gaussians", "colors_clipped", "left_out_of_spz")]
     assert counted == [[2, 2], [1, 0], [0, 1]]
     assert [read_ply(tmp_path / f"a/sample_{i:02}.spz").count for i in (0, 1)] == [2, 1]
+
+
+@pytest.mark.parametrize(("far", "offset"), [((300.0, -200.0, 100.0), [0, 0, 0]), ((4e5, 5e6, 300.0), [4e5, 5e6, 300])])
+def test_files_have_the_users_coordinates_or_those_less_an_offset_that_scene_json_has(tmp_path, caplog, far, offset):
+    places = torch.tensor([[0.25, 0.5, 2.0], [-0.25, 0, 2.0]])
+    scene = dataclasses.replace(scene_at(2, 0.9), means=places)
+    images, units = torch.zeros(1, 3, 16, 16), FileUnits(0.5, far)  # exact in float32
+    write_fitted_scene(tmp_path, "a", "a", scene, CAMERA[None], images, images, 0, units)
+    recorded = strict_json(tmp_path / "scene.json")
+    assert recorded["settings"].get("offset", [0, 0, 0]) == offset
+    assert caplog.text.count("a: too far from its origin for float32: add offset (400000, 5e+06, 300)") == any(offset)
+    stored = read_ply(tmp_path / "scene.ply").means
+    user = stored.double().numpy() + offset
+    np.testing.assert_allclose(user, 2 * places.double().numpy() + far, rtol=0, atol=1e-12)
+    camera = torch.tensor(recorded["reference_camera"]["world_to_camera"])
+    torch.testing.assert_close(stored @ camera[:3, :3].T + camera[:3, 3], 2 * places)

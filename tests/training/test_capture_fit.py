@@ -69,8 +69,8 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
     one, other = (torch.load(tmp_path / run / "checkpoints/last.ckpt", weights_only=True) for run in ("run", "parts"))
     assert all(tensor.equal(other["state_dict"][name]) for name, tensor in one["state_dict"].items())
     # The files are in the world and units of transforms.json.
-    scale = CaptureDataModule(str(capture)).source("test").read("capture").scale
-    means = one["state_dict"]["raw.means"][:231] / scale
+    sequence = CaptureDataModule(str(capture)).source("test").read("capture")
+    means = one["state_dict"]["raw.means"][:231] / sequence.scale + torch.tensor(sequence.origin)
     torch.testing.assert_close(read_ply(tmp_path / "run/scene.ply").means, means)
     splat = read_gaussians(tmp_path / "run/scene.splat").means  # sorted by importance
     torch.testing.assert_close(splat.sort(0).values, means.sort(0).values)
@@ -130,5 +130,6 @@ def test_points_of_a_reconstruction_are_in_the_cameras_units(tmp_path):
     path.write_text(path.read_text().replace('{"camera', '{"ply_file_path": "points.ply", "camera'))
     sequence = CaptureDataModule(str(tmp_path / "capture"), image_size=12).source("train").read("capture")
     frame = read_transforms(path).frames[1].camera()
-    torch.testing.assert_close(sequence.points / sequence.scale, torch.tensor(points))
-    torch.testing.assert_close(sequence.cameras[0].centers / sequence.scale, frame.centers)
+    origin = torch.tensor(sequence.origin, dtype=torch.float64)
+    torch.testing.assert_close(sequence.points / sequence.scale + origin, torch.tensor(points).double())
+    torch.testing.assert_close(sequence.cameras[0].centers / sequence.scale + origin, frame.centers)

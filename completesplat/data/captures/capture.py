@@ -4,29 +4,31 @@ import logging
 import signal
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import Image
 
-from completesplat.data.images.exif import ORIENTATION, read_exif
+from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, read_exif
 from completesplat.data.images.files import (
     EIGHT_BIT_MODES,
     FORMATS,
-    check_annotated_size,
     check_sums,
     decode,
     opened,
     over_grey,
     refused_as_bad,
+    stored_size,
+    upright,
 )
 from completesplat.data.sequences import shortened
-from completesplat.data.validation import BadAnnotation, BadCamera, TooFewFrames, at, require_file
+from completesplat.data.validation import LARGEST, BadAnnotation, BadCamera, BadImage, TooFewFrames, at, require_file
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.files import by_numbers
 from completesplat.geometry.cameras import Cameras
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FEWEST_FRAMES = 6
+SIDEWAYS = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 # Limits for an undistorted image's area and sides, relative to the distorted image's. Wrong coefficients exceed them.
 SMALLEST_AREA, LARGEST_SIDE = 0.5, 2.0
 
@@ -52,23 +55,38 @@ class Lens:
 
     def __post_init__(self) -> None:
         (height, width), (x, y) = self.image_size, self.center
-        if not np.isfinite([*self.focal, *self.center, *self.distortion]).all():
+        if not (np.abs([*self.focal, *self.center, *self.distortion]) < LARGEST).all():
             raise BadCamera(f"intrinsics are not finite: {self.focal}, {self.center}, {self.distortion}")
         if min(height, width) <= 0 or min(self.focal) <= 0:
             raise BadCamera(f"sizes and focal lengths must be positive, not {width} x {height} and {self.focal}")
         if not (0 < x < width and 0 < y < height):
             raise BadCamera(f"principal point ({x:g}, {y:g}) lies outside of the {width} x {height} image")
 
+    def resized(self, image_size: tuple[int, int]) -> "Lens":
+        """Return the lens of images that are resized to (height, width)."""
+        down, across = (new / old for new, old in zip(image_size, self.image_size, strict=True))
+        focal, center = ((x * across, y * down) for x, y in (self.focal, self.center))
+        return replace(self, focal=focal, center=center, image_size=image_size)
+
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """One image of a capture, with its number in the capture's own file and its pose in OpenCV's convention."""
+    """One image of a capture, with its number in the capture's own file and its pose in OpenCV's convention.
+
+    Programs that estimate poses, such as COLMAP, use the pixels as they are stored; others turn the image by its EXIF
+    orientation first. The size of the lens says which image the pose is of.
+
+    Attributes:
+        orientation: of an image that has this size both ways, EXIF's is "ignored" (COLMAP) or "refused"; "unknown": the
+            size says nothing, because it is the image's own.
+    """
 
     number: int
     image: Path
     mask: Path | None
     lens: Lens
     world_to_camera: Float[np.ndarray, "4 4"]
+    orientation: Literal["ignored", "refused", "unknown"] = "refused"
 
     def camera(self) -> Cameras:
         """Return the pinhole camera (float64) of the undistorted image; errors as in `undistorted_lens`."""
@@ -81,15 +99,52 @@ class CapturedFrame:
     def read(self) -> tuple[Image.Image, Image.Image]:
         """Return the undistorted RGB image and its mask: of the mask file, else the alpha channel, else white.
 
+        Alpha is straight and mixed over white in sRGB, as in the images of NeRF (synthetic).
+
         Raises:
-            DataError: a file is missing, unusable or of another size, or its EXIF orientation turns the image.
+            DataError: a file is missing, unusable or of another aspect, or its EXIF orientation leaves two images.
         """
         with at(self.image, frame=self.number):
-            image, mask = _read_upright(self.image, self.lens.image_size)
+            orientation, mask = self.check(), None
+            with refused_as_bad(str(self.image)), opened(self.image, FORMATS) as stored:
+                check_sums(stored, self.image)
+                stored.load()
+                if stored.has_transparency_data and stored.mode in EIGHT_BIT_MODES:
+                    turned = upright(stored, orientation)
+                    image, mask = over_grey(turned, 1.0), turned.convert("RGBA").getchannel("A")
+            if mask is None:
+                image = decode(self.image, str(self.image), "RGB", self.lens.image_size, orientation is not None)
             if self.mask is not None:
-                mask = decode(self.mask, str(self.mask), "L", self.lens.image_size)
+                mask = decode(self.mask, str(self.mask), "L").resize(image.size, Image.Resampling.BILINEAR)
             image = undistort(image, self.lens)
             return image, Image.new("L", image.size, 255) if mask is None else undistort(mask, self.lens)
+
+    def check(self) -> object:
+        """Check the headers of image and mask, with the errors of `read`.
+
+        Returns:
+            The EXIF orientation by which the image is to be turned; None: its pixels stay as they are stored.
+        """
+        height, width = self.lens.image_size
+        with at(require_file(self.image), frame=self.number):
+            if self.mask is not None and not _same_aspect(
+                size := stored_size(self.mask, str(self.mask)), (height, width)
+            ):
+                raise BadImage(f"has {size[0]} x {size[1]} pixels, its image {height} x {width}", str(self.mask))
+            with refused_as_bad(str(self.image)), opened(self.image, FORMATS) as image:
+                orientation = read_exif(image).get(ORIENTATION)
+                as_stored, sideways = image.size == (width, height), orientation in SIDEWAYS
+                as_upright = image.size == (height, width) if sideways else as_stored
+                if not as_stored and not as_upright:
+                    size = f"has {image.height} x {image.width} pixels, its camera {height} x {width}"
+                    raise ImageError(f"{size}: give the photos that the cameras were computed for, of any size")
+                if orientation not in TRANSPOSITIONS:
+                    return None
+                unclear = as_stored and (as_upright or self.orientation == "unknown") and self.orientation != "ignored"
+                if unclear or image.format == "TIFF":  # decoding turns a TIFF
+                    turned = f"is to be turned (EXIF orientation {orientation}), its camera's pose perhaps not"
+                    raise ImageError(f"{turned}: save the pixels as the pose sees them, without that tag")
+                return None if as_stored else orientation
 
 
 @dataclass(frozen=True)
@@ -125,27 +180,26 @@ def warn_of_missing(path: Path, missing: Sequence[str], frames: int) -> None:
         logger.warning("%s: %s: %s", path, counted, shortened(missing))
 
 
-def _read_upright(path: Path, image_size: tuple[int, int]) -> tuple[Image.Image, Image.Image | None]:
-    """Return the RGB image over white, and its opacity if it has transparency data.
+def fitted(frame: CapturedFrame) -> CapturedFrame:
+    """Return the frame with the lens of its image, if that is smaller or larger (3DGS's data set) or to be turned.
 
-    Alpha is straight and mixed in sRGB, as in the images of NeRF (synthetic). An EXIF orientation is refused, because
-    programs that estimate poses use the pixels as they are stored, so the pose would not fit the upright image.
+    An image that has another aspect, or that cannot be read, is refused by `CapturedFrame.check` and `read`.
     """
-    require_file(path)
-    with refused_as_bad(str(path)), opened(path, FORMATS) as image:
-        orientations = {read_exif(image).get(ORIENTATION)}  # Decoding a TIFF removes its orientation.
-        check_sums(image, path)
-        image.load()
-        orientations.add(read_exif(image).get(ORIENTATION))
-        if turned := orientations - {None, 0, 1}:
-            raise ImageError(
-                f"is to be turned (EXIF orientation {turned.pop()}), its camera's pose is not: save the pixels "
-                "as the pose sees them, without that tag"
-            )
-        if image.has_transparency_data and image.mode in EIGHT_BIT_MODES:
-            check_annotated_size(image, image_size)
-            return over_grey(image, 1.0), image.convert("RGBA").getchannel("A")
-    return decode(path, str(path), "RGB", image_size), None
+    with suppress(ImageError), opened(frame.image, FORMATS) as image:
+        for size in (image.size[::-1], image.size):
+            if size == frame.lens.image_size:
+                break
+            if _same_aspect(size, frame.lens.image_size):
+                return replace(frame, lens=frame.lens.resized(size))
+            if read_exif(image).get(ORIENTATION) not in SIDEWAYS:
+                break
+    return frame
+
+
+def _same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Return whether one size is a multiple of the other, up to the rounding of a side."""
+    down, across = (one / another for one, another in zip(size, other, strict=True))
+    return abs(down - across) <= max(1, down, across) / min(other)
 
 
 def undistorted_lens(lens: Lens) -> Lens:

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from os.path import isfile
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, in_order, warn_of_missing
+from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fitted, in_order, warn_of_missing
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
@@ -22,6 +23,7 @@ from completesplat.data.validation import (
     read_text,
     require_file,
 )
+from completesplat.errors import DataError
 from completesplat.geometry.rotations import quaternion_to_matrix
 
 # Names and numbers of parameters by model id (colmap, `src/colmap/sensor/models.h`); other models are refused.
@@ -49,16 +51,33 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
     """
     if not images.is_dir():
         raise MissingFile("no such folder", str(images))
-    suffix, read = ("bin", _binary_rows) if (model / "images.bin").is_file() else ("txt", _text_rows)
+    suffix, read = _form(model)
     files = tuple(require_file(model / f"{name}.{suffix}") for name in ("cameras", "images", "points3D"))
     lenses = dict(_parsed(_camera_of, read, files[0]))
     with at(files[1]):
         posed = _parsed(partial(_frame_of, lenses=lenses, images=images, masks=masks), read, files[1])
         missing = sorted(str(frame.image.relative_to(images)) for frame in posed if not isfile(frame.image))
         warn_of_missing(files[1], missing, len(posed))
-        frames = in_order([frame for frame in posed if isfile(frame.image)])
+        frames = in_order([fitted(frame) for frame in posed if isfile(frame.image)])
     points = np.array(_parsed(lambda row: [float(coordinate) for coordinate in row[1:4]], read, files[2]))
     return Capture(files, frames, points if len(points) else None)
+
+
+def is_model(folder: Path) -> bool:
+    """Return whether a folder has a model."""
+    return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
+
+
+def image_count(model: Path) -> int:
+    """Return the number of a model's images, 0 if they cannot be read."""
+    suffix, read = _form(model)
+    with suppress(DataError):
+        return len(_parsed(len, read, model / f"images.{suffix}"))
+    return 0
+
+
+def _form(model: Path) -> tuple[str, Callable[[Path], Iterator[Row]]]:
+    return ("bin", _binary_rows) if (model / "images.bin").is_file() else ("txt", _text_rows)
 
 
 def _parsed(parse: Callable[[Row], T], read: Callable[[Path], Iterator[Row]], path: Path) -> list[T]:
@@ -85,7 +104,7 @@ def _camera_of(row: Row) -> tuple[int, Lens]:
 
 def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | None) -> CapturedFrame:
     """Return an image with its camera; a row has number, pose (qw, qx, qy, qz, tx, ty, tz), camera and name."""
-    number, camera, name = int(row[0]), int(row[8]), " ".join(map(str, row[9:]))
+    number, camera, name = int(row[0]), int(row[8]), str(row[9])
     with at(frame=number):
         if camera not in lenses:
             raise BadAnnotation(f"no camera {camera}")
@@ -97,7 +116,7 @@ def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | 
         world_to_camera[:3, 3] = pose[4:]
         image = inside(images, name)
         mask = None if masks is None or not isfile(image) else _find_mask(masks, name)
-        return CapturedFrame(number, image, mask, lenses[camera], world_to_camera)
+        return CapturedFrame(number, image, mask, lenses[camera], world_to_camera, "ignored")
 
 
 def _find_mask(masks: Path, name: str) -> Path:
@@ -110,10 +129,13 @@ def _find_mask(masks: Path, name: str) -> Path:
 
 def _text_rows(path: Path) -> Iterator[Row]:
     """Yield the entries of a text file; those of images have a second line for their features, which may be empty."""
-    lines = [line for line in read_text(path).split("\n") if not line.startswith("#")]
-    for line in lines[:: 2 if path.stem == "images" else 1]:
-        if line.strip():
-            yield line.split()
+    lines = map(str.strip, read_text(path).split("\n"))
+    for line in lines:
+        if line and not line.startswith("#"):
+            yield line.split(maxsplit=9 if path.stem == "images" else -1)
+            # Features are triples; another number of values is that of an image, and this one's line is missing.
+            if path.stem == "images" and len(next(lines, "").split()) % 3:
+                raise ValueError
 
 
 def _binary_rows(path: Path) -> Iterator[Row]:

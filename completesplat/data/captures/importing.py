@@ -9,7 +9,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Literal, Unpack
 
-from PIL import ImageOps
+from PIL import Image, ImageOps
 from rich.progress import Progress, track
 
 from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
@@ -18,12 +18,12 @@ from completesplat.data.captures.turntable import TurntableSettings, import_turn
 from completesplat.data.images.files import (
     FORMATS,
     check_sums,
-    image_files,
     opened,
     refused_as_bad,
     save_image,
     stored_size,
 )
+from completesplat.data.sequences import shortened
 from completesplat.data.validation import refused_to
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder, folder_names
@@ -54,6 +54,7 @@ def import_capture(
     for error in sources["train"].refused:
         leave_out(error)
     for name in sources["train"].names:
+        sources["train"].check(name)
         counts = [len(sources[split].read(name).frames) for split in ("train", "test")]
         logger.info("%s: %d images with cameras, of which %d are held out", name, sum(counts), counts[1])
     names = sources["train"].names
@@ -77,7 +78,7 @@ def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> 
             _split_video(source, images, frames)
         else:
             _copy_photos(source / "images" if (source / "images").is_dir() else source, images)
-        names = sorted(os.listdir(images))
+        names = sorted(path.relative_to(images).as_posix() for path in images.glob("**/*.*"))
         if len(names) < FEWEST_FRAMES:
             raise DataError(f"{len(names)} usable images; a capture needs {FEWEST_FRAMES}", str(source))
         posed = _find_cameras(unfinished, names, video or len(names) > MOST_WITH_ALL_PAIRS, max_image_size)
@@ -91,16 +92,42 @@ def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> 
 
 
 def _copy_photos(folder: Path, images: Path) -> None:
-    """Write upright photos, with the rest of their EXIF records, which has the focal length."""
-    photos = image_files(folder)
-    stems = folder_names("_".join(path.stem.split()) for path in photos)  # COLMAP lists pairs with a space between
-    for photo, stem in track(list(zip(photos, stems, strict=True)), "photos"):
+    """Write upright photos, with the rest of their EXIF records, which has the focal length.
+
+    If there are none in the folder itself, those in folders below it are taken, each the photos of one camera.
+    """
+    formats = _photo_formats()
+    suffixes = {suffix for suffix, kind in Image.registered_extensions().items() if kind in formats}
+    levels = [sorted(filter(Path.is_file, folder.glob(level))) for level in ("[!.]*", "[!.]*/[!.]*")]
+    photos = [[path for path in files if path.suffix.lower() in suffixes] for files in levels]
+    level = int(not photos[0] and bool(photos[1] or not levels[0]))
+    if others := sorted({path.name for path in levels[level]} - {path.name for path in photos[level]}):
+        advice = "" if "HEIF" in formats else '; HEIC needs: pip install "completesplat[heic]"'
+        logger.warning("left out: %d files of other formats: %s%s", len(others), shortened(others), advice)
+    # COLMAP lists pairs with a space between.
+    folders = sorted({photo.parent for photo in photos[level]})
+    names = dict(zip(folders, folder_names("_".join(path.name.split()) for path in folders), strict=True))
+    stems = folder_names("_".join(path.stem.split()) for path in photos[level])
+    for photo, stem in track(list(zip(photos[level], stems, strict=True)), "photos"):
         with refused_to(leave_out), refused_as_bad(str(photo)):
-            with opened(photo, FORMATS) as image:
+            with opened(photo, formats) as image:
                 check_sums(image, photo)
                 upright = ImageOps.exif_transpose(image)
             options = {"quality": 95, "subsampling": 0, "exif": upright.info.get("exif", b"")}
-            save_image(upright, images / f"{stem}{photo.suffix.lower()}", **options)
+            place = images / names[photo.parent] if level else images
+            place.mkdir(exist_ok=True)
+            suffix = ".jpg" if image.format == "HEIF" else photo.suffix.lower()
+            save_image(upright, place / f"{stem}{suffix}", **options)
+
+
+def _photo_formats() -> tuple[str, ...]:
+    """Return the formats of photos, with that of HEIC where pillow-heif is installed."""
+    try:
+        import pillow_heif
+    except ImportError:
+        return FORMATS
+    pillow_heif.register_heif_opener()
+    return *FORMATS, "HEIF"
 
 
 def _split_video(video: Path, images: Path, frames: int) -> None:
@@ -125,12 +152,13 @@ def image_pairs(images: int, sequential: bool) -> list[tuple[int, int]]:
 
 
 def _find_cameras(folder: Path, names: list[str], sequential: bool, max_image_size: int) -> set[str]:
-    """Write COLMAP's largest model as `folder`/sparse/0; return its images. Images of one size share a lens."""
+    """Write COLMAP's largest model as `folder`/sparse/0; return its images. Those of a folder and size share a lens."""
     pycolmap = import_pycolmap()
     images, database, pairs, at_a_time = folder / "images", folder / "db", folder / "pairs", os.cpu_count() or 1
     pycolmap.Database.open(database).close()
-    sizes = {stored_size(images / name, name) for name in names}
-    mode = pycolmap.CameraMode.SINGLE if len(sizes) == 1 else pycolmap.CameraMode.PER_IMAGE
+    sizes = {(Path(name).parent, stored_size(images / name, name)) for name in names}
+    uniform = len(sizes) == len({Path(name).parent for name in names})
+    mode = pycolmap.CameraMode.PER_FOLDER if uniform else pycolmap.CameraMode.PER_IMAGE
     pycolmap.import_images(database, images, mode, names)
     extraction, pairing = pycolmap.FeatureExtractionOptions(), pycolmap.ImportedPairingOptions()
     extraction.max_image_size, extraction.sift.max_num_features = max_image_size, MOST_FEATURES

@@ -1,6 +1,7 @@
 """Data module of a user's captures, which are read in place."""
 
 import hashlib
+import logging
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -12,8 +13,8 @@ import numpy as np
 import torch
 
 from completesplat.data.captures.capture import Capture, CapturedFrame
-from completesplat.data.captures.colmap import read_colmap
-from completesplat.data.captures.transforms_json import read_transforms
+from completesplat.data.captures.colmap import image_count, is_model, read_colmap
+from completesplat.data.captures.transforms_json import read_polycam, read_transforms
 from completesplat.data.images.crop import cut_square
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
@@ -31,10 +32,15 @@ from completesplat.data.validation import MissingFile, at, refused_to
 from completesplat.errors import DataError
 from completesplat.settings.schema import Range
 
+logger = logging.getLogger(__name__)
+
 # Points whose distance from the median point exceeds this multiple of the median distance are outliers, because the
-# farthest point determines the scale of the scene.
-FARTHEST = 5.0
+# farthest point determines the scale of the scene. Beyond the second multiple, they are errors of the reconstruction.
+FARTHEST, FARTHEST_USED = 5.0, 100_000
 FEWEST_HELD_OUT = 2
+TRANSFORMS = ("transforms.json", "transforms_train.json")  # the second is NeRF's (synthetic)
+# Of COLMAP, nerfstudio, and COLMAP's undistorter.
+MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "dense/*/sparse", "dense/sparse")
 Members = Callable[[int], list[int]]
 
 
@@ -48,21 +54,34 @@ def members(hold_out: int, held_out: bool, frames: int) -> list[int]:
 
 
 def read_capture(folder: Path) -> Capture | None:
-    """Read the capture in a folder: `transforms.json`, or `sparse/0` or `sparse` with `images` and perhaps `masks`.
+    """Read the capture in a folder: `TRANSFORMS`, Polycam's `keyframes`, or the largest model of COLMAP in `MODELS`.
 
-    `folder` may also be a JSON file, such as `transforms_train.json` of NeRF.
+    A model has its `images`, and perhaps `masks`, beside it or in a folder above. `folder` may also be a JSON file.
 
     Returns:
         The capture, or None if the folder has none.
     """
-    transforms = folder if folder.suffix == ".json" else folder / "transforms.json"
-    if transforms.is_file():
-        return read_transforms(transforms)
-    for model in (folder / "sparse/0", folder / "sparse"):
-        if any((model / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            masks = folder / "masks"
-            return read_colmap(model, folder / "images", masks if masks.is_dir() else None)
-    return None
+    for transforms in (folder / name for name in TRANSFORMS) if folder.suffix != ".json" else (folder,):
+        if transforms.is_file():
+            return read_transforms(transforms)
+    if (folder / "keyframes/cameras").is_dir() or (folder / "keyframes/corrected_cameras").is_dir():
+        return read_polycam(folder / "keyframes")
+    groups = ([path for path in sorted(folder.glob(pattern)) if is_model(path)] for pattern in MODELS)
+    if not (found := [models for models in groups if models]):
+        return None
+    models = next((models for models in found if _images(models[0], folder).is_dir()), found[0])
+    model = max(models, key=image_count) if len(models) > 1 else models[0]
+    if len(models) > 1:
+        logger.warning("%s: the largest of %d models, with %d images", model, len(models), image_count(model))
+    images = _images(model, folder)
+    masks = images.with_name("masks")
+    return read_colmap(model, images, masks if masks.is_dir() else None)
+
+
+def _images(model: Path, folder: Path) -> Path:
+    """Return the folder `images` beside a model, or in a folder above it, but not above `folder`."""
+    above = [parent / "images" for parent in model.parents if parent.is_relative_to(folder)]
+    return next((images for images in above if images.is_dir()), folder / "images")
 
 
 class CaptureSource(SequenceSource):
@@ -97,23 +116,41 @@ class CaptureSource(SequenceSource):
                 self._sequences[name] = self._make(name)
         return self._sequences[name]
 
+    def check(self, name: str) -> None:
+        """Check the headers of all images of a capture, or raise a DataError."""
+        with at(sequence=name):
+            for frame in self._captures[name].frames:
+                frame.check()
+
     def _make(self, name: str) -> PosedSequence:
-        """Place the object by all frames, so that all splits have the same scale."""
+        """Place the object by all frames, so that all splits have the same scale, and move it to the origin.
+
+        Float32, which holds all that follows, is too coarse for coordinates such as those of maps.
+        """
         capture = self._captures[name]
         cameras = [frame.camera() for frame in capture.frames]
-        if capture.points is None:
+        points = capture.points
+        if points is None:
             placement = from_cameras(cameras)
         else:
-            distance = np.linalg.norm(capture.points - np.median(capture.points, axis=0), axis=-1)
-            near = capture.points[distance <= FARTHEST * np.median(distance)]
-            placement = from_points(near, upright_axes(cameras), "the point cloud")
+            with np.errstate(all="ignore"):
+                distance = np.linalg.norm(points - np.median(points, axis=0), axis=-1)
+                distance /= np.median(distance)
+            placement = from_points(points[distance <= FARTHEST], upright_axes(cameras), "the point cloud")
+            if lost := int((~(distance <= FARTHEST_USED)).sum()):
+                beyond = f"more than {FARTHEST_USED:,} scene radii away and are left out"
+                logger.warning("%s: %d of %d points are %s", name, lost, len(points), beyond)
+            points = points[distance <= FARTHEST_USED]
         numbers = self._members(len(capture.frames))
         read = partial(_read, name, [capture.frames[number] for number in numbers], self.framing.image_size)
         scale = OBJECT_HALF_SIZE / placement.half_size
-        points = None if capture.points is None else torch.from_numpy(scale * capture.points).float()
-        selected = [cameras[number] for number in numbers]
+        center, moved = placement.center, torch.eye(4, dtype=torch.float64)
+        moved[:3, 3] = center
+        selected = [replace(cameras[i], world_to_camera=cameras[i].world_to_camera @ moved) for i in numbers]
+        placement = placement._replace(center=torch.zeros_like(center))
         sequence = placed_sequence(name, numbers, selected, placement, self.framing, read)
-        return replace(sequence, points=points, scale=scale)
+        seeds = None if points is None else (scale * (torch.from_numpy(points) - center)).float()
+        return replace(sequence, points=seeds, scale=scale, origin=tuple(center.tolist()))
 
 
 def _read(name: str, frames: list[CapturedFrame], size: int, index: int) -> MaskedImage:
@@ -155,11 +192,14 @@ class CaptureDataModule(ObjectDataModule):
 
     def open(self, split: str) -> Mapping[str, CaptureSource]:
         """Read the cameras of all captures; the error of one capture is only raised if no other can be read."""
+        for left in (self.root.with_name(f".{self.root.name}.unfinished"), *self.root.glob(".*.unfinished")):
+            if left.is_dir():
+                logger.warning("%s: left by an import that was interrupted: start it again", left)
         if not self.root.exists():
             raise MissingFile("no such file or folder", str(self.root))
         captures: dict[str, Capture] = {}
         refused: list[DataError] = []
-        folders = [self.root, *sorted(path for path in self.root.glob("*/") if path.is_dir())]
+        folders = [self.root, *sorted(path for path in self.root.glob("[!.]*/") if path.is_dir())]
         for folder in folders:
             name = folder.resolve().name or "capture"
             with refused_to(refused.append), at(sequence=name):

@@ -2,14 +2,17 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from os.path import isfile
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, in_order, warn_of_missing
+from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fitted, in_order, warn_of_missing
+from completesplat.data.images.exif import ORIENTATION, read_exif
 from completesplat.data.images.files import stored_size
 from completesplat.data.images.photograph import read_photograph
 from completesplat.data.validation import (
@@ -38,6 +41,7 @@ OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
 Entry = Mapping[str, object]
 FEWEST_CAMERAS = 2
 SAME_FOCAL = 1e-3
+POLYCAM = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # NeRF (synthetic) leaves the suffix out.
 
 
@@ -57,7 +61,8 @@ def read_transforms(path: Path) -> Capture:
     Raises:
         DataError: something is missing, malformed or impossible; the error names the file and the frame's number.
     """
-    frames, content = _read_frames(path)
+    content = read_json(path, allow_nan=True)  # NaN is refused later, with the number of its frame.
+    frames = _read_frames(path, content)
     with at(path):
         ordered = in_order(frames)
         if content.get("ply_file_path") is None:
@@ -65,6 +70,26 @@ def read_transforms(path: Path) -> Capture:
         cloud = inside(path.parent, field(content, "ply_file_path", str))
         points = read_points(cloud)
     return Capture((path, cloud), ordered, points if len(points) else None)
+
+
+def read_polycam(keyframes: Path) -> Capture:
+    """Read the images and cameras, one file for each, of Polycam's raw data, corrected by Polycam or else by the phone.
+
+    `t_00` to `t_23` are the rows of `transform_matrix` (nerfstudio, `process_data/polycam_utils.py`).
+
+    Raises:
+        DataError: as in `read_transforms`.
+    """
+    kind = "corrected_" if (keyframes / "corrected_cameras").is_dir() else ""
+    files, entries = sorted((keyframes / f"{kind}cameras").glob("*.json")), []
+    for file in files:
+        camera = read_json(file, allow_nan=True)
+        with at(file):
+            rows = [[field(camera, f"t_{row}{column}", float) for column in range(4)] for row in range(3)]
+        values = {name: camera.get(key) for name, key in POLYCAM.items()}
+        entries.append({**values, "file_path": f"{kind}images/{file.stem}", "transform_matrix": [*rows, [0, 0, 0, 1]]})
+    frames = _read_frames(keyframes / f"{kind}cameras", {"frames": entries})
+    return Capture(tuple(files), in_order(frames), None)
 
 
 def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
@@ -77,20 +102,22 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
         DataError: as in `read_transforms`, but few frames suffice; or a photo is turned by EXIF or has another size.
         CompleteSplatError: a photo is not in the file.
     """
-    frames = {frame.image.resolve(): frame for frame in _read_frames(path)[0]}
+    frames = {frame.image.resolve(): frame for frame in _read_frames(path, read_json(path, allow_nan=True))}
     squares, cameras = [], []
     for image in images:
         frame = frames.get(image.resolve())
         if frame is None:
             raise CompleteSplatError(f"{image}: {path} has no frame with this image")
-        undistorted, _ = frame.read()  # refuses images that `read_photograph` would turn
-        distorts = any(frame.lens.distortion)
-        squares.append(read_photograph(undistorted if distorts else frame.image, size).image)
-        camera = frame.camera().to(torch.float32)
+        undistorted, _ = frame.read()
+        if ORIENTATION in read_exif(undistorted):  # `read_photograph` would turn it
+            undistorted = Image.fromarray(np.array(undistorted))
+        squares.append(read_photograph(undistorted, size).image)
+        camera = frame.camera()
         (height, width), side = camera.image_size, min(camera.image_size)
         cameras.append(crop_resize(camera, (width - side) // 2, (height - side) // 2, side, size))
     placed = stack(cameras)
-    return Views(torch.stack(squares), placed.relative_to(placed[0]), torch.ones(len(squares), 1, size, size))
+    relative = placed.relative_to(placed[0]).to(torch.float32)
+    return Views(torch.stack(squares), relative, torch.ones(len(squares), 1, size, size))
 
 
 def read_cameras(path: Path, size: int) -> list[Cameras]:
@@ -124,9 +151,8 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
     return cameras
 
 
-def _read_frames(path: Path) -> tuple[list[CapturedFrame], Entry]:
-    """Return all frames that have images, and the file's content."""
-    content = read_json(path, allow_nan=True)  # NaN is refused later, with the number of its frame.
+def _read_frames(path: Path, content: Entry) -> list[CapturedFrame]:
+    """Return all frames of a file's content that have images."""
     root, frames, missing = path.parent, [], []
     with at(path):
         entries = field(content, "frames", list)
@@ -141,10 +167,12 @@ def _read_frames(path: Path) -> tuple[list[CapturedFrame], Entry]:
                     continue
                 masked = entry.get("mask_path") is not None
                 mask = require_file(inside(root, field(entry, "mask_path", str))) if masked else None
-                lens, pose = _read_lens({**content, **entry}, image), _read_pose(entry.get("transform_matrix"))
-                frames.append(CapturedFrame(number, image, mask, lens, pose))
+                values, pose = {**content, **entry}, _read_pose(entry.get("transform_matrix"))
+                frame = CapturedFrame(number, image, mask, _read_lens(values, image), pose)
+                sized = {"w", "h"} <= values.keys()
+                frames.append(fitted(frame) if sized else replace(frame, orientation="unknown"))
     warn_of_missing(path, missing, len(entries))
-    return frames, content
+    return frames
 
 
 def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
@@ -153,9 +181,11 @@ def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
     if not np.allclose(pose[3], [0, 0, 0, 1]):
         raise BadCamera(f"transform_matrix ends in the row {pose[3].tolist()}, not in 0, 0, 0, 1")
     require_rotation(pose[:3, :3], "the rotation of transform_matrix")
-    pose[:3, 1:3] *= -1
+    # The nearest rotation: an error of rounding would be multiplied by the distance from the origin.
+    u, _, vt = np.linalg.svd(pose[:3, :3] * [1, -1, -1])
     world_to_camera = np.eye(4)
-    world_to_camera[:3, :3], world_to_camera[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+    world_to_camera[:3, :3] = (u @ vt).T
+    world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ pose[:3, 3]
     return world_to_camera
 
 

@@ -1,5 +1,6 @@
 """Data module for one category of CO3D v2 (Reizenstein et al., ICCV 2021), or of data in its layout."""
 
+import os
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -7,6 +8,7 @@ from completesplat.data.co3d.source import CO3DSource
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
+from completesplat.errors import DataError
 from completesplat.settings.schema import Natural, Positive, Range, Share
 
 
@@ -74,7 +76,18 @@ class CO3DDataModule(ObjectDataModule):
         return chosen | self.seeded._asdict() | vars(self.filters) | vars(self.framing)
 
     def open(self, split: str) -> Mapping[str, CO3DSource]:
-        """Open all splits at once, because they share the annotations."""
+        """Open all splits at once, because they share the annotations. Sequences without images are left out.
+
+        Raises:
+            DataError: more sequences have no images than the policy allows; else as `read_category`.
+        """
         which = self.root, self.category, self.subset
         splits, files, refused = read_category(*which, self.seeded, self.filters, self.allow_shared_sequences)
+        first = {name: frames[0].image for split in splits.values() for name, frames in split.frames.items()}
+        absent = {name for name, image in first.items() if not os.path.isdir(image.parent)}
+        on_bad, most = self.policy
+        if absent and (on_bad == "raise" or len(absent) > most * len(first)):
+            counted = f"{len(absent)} of {len(first)} sequences have no images, as after a partial download"
+            raise DataError(f"{counted}; data.max_bad_fraction=1 uses the others", str(self.root / self.category))
+        splits = {split: members.without(absent, "not downloaded") for split, members in splits.items()}
         return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}

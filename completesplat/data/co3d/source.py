@@ -27,7 +27,7 @@ from completesplat.data.placement import (
     upright_axes,
 )
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import at, read_points
+from completesplat.data.validation import BadImage, at, read_points
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import pixel_centers, unproject
 
@@ -152,6 +152,10 @@ def _read(name: str, frames: list[CO3DFrame], size: int, index: int) -> MaskedIm
     with at(sequence=name, frame=frame.number):
         image = decode(frame.image, str(frame.image), "RGB", image_size)
         mask = decode(frame.mask, str(frame.mask), "L", image_size)
+        # CO3D's loader leaves out empty masks, too (`json_index_dataset.py`, `remove_empty_masks`).
+        for path, part, fault in ((frame.image, image, "is black everywhere"), (frame.mask, mask, "shows no object")):
+            if part.getbbox() is None:
+                raise BadImage(fault, str(path))
         return MaskedImage(cut_square(image, square, size), cut_square(mask, square, size))
 
 

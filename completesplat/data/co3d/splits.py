@@ -2,8 +2,8 @@
 
 import logging
 import os
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -140,6 +140,12 @@ class SplitMembers:
     captured: dict[str, list[CO3DFrame]]
     point_clouds: dict[str, Path | None]
     left_out: dict[str, list[str]]
+
+    def without(self, names: Collection[str], reason: str) -> "SplitMembers":
+        """Return the split without some sequences, which are left out for this reason."""
+        frames = {name: frames for name, frames in self.frames.items() if name not in names}
+        lost = [name for name in self.frames if name in names]
+        return replace(self, frames=frames, left_out={**self.left_out, **({reason: lost} if lost else {})})
 
 
 class Category(NamedTuple):

@@ -29,9 +29,13 @@ LARGEST_SCALE = 2.0**112  # its product with the largest float16 still fits into
 
 
 def decode(
-    source: Path | bytes, file: str, mode: Literal["RGB", "L"], image_size: tuple[int, int] | None = None
+    source: Path | bytes,
+    file: str,
+    mode: Literal["RGB", "L"],
+    image_size: tuple[int, int] | None = None,
+    turn: bool = True,
 ) -> Image.Image:
-    """Decode one image of a data set to 8 bits, and turn it upright by its EXIF orientation.
+    """Decode one image of a data set to 8 bits, and turn it upright by its EXIF orientation, unless `turn` is false.
 
     Grey of 16 bits is scaled to 8. Transparent pixels are refused, because metrics depend on the background, which only
     the data set's maker can choose. Colour is refused for `mode` "L" (a mask), because its brightness is no
@@ -50,7 +54,7 @@ def decode(
             has pixels whose meaning in this mode is unclear.
     """
     with _loaded(source, file, FORMATS) as (stored, exif):
-        image = upright(stored, exif.get(ORIENTATION))
+        image = upright(stored, exif.get(ORIENTATION) if turn else None)
         if image_size is not None:
             check_annotated_size(image, image_size)
         return _eight_bits(image, getattr(stored, "tag_v2", {}), mode)

@@ -172,6 +172,9 @@ class SceneDataModule(LightningDataModule):
             "evaluation=hidden_modes needs data whose hidden parts are known: toy objects, or data render hidden=modes"
         )
 
+    def check_test(self) -> None:
+        """Raise DataError for a test that cannot work, before its model is trained; by default, nothing is checked."""
+
     def setup(self, stage: str | None = None) -> None:
         """List the sequences (images are read later).
 

@@ -110,7 +110,7 @@ class SceneLoader:
         try:
             for scenes, refused, refused_depths in self._loader:
                 self._batches += 1
-                self._account(refused, scenes is None)
+                self.account(refused, scenes is None)
                 self.refused_depths += refused_depths
                 if self._batches == len(self):
                     # Not after the loop, because Lightning knows the number of batches and never exhausts the iterator.
@@ -144,7 +144,8 @@ class SceneLoader:
         """Let the next iteration start after the batches counted in `state`, if the epoch is still the same."""
         self._resume = dict(state)
 
-    def _account(self, refused: Sequence[DataError], empty: bool) -> None:
+    def account(self, refused: Sequence[DataError], empty: bool) -> None:
+        """Count items that cannot be read; raise DataError if they are too many, or nothing is left (`empty`)."""
         if refused and self.on_bad == "raise":
             raise refused[0]
         self.refused += refused

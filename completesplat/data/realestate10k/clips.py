@@ -22,6 +22,7 @@ from torch import Tensor
 from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.files import decode, stored_size
 from completesplat.data.validation import (
+    LARGEST,
     ROTATION_TOLERANCE,
     BadAnnotation,
     BadCamera,
@@ -90,7 +91,7 @@ def make_clip(key: str, source: Path, timestamps: Sequence[int], rows: Float[Ten
     rigid = (deviation <= ROTATION_TOLERANCE) & (torch.linalg.det(rotation) > 0)
     for bad, kind, reason in (
         (torch.tensor([count[time] > 1 for time in timestamps]), BadAnnotation, "another frame has its timestamp"),
-        (~rows.isfinite().all(dim=1), BadAnnotation, "camera with numbers that are not finite"),
+        (~(rows.abs() < LARGEST).all(dim=1), BadAnnotation, "camera with numbers that are not finite in float32"),
         ((rows[:, :2] <= 0).any(dim=1), BadCamera, "focal length is not positive"),
         ((rows[:, 4:6] != 0).any(dim=1), BadCamera, "lens distortion is not supported"),
         (~rigid, BadCamera, "pose is not a rotation and translation"),
@@ -153,10 +154,10 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
-    """Return timestamps and camera rows."""
+    """Return timestamps and camera rows. Above them is the video's address, which some copies lack."""
     timestamps, rows = [], []
-    lines = read_text(path, MOST_BYTES).splitlines()[1:]
-    for frame, columns in enumerate(line.split() for line in lines if line.strip()):
+    lines = [line.split() for line in read_text(path, MOST_BYTES).splitlines() if line.strip()]
+    for frame, columns in enumerate(lines[1:] if lines and len(lines[0]) == 1 else lines):
         with at(frame=frame):
             if len(columns) != 1 + CAMERA_NUMBERS:
                 raise BadAnnotation(f"{len(columns)} columns instead of {1 + CAMERA_NUMBERS}")

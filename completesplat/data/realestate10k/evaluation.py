@@ -8,6 +8,7 @@ from pathlib import Path
 from completesplat.data.loading.scenes import Choice
 from completesplat.data.sequences import PosedSequence, SequenceSource, shortened
 from completesplat.data.validation import BadAnnotation, at, read_json, read_text
+from completesplat.errors import DataError
 
 CONTEXT, TARGET, SCORED = "context", "target", "target_quantify"
 LINE = "KEY source target target target"
@@ -39,7 +40,16 @@ class ChosenSource(SequenceSource):
         self._clips = clips
 
     def read(self, name: str) -> PosedSequence:
-        return replace(self._source.read(self._clips[name]), name=name)
+        """Return the clip of a test; refuse it if it lacks a frame of the test's views."""
+        sequence = replace(self._source.read(self._clips[name]), name=name)
+        reference, targets = self.views.get(name, (sequence.frames[0], []))
+        for frame in (reference, *targets):
+            if frame not in sequence.frames:
+                raise BadAnnotation("the frame is in the evaluation index, not in the data", None, name, frame)
+        return sequence
+
+    def verify(self) -> Sequence[DataError]:
+        return self._source.verify()
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
         return self._source.groups([self._clips[name] for name in names])

@@ -17,7 +17,7 @@ from completesplat.data.packed.manifest import Scalar
 from completesplat.data.realestate10k.clips import ChunkedClips, Clip, TextClips
 from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource, split_by_hash
-from completesplat.data.validation import BadAnnotation, at, require_file
+from completesplat.data.validation import at, refused_to, require_file
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import crop_resize
 from completesplat.settings.schema import Natural, OneOf, Positive, Share
@@ -187,6 +187,15 @@ class RE10KDataModule(SceneDataModule):
         self._test_views = chosen.views
         return chosen
 
+    def check_test(self) -> None:
+        """Read all clips of an evaluation index, chunks as a whole, because clips may lack its frames."""
+        if self.index is not None:
+            loader, refused = self.test_dataloader(), list[DataError]()
+            for name in loader.dataset.names:
+                with refused_to(refused.append), at(sequence=name):
+                    loader.dataset.store.source.read(name)
+            loader.account(refused, empty=len(refused) == len(loader.dataset))
+
     def stackable(self, scenes: EvaluationScenes) -> bool:
         """Decide by the evaluation index, because reading all clips would take hours."""
         views = self._test_views
@@ -201,11 +210,7 @@ class RE10KDataModule(SceneDataModule):
         if sequence.name not in self._test_views:
             return evaluation_views_within(len(sequence.frames), *self.evaluation)
         reference, targets = self._test_views[sequence.name]
-        position = {frame: view for view, frame in enumerate(sequence.frames)}
-        for frame in (reference, *targets):
-            if frame not in position:
-                raise BadAnnotation("the frame is in the evaluation index, not in the data", None, sequence.name, frame)
-        return position[reference], [position[frame] for frame in targets]
+        return sequence.frames.index(reference), [sequence.frames.index(frame) for frame in targets]
 
 
 def _checksum(path: Path | None) -> str:

@@ -21,6 +21,7 @@ MOST_BYTES = 2**32
 BYTES_OF_ANY_RATIO, LARGEST_RATIO = 2**24, 40
 CHUNK = 2**20  # bytes that are read at once
 ROTATION_TOLERANCE = 1e-3
+LARGEST = 2.0**60  # numbers whose squares float32 holds, too
 
 T = TypeVar("T")
 Refuse = Callable[[DataError], None]
@@ -96,21 +97,25 @@ def require_file(path: Path) -> Path:
 def inside(root: Path, relative: str) -> Path:
     """Return the path below `root` that an annotation names. Links are followed if they stay below `root`.
 
+    Backslashes are separators, as on Windows. An absolute path may lead into `root`.
+
     Raises:
-        OutsidePath: the path is empty or absolute, has `..`, a backslash, drive, scheme or NUL, or a link leads out.
+        OutsidePath: the path is empty, has `..`, a drive, scheme or NUL, or it or a link leads out.
     """
-    path, windows = PurePath(relative), PureWindowsPath(relative)
-    plain = path.parts and not path.is_absolute() and ".." not in path.parts and not windows.drive
-    if not plain or any(text in relative for text in ("\0", "\\", "://")):
+    path, windows = PurePath(relative.replace("\\", "/")), PureWindowsPath(relative)
+    absolute = path.is_absolute() or windows.drive
+    if not path.parts or ".." in path.parts or any(text in relative for text in ("\0", "://")):
         raise OutsidePath(f"leads outside of {root}, or nowhere: {_shortened(relative)}")
     try:
         # `realpath` also accepts a path that does not exist, and one whose links form a ring.
         real_root, real_path = os.path.realpath(root), os.path.realpath(root / path)
     except ValueError:
         raise OutsidePath(f"characters that no file name has: {_shortened(relative)}") from None
-    if os.path.commonpath([real_root, real_path]) != real_root:
-        raise OutsidePath(f"a link leads outside of {root}: {_shortened(relative)} is {real_path}")
-    return root / path
+    if windows.drive or os.path.commonpath([real_root, real_path]) != real_root:
+        if absolute and not os.path.lexists(path):
+            raise OutsidePath(f"a path of another machine; make it relative to {root}: {_shortened(relative)}")
+        raise OutsidePath(f"leads outside of {root}: {_shortened(relative)} is {real_path}")
+    return root / (os.path.relpath(real_path, real_root) if absolute else path)
 
 
 def read_json(path: Path, allow_nan: bool = False) -> Any:
@@ -124,7 +129,7 @@ def read_json(path: Path, allow_nan: bool = False) -> Any:
         UnreadableFile: it is no (gzipped) JSON in UTF-8, or too large, unpacked or not.
     """
     try:
-        text = _read(path, MOST_BYTES).decode("utf-8")
+        text = _read(path, MOST_BYTES).decode("utf-8-sig")
         return json.loads(text, parse_constant=float if allow_nan else _refuse_constant)
     except (OSError, EOFError, ValueError, zlib.error, RecursionError, MemoryError) as error:
         raise UnreadableFile(f"not a JSON file ({str(error) or type(error).__name__})", str(path)) from None
@@ -133,7 +138,7 @@ def read_json(path: Path, allow_nan: bool = False) -> Any:
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
     """Read a text file in UTF-8; errors as in `read_json`."""
     try:
-        return _read(path, most_bytes).decode("utf-8")
+        return _read(path, most_bytes).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise UnreadableFile(f"not a text file ({type(error).__name__})", str(path)) from None
 
@@ -160,7 +165,7 @@ def field(entry: object, key: str, kind: type[T]) -> T:
 
 
 def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert numbers from JSON to a float64 array, and refuse other types, another shape, NaN and infinity."""
+    """Convert numbers from JSON to float64; refuse other types, another shape, and what is not finite in float32."""
     try:
         array = np.array(value)
     except ValueError:  # Lists of unequal length.
@@ -169,9 +174,10 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
     if array.shape != shape or array.dtype.kind not in "iuf":
         numbers = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
         raise BadAnnotation(f"{what} must be {numbers}, not {_shortened(value)}")
-    if not np.isfinite(array).all():
-        raise BadAnnotation(f"{what} is not finite: {_shortened(value)}")
-    return array.astype(np.float64)
+    array = array.astype(np.float64)
+    if not (np.abs(array) < LARGEST).all():
+        raise BadAnnotation(f"{what} is not finite in float32: {_shortened(value)}")
+    return array
 
 
 def require_rotation(matrix: np.ndarray, what: str) -> None:
