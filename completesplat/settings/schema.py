@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType, UnionType
-from typing import Annotated, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Annotated, Any, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints, is_typeddict
 
 from completesplat.errors import CompleteSplatError
 
@@ -108,7 +108,7 @@ def check_value(key: str, annotation: object, value: object) -> None:
     """Raise CompleteSplatError, with the values that are allowed, if a setting does not fit an annotation."""
     for place, part, reason in refused(annotation, value):
         example = f", such as {key}{place}=[{part}]" if reason == "must be a list" else ""
-        raise CompleteSplatError(f"{key}{place}={part}: {reason}{example}")
+        raise CompleteSplatError(f"{key}{place}={'null' if part is None else part}: {reason}{example}")
 
 
 def hints_of(function: object) -> dict[str, object]:
@@ -170,6 +170,8 @@ def refused(annotation: object, value: object) -> list[Refused]:
         return [bad._replace(place=f".{key}{bad.place}") for key, part, kind in kinds for bad in refused(kind, part)]
     if isinstance(annotation, type) and annotation in KINDS and not _is_a(annotation, value):
         return [Refused("", value, f"must be {KINDS[annotation]}")]
+    if value is None and (origin is Callable or isinstance(annotation, type) and annotation not in (*KINDS, object, Any)):
+        return [Refused("", value, "must not be null; leave it out")]
     return []
 
 

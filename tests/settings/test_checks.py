@@ -33,6 +33,11 @@ ODD = [
     ("data", "data_task=check workers=-1", "workers=-1: must be at least 1"),
     ("data", "frames=1001", "toy_objects: frames=1001: must lie between 2 and 1000"),
     ("fit", "autoreconstructor.encoder.channels=8", "autoreconstructor.encoder.channels=8: must be a list, such as "),
+    ("fit", "model=capture model.fitting.most=99999999999999", "model.fitting.most=99999999999999: must lie between 4"),
+    ("fit", "model=per_scene model.fitting.count=99999999999999", "model.fitting.count=99999999999999: must lie between"),
+    ("fit", "model=capture model.fitting=null", "model.fitting=null: must not be null; leave it out"),
+    ("fit", "model=per_scene model.fitting=null", "model.fitting=null: must not be null; leave it out"),
+    ("fit", "model.optimizer=null", "model.optimizer=null: must not be null; leave it out"),
     ("fit", "data=toy_rooms data.crop=top", "data.crop=top: choose one of center, principal"),
 ]
 
