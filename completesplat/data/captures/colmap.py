@@ -26,6 +26,7 @@ from completesplat.geometry.rotations import quaternion_to_matrix
 
 # Names and numbers of parameters by model id (colmap, `src/colmap/sensor/models.h`); other models are refused.
 MODELS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+PARTS = ("cameras", "images", "points3D")
 
 Row = Sequence[float | str]
 T = TypeVar("T")
@@ -49,8 +50,9 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
     """
     if not images.is_dir():
         raise MissingFile("no such folder", str(images))
-    suffix, read = ("bin", _binary_rows) if (model / "images.bin").is_file() else ("txt", _text_rows)
-    files = tuple(require_file(model / f"{name}.{suffix}") for name in ("cameras", "images", "points3D"))
+    suffix = max(READERS, key=lambda suffix: sum((model / f"{name}.{suffix}").is_file() for name in PARTS))
+    files = tuple(require_file(model / f"{name}.{suffix}") for name in PARTS)
+    read = READERS[suffix]
     lenses = dict(_parsed(_camera_of, read, files[0]))
     with at(files[1]):
         posed = _parsed(partial(_frame_of, lenses=lenses, images=images, masks=masks), read, files[1])
@@ -141,3 +143,7 @@ def _binary_rows(path: Path) -> Iterator[Row]:
             take(f"{8 * take('Q')[0]}x")
     if offset != len(content):
         raise ValueError
+
+
+READERS = {"bin": _binary_rows, "txt": _text_rows}
+"""Readers of the files of a model, the preferred one first."""
