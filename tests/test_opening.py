@@ -2,8 +2,8 @@
 
 import shutil
 import socket
-import time
 import subprocess
+import time
 
 import pytest
 
@@ -90,7 +90,9 @@ def test_without_a_network_a_name_on_the_hub_is_refused_at_once(name, tmp_path, 
 
 def test_published_weights_that_the_hubs_copy_lacks_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: str(tmp_path))
-    with pytest.raises(WeightsError, match=r"splatter_image:tables: config_tables\.yaml or model_tables\.pth is not in"):
+    with pytest.raises(
+        WeightsError, match=r"splatter_image:tables: config_tables\.yaml or model_tables\.pth is not in"
+    ):
         locate("splatter_image:tables")
 
 

@@ -39,7 +39,11 @@ ODD = [
     ("fit", "evaluation.precision=64", "evaluation.precision=64: choose one of 32-true, bf16-mixed, 16-mixed"),
     ("test", "evaluation.precision=bf16-true", "evaluation.precision=bf16-true: choose one of 32-true, bf16-mixed"),
     ("fit", "model=capture model.fitting.most=99999999999999", "model.fitting.most=99999999999999: must lie between 4"),
-    ("fit", "model=per_scene model.fitting.count=99999999999999", "model.fitting.count=99999999999999: must lie between"),
+    (
+        "fit",
+        "model=per_scene model.fitting.count=99999999999999",
+        "model.fitting.count=99999999999999: must lie between",
+    ),
     ("fit", "model=capture model.fitting=null", "model.fitting=null: must not be null; leave it out"),
     ("fit", "model=per_scene model.fitting=null", "model.fitting=null: must not be null; leave it out"),
     ("fit", "model.optimizer=null", "model.optimizer=null: must not be null; leave it out"),
