@@ -2,21 +2,11 @@
 
 import inspect
 import math
+import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType, UnionType
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    NamedTuple,
-    Union,
-    Unpack,
-    get_args,
-    get_origin,
-    get_type_hints,
-    is_typeddict,
-)
+from typing import Annotated, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints, is_typeddict
 
 from completesplat.errors import CompleteSplatError
 
@@ -181,7 +171,7 @@ def refused(annotation: object, value: object) -> list[Refused]:
         return [bad._replace(place=f".{key}{bad.place}") for key, part, kind in kinds for bad in refused(kind, part)]
     if isinstance(annotation, type) and annotation in KINDS and not _is_a(annotation, value):
         return [Refused("", value, f"must be {KINDS[annotation]}")]
-    is_part = isinstance(annotation, type) and annotation not in (*KINDS, object, Any)
+    is_part = isinstance(annotation, type) and annotation not in (*KINDS, object, typing.Any)
     if value is None and (is_part or origin is Callable):
         return [Refused("", value, "must not be null; leave it out")]
     return []
