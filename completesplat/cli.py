@@ -9,6 +9,23 @@ VERBS = ("data", "plan", "fit", "test", "predict", "view", "report", "new", "ben
 
 def main() -> None:
     """Run the command; exit with status 0 only if everything worked, 2 for a refused input, 1 for other failures."""
+    try:
+        try:
+            _run()
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except OSError:
+        try:
+            os.write(sys.stdout.fileno(), b"\n")
+        except OSError as error:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            closed = isinstance(error, BrokenPipeError)  # by the reader of the output (`head`, say)
+            sys.exit(1 if closed else _refuse(f"standard output: cannot be written: {error.strerror}", 1))
+        raise
+
+
+def _run() -> None:
     # Paths may hold bytes that are not UTF-8. Standard error escapes them by default.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -37,9 +54,6 @@ def main() -> None:
         launch(arguments[0], arguments[1:])
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:  # the reader of the output (`head`, say) closed it
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
     except Exception as error:
         message = refusal(error)
         if message is None:

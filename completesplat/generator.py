@@ -28,7 +28,7 @@ from completesplat.scene import Views
 from completesplat.scene_model import SceneModel, Visible, camera_tensors
 from completesplat.settings.schema import Natural, Positive, Seed
 from completesplat.splatter_image import SplatterImage
-from completesplat.tensors import concatenate
+from completesplat.tensors import concatenate, in_float32
 from completesplat.weights import first_line
 from completesplat.weights.checkpoint_reading import not_finite
 
@@ -181,6 +181,7 @@ class CompleteSplat(SceneModel):
         self.architecture["sampler"] = config
 
     @staticmethod
+    @in_float32()
     def from_pretrained(path: Path | str) -> SceneModel:
         """Load what `save_pretrained` wrote or a run trained, in evaluation mode on the CPU; stage 1 is a `OneAnswer`.
 

@@ -24,7 +24,7 @@ from completesplat.rasterizers.selection import auto
 from completesplat.scene import Views
 from completesplat.settings.schema import Natural, check_settings
 from completesplat.splatter_image import Parameterization
-from completesplat.tensors import concatenate
+from completesplat.tensors import concatenate, in_float32
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, read_small, shipped, write_sums
 
 Visible = Float[Tensor, "batch 1 height width"]  # masks that are 0 where an image is hidden, and 1 elsewhere
@@ -125,6 +125,7 @@ class SceneModel(nn.Module):
         """Return the settings that a data set with the config `data` must have for this model."""
         return {"image_size": self.image_size} | ({} if self.background is None else {"background": self.background})
 
+    @in_float32()
     def forward(
         self, image: Photograph | ImageLike, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any
     ) -> list[Gaussians]:
@@ -136,8 +137,11 @@ class SceneModel(nn.Module):
             **settings: `samples`, `skip_weight`, `color_fits`, `steps`, `seed`, ...: see `generate`.
 
         Raises:
-            CompleteSplatError: the image is not readable, or `generate` refuses an option.
+            CompleteSplatError: the image is not readable, the weights are not float32, or `generate` refuses an option.
         """
+        if (dtype := self.up.dtype) != torch.float32:
+            message = f"the model's weights are {dtype}; model.float() makes them float32, which scenes need"
+            raise CompleteSplatError(message)
         check_settings(self.generate, settings)
         photograph = image if isinstance(image, Photograph) else self.read(image)
         device = self.up.device

@@ -1,6 +1,7 @@
 """Frozen dataclasses of tensors, which are moved between devices, batched and indexed together."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
@@ -9,6 +10,17 @@ from torch import Tensor
 from torch.utils.data import default_collate
 
 T = TypeVar("T", bound="TensorDataclass")
+
+
+@contextmanager
+def in_float32() -> Iterator[None]:
+    """Make float32, in which networks and cameras compute, torch's default type in the block or decorated function."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
 
 
 @dataclass(frozen=True)

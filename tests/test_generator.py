@@ -94,6 +94,21 @@ def test_one_model_draws_in_four_threads_what_it_draws_one_after_the_other(model
     assert all(same(*pair) for scenes in zip(alone, together, strict=True) for pair in zip(*scenes, strict=True))
 
 
+def test_another_default_type_of_torch_changes_nothing_and_weights_of_another_type_are_refused(folder, photo):
+    expected = CompleteSplat.from_pretrained(folder)(photo, samples=1, steps=1)[0]
+    torch.set_default_dtype(torch.float64)
+    try:
+        model = CompleteSplat.from_pretrained(folder)
+        assert same(model(photo, samples=1, steps=1)[0], expected)
+        assert torch.get_default_dtype() == torch.float64
+    finally:
+        torch.set_default_dtype(torch.float32)
+    for dtype in (torch.bfloat16, torch.float16, torch.float64):
+        with pytest.raises(CompleteSplatError, match=r"weights are torch\.\w+; model\.float\(\) makes them float32"):
+            model.to(dtype)(photo, samples=1, steps=1)
+    assert len(model.float()(photo, samples=1, steps=1)) == 1
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -1,7 +1,9 @@
 """Names of weights: which file is meant, and whether it is whole."""
 
 import shutil
+import socket
 import subprocess
+import time
 
 import pytest
 
@@ -68,6 +70,30 @@ def test_a_hub_repository_in_the_cache_needs_no_network(tiny_weights, tmp_path, 
     assert locate("some/splats") == repository / "snapshots" / commit / WEIGHTS_FILE
     with pytest.raises(WeightsError, match="other/splats: no folder here, and not to be had from the hub"):
         locate("other/splats")
+
+
+@pytest.mark.parametrize("name", ["other/splats", "splatter_image:objaverse"])
+def test_without_a_network_a_name_on_the_hub_is_refused_at_once(name, tmp_path, monkeypatch, caplog):
+    import huggingface_hub.constants
+
+    def unknown(*_, **__):
+        raise socket.gaierror(-3, "Temporary failure in name resolution")
+
+    waits = []
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    monkeypatch.setattr(time, "sleep", waits.append)
+    with pytest.raises(WeightsError, match=r"not to be had from the hub \(.*name resolution"):
+        locate(name)
+    assert (waits, caplog.text) == ([], "")
+
+
+def test_published_weights_that_the_hubs_copy_lacks_are_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: str(tmp_path))
+    with pytest.raises(
+        WeightsError, match=r"splatter_image:tables: config_tables\.yaml or model_tables\.pth is not in"
+    ):
+        locate("splatter_image:tables")
 
 
 def test_a_name_that_is_too_long_for_a_file_is_refused_in_a_short_line():

@@ -7,6 +7,7 @@ depths, or from points, where a data set has them.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int64
@@ -18,7 +19,7 @@ from completesplat.geometry.harmonics import SH_C0
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
-from completesplat.settings.schema import Positive, Share
+from completesplat.settings.schema import Positive, Range, Share
 
 POSITION_RATE, POSITION_DECAY = 1.6e-4, 0.01
 RATES = {"log_scales": 5e-3, "quaternions": 1e-3, "logits": 5e-2, "harmonics": 2.5e-3}
@@ -28,6 +29,7 @@ positions is relative to the scene's extent and decays exponentially to a hundre
 DEAD_OPACITY, MOST_COPIES = 0.005, 51  # as in the authors' code and gsplat
 NOISE, NOISE_STEEPNESS = 5e5, 100.0
 NEIGHBOURS = 3
+Count = Annotated[int, Range(NEIGHBOURS + 1, 10**7)]  # of Gaussians; 3DGS's largest scenes have six million
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class FittingSettings:
         position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
     """
 
-    count: Positive = 4000
+    count: Count = 4000
     steps: Positive = 300
     views: Positive = 2
     opacity: Share = 0.1

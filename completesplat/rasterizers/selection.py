@@ -96,7 +96,7 @@ def _proof(constants: RenderingConstants | None) -> Path:
 
     folder = cache_directory() or Path(os.devnull)
     settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
-    files = *sorted(Path(__file__).parent.glob("*.py")), *sorted(folder.glob("*/*.nb?"))
+    files = *sorted(Path(__file__).parent.glob("*.py")), *sorted(folder.glob("kernels_*/*.nb?"))
     facts = repr((settings, constants, torch.__version__)).encode()
     digest = sha256(b"".join([facts, *(path.read_bytes() for path in files)])).hexdigest()
     return folder / f"passed-{digest}"

@@ -28,19 +28,31 @@ LEVELS = (
 )
 
 
+Precision = Annotated[object, OneOf(("32-true", "bf16-mixed", "16-mixed", 32, "bf16", 16))]
+"""Lightning's precisions with weights in float32, which Gaussians and cameras need."""
+
+
 class Trainer(TypedDict):
     """Settings whose ranges Lightning does not check."""
 
+    precision: Precision
     accumulate_grad_batches: Positive
     val_check_interval: Annotated[float, Range(1e-6)] | str | Mapping[str, int] | None
     check_val_every_n_epoch: Positive | None
     gradient_clip_val: Annotated[float, Range(0)] | None
 
 
+class Evaluation(TypedDict):
+    """Settings of a protocol."""
+
+    precision: Precision
+
+
 class Fit(TypedDict):
     """Settings of `completesplat fit`."""
 
     trainer: Trainer
+    evaluation: Evaluation
     seed: Annotated[int, Range(0, 2**32 - 1)]
     ckpt_path: str | None
     test: bool
@@ -115,6 +127,7 @@ class ModelSettings(RunSettings):
 class Test(ModelSettings):
     """Settings of `completesplat test`."""
 
+    evaluation: Evaluation
     scenes: str | None
     frame: Annotated[str, OneOf(("opencv", "opengl"))]
     align: Annotated[str, OneOf(("none", "scale"))]

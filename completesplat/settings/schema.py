@@ -2,6 +2,7 @@
 
 import inspect
 import math
+import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType, UnionType
@@ -108,7 +109,7 @@ def check_value(key: str, annotation: object, value: object) -> None:
     """Raise CompleteSplatError, with the values that are allowed, if a setting does not fit an annotation."""
     for place, part, reason in refused(annotation, value):
         example = f", such as {key}{place}=[{part}]" if reason == "must be a list" else ""
-        raise CompleteSplatError(f"{key}{place}={part}: {reason}{example}")
+        raise CompleteSplatError(f"{key}{place}={'null' if part is None else part}: {reason}{example}")
 
 
 def hints_of(function: object) -> dict[str, object]:
@@ -170,6 +171,9 @@ def refused(annotation: object, value: object) -> list[Refused]:
         return [bad._replace(place=f".{key}{bad.place}") for key, part, kind in kinds for bad in refused(kind, part)]
     if isinstance(annotation, type) and annotation in KINDS and not _is_a(annotation, value):
         return [Refused("", value, f"must be {KINDS[annotation]}")]
+    is_part = isinstance(annotation, type) and annotation not in (*KINDS, object, typing.Any)
+    if value is None and (is_part or origin is Callable):
+        return [Refused("", value, "must not be null; leave it out")]
     return []
 
 

@@ -25,6 +25,7 @@ MEASURES = [
 ]
 PARTS = ("min", "median", "max")
 BINS = 30
+SMALLEST_SPAN = 1e-6  # of a histogram, relative to its values: closer ones differ by rounding, and bins would be empty
 CHUNK = 256
 
 # A sequence's smallest, median and largest value of each measure.
@@ -117,7 +118,10 @@ def _histogram(key: str, rows: dict[str, list[Row]]) -> dict[str, Any]:
         step = int(np.ceil((np.ptp(together) + 1) / BINS))
         edges = np.arange(together.min() - 0.5, together.max() + step, step)
     else:
-        edges = np.histogram_bin_edges(together, BINS)
+        low, high = (together.min(), together.max()) if len(together) else (0.0, 1.0)
+        if high - low <= SMALLEST_SPAN * high:
+            low, high = 0.5 * low, 1.5 * high or 1.0
+        edges = np.linspace(low, high, BINS + 1)
     counts = {split: np.histogram(members, edges)[0].tolist() for split, members in values.items()}
     return {"edges": edges.tolist(), "counts": counts}
 

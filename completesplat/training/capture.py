@@ -19,6 +19,7 @@ from completesplat.baselines.fitting import (
     POSITION_DECAY,
     POSITION_RATE,
     RATES,
+    Count,
     RawGaussians,
     gaussians_at_points,
     initial_gaussians,
@@ -41,7 +42,6 @@ from completesplat.tensors import stack
 from completesplat.training.optimization import Schedule, constant
 from completesplat.training.stage import Renders, Stage
 
-Count = Annotated[int, Range(NEIGHBOURS + 1)]
 REFINED_SHARE = 0.8  # of the run, in which Gaussians move and are added (25,000 of 30,000 steps in 3DGS-MCMC)
 
 logger = logging.getLogger(__name__)

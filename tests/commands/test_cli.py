@@ -33,6 +33,19 @@ def test_a_reader_that_goes_away_is_no_fault_of_the_program():
 
 
 @pytest.mark.processes
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs Linux's /dev/full")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("arguments", ["--version", "doctor"])
+def test_an_output_that_cannot_be_written_is_one_line(arguments, unbuffered, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
+    started = [sys.executable, "-m", "completesplat", *arguments.split()]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(started, stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    refused = "error: standard output: cannot be written: No space left on device\n"
+    assert (done.returncode, done.stderr) == (1, refused)
+
+
+@pytest.mark.processes
 @pytest.mark.parametrize("given", [None, "7"])
 def test_torch_is_loaded_with_short_waits_of_its_threads(given):
     """The setting counts at the moment when torch is loaded, so a new process prints it there and ends."""

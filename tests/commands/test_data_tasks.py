@@ -1,5 +1,7 @@
 """`completesplat data toy`, `stats`, `show`, `prepare` and `import`: what they write, say and refuse."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -55,6 +57,15 @@ def test_statistics_are_drawn_and_the_sheet_shows_as_many_scenes_as_asked(comman
         heights.append(imageio.imread(tmp_path / str(scenes) / "show.png").shape[0])
     assert heights[0] < heights[1]
     assert "scenes=9: must lie between 1 and 8" in refused("data", "data_task=show", *sets[kind], "scenes=9")
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("option", ["disabled", "none", "stdout"])
+def test_hydras_other_ways_of_logging_work(sets, option, tmp_path):
+    """In processes, because Hydra disables all loggers of this one."""
+    started = [sys.executable, "-m", "completesplat", "data", "stats", *sets["objects"], f"out={tmp_path / 'out'}"]
+    done = subprocess.run([*started, f"hydra/job_logging={option}"], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (0, str(tmp_path / "out")), done.stderr
 
 
 def test_splits_are_some_of_the_three(tmp_path):

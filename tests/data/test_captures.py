@@ -446,6 +446,18 @@ def test_missing_images_are_left_out_and_those_outside_and_what_is_no_model_are_
         read_colmap(model, images)
 
 
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_a_file_that_a_binary_model_lacks_is_named_and_a_whole_text_model_is_read_instead(tmp_path, file):
+    model, images = write_model(tmp_path, "PINHOLE"), tmp_path / "images"
+    frames = len(read_colmap(model, images).frames)
+    (model / file).unlink()
+    with pytest.raises(MissingFile, match=f"{file}: no such file"):
+        read_colmap(model, images)
+    for text in write_model(tmp_path / "text", "PINHOLE", binary=False).glob("*.txt"):
+        text.rename(model / text.name)
+    assert len(read_colmap(model, images).frames) == frames
+
+
 def test_pycolmap_is_needed_for_distorted_lenses_only(monkeypatch, tmp_path):
     write_model(tmp_path / "plain", "PINHOLE")
     write_transforms(tmp_path / "barrel", **BARREL)

@@ -95,6 +95,12 @@ def test_unknown_subsets_and_missing_and_outside_categories_are_refused(tmp_path
     with pytest.raises(DataError, match=r"'other'.*fewview_dev, manyview_dev_0") as caught:
         read(tmp_path / "root", subset="other")
     assert caught.value.file == str(lists)
+    for path in lists.iterdir():
+        path.unlink()
+    with pytest.raises(
+        DataError, match=r"no set list 'other' there; nor any other; give data.subset=null, which splits"
+    ):
+        read(tmp_path / "root", subset="other")
     with pytest.raises(DataError, match="no such CO3D category") as caught:
         read_category(tmp_path / "root", "none", SUBSET, SeededSplit(0.1, 0.1, 0), Filters())
     assert caught.value.file == str(tmp_path / "root/none")

@@ -1,7 +1,9 @@
+import math
 import struct
 import warnings
 import zlib
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from PIL import Image, ImageCms
 
 from completesplat.data.images import files
 from completesplat.data.images.photograph import read_photograph
-from completesplat.errors import ImageError
+from completesplat.errors import CompleteSplatError, ImageError
 
 SIZE = 16
 
@@ -258,3 +260,20 @@ def test_images_in_memory_are_read_as_files_are(tmp_path):
 def test_images_in_memory_without_one_plain_meaning_are_refused(wrong, reason):
     with pytest.raises(ImageError, match=reason):
         read_photograph(wrong, SIZE)
+
+
+@pytest.mark.parametrize("fov", [1e-300, 0, -5, math.nextafter(180, 0), 200, float("nan")])
+def test_fields_of_view_that_no_lens_has_are_refused(fov):
+    """Of 1e-300 degrees the focal length is infinite in float32; of nearly 180 it is negative."""
+    for given in ({"fov_degrees": fov}, {"default_fov_degrees": fov}):
+        with pytest.raises(CompleteSplatError, match=r"must lie between 0\.1 and 179 degrees, not "):
+            read_photograph(RGB, SIZE, **given)
+    for edge in (0.1, 179):
+        assert read_photograph(RGB, SIZE, fov_degrees=edge).fov_degrees == edge
+
+
+@pytest.mark.parametrize("source", [None, 5, [[1, 2], [3, 4]], b"a.png", {"image": "a.png"}])
+def test_what_is_neither_a_file_nor_pixels_is_refused(source, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # users have no type checker at run time
+    with pytest.raises(ImageError, match=f"{type(source).__name__}: give a file name, a PIL image, an array or a"):
+        read_photograph(source, SIZE)

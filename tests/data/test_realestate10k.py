@@ -82,6 +82,15 @@ def test_a_point_reprojects_onto_its_pixel(tmp_path, form, crop):
     torch.testing.assert_close(views.cameras.intrinsics[:, :2, 2], expected)
 
 
+@pytest.mark.parametrize("suffix", [".jpeg", ".JPG"])
+def test_jpeg_files_have_any_of_their_suffixes(suffix, tmp_path):
+    root = write_tree(tmp_path, "text", [make_clip("a")], [])
+    expected = module(root, val_fraction=0.0).source("train").read("a").read(3).image
+    for path in root.glob("train/a/*.jpg"):
+        path.rename(path.with_suffix(suffix))
+    assert torch.equal(module(root, val_fraction=0.0).source("train").read("a").read(3).image, expected)
+
+
 def test_targets_stay_near_the_reference_and_may_be_none(root):
     data = module(root, min_gap=1, max_gap=2)
     for seed in range(50):

@@ -116,8 +116,8 @@ def tests_run(monkeypatch, tmp_path) -> list[str]:
     monkeypatch.setattr(selection, "failure", lambda name, constants: ran.append(name) or test(name, constants))
     monkeypatch.setattr(selection, "FASTER", {"tiled": Works})
     monkeypatch.setattr(compilation, "cache_directory", lambda: tmp_path)
-    (tmp_path / "machine").mkdir()
-    (tmp_path / "machine/kernel.nbc").write_bytes(b"code")
+    (tmp_path / "kernels_machine").mkdir()
+    (tmp_path / "kernels_machine/kernel.nbc").write_bytes(b"code")
     return ran
 
 
@@ -133,9 +133,9 @@ def test_a_passed_test_is_not_repeated_under_the_same_conditions(tests_run, tmp_
         selection.auto(constants)
         return len(tests_run) == before + 1
 
-    (tmp_path / "machine/kernel.nbc").write_bytes(b"cope")
+    (tmp_path / "kernels_machine/kernel.nbc").write_bytes(b"cope")
     assert tested_again()
-    (tmp_path / "machine/other.nbi").write_bytes(b"index")
+    (tmp_path / "kernels_machine/other.nbi").write_bytes(b"index")
     assert tested_again()
     monkeypatch.setattr(torch, "__version__", "3.0")
     assert tested_again()

@@ -33,6 +33,20 @@ ODD = [
     ("data", "data_task=check workers=-1", "workers=-1: must be at least 1"),
     ("data", "frames=1001", "toy_objects: frames=1001: must lie between 2 and 1000"),
     ("fit", "autoreconstructor.encoder.channels=8", "autoreconstructor.encoder.channels=8: must be a list, such as "),
+    ("fit", "trainer.precision=bf16-true", "trainer.precision=bf16-true: choose one of 32-true, bf16-mixed, 16-mixed"),
+    ("fit", "trainer.precision=64-true", "trainer.precision=64-true: choose one of 32-true, bf16-mixed, 16-mixed"),
+    ("plan", "trainer.precision=16-true", "trainer.precision=16-true: choose one of 32-true, bf16-mixed, 16-mixed"),
+    ("fit", "evaluation.precision=64", "evaluation.precision=64: choose one of 32-true, bf16-mixed, 16-mixed"),
+    ("test", "evaluation.precision=bf16-true", "evaluation.precision=bf16-true: choose one of 32-true, bf16-mixed"),
+    ("fit", "model=capture model.fitting.most=99999999999999", "model.fitting.most=99999999999999: must lie between 4"),
+    (
+        "fit",
+        "model=per_scene model.fitting.count=99999999999999",
+        "model.fitting.count=99999999999999: must lie between",
+    ),
+    ("fit", "model=capture model.fitting=null", "model.fitting=null: must not be null; leave it out"),
+    ("fit", "model=per_scene model.fitting=null", "model.fitting=null: must not be null; leave it out"),
+    ("fit", "model.optimizer=null", "model.optimizer=null: must not be null; leave it out"),
     ("fit", "data=toy_rooms data.crop=top", "data.crop=top: choose one of center, principal"),
 ]
 
@@ -44,6 +58,7 @@ def test_a_wrong_value_is_refused_with_the_allowed_values(verb, setting, message
         "data": ["data_task=toy"],
         "test": ["ckpt=nowhere"],
         "view": [],
+        "plan": [],
     }
     assert message in refused(verb, *given.get(verb, ["trainer.max_steps=1"]), *setting.split())
 

@@ -53,7 +53,7 @@ GOOD: dict[str, Any] = {
 def test_what_does_not_fit_is_named_with_what_it_may_be(setting, value, message):
     with pytest.raises(CompleteSplatError) as caught:
         check_settings(task, GOOD | {setting: value})
-    assert str(caught.value) == f"{setting}={value}: {message}"
+    assert str(caught.value) == f"{setting}={'null' if value is None else value}: {message}"
 
 
 def test_what_fits_is_accepted_and_what_lies_deeper_is_named_with_its_place():

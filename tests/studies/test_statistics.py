@@ -6,6 +6,7 @@ from dataclasses import replace
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+import torch
 
 from completesplat.studies.statistics import MEASURES, plot_statistics, show_statistics, statistics
 
@@ -79,6 +80,18 @@ def test_every_sequence_is_in_one_bin_of_each_histogram(orbit):
         assert all(len(counts) == len(histogram["edges"]) - 1 for counts in histogram["counts"].values())
     histogram = statistics({"a": [orbit(n) for n in (3, 5, 3)]})["histograms"]["frames_per_sequence"]
     assert histogram == {"edges": [2.5, 3.5, 4.5, 5.5], "counts": {"a": [2, 0, 1]}}  # by whole numbers
+
+
+@pytest.mark.parametrize("far", [4.0, 1e-30, 1e30])
+def test_values_that_differ_by_rounding_alone_share_a_histogram_around_them(orbit, far):
+    """As of two splits of a capture whose cameras are all equally far, about any distance."""
+    depths = {"train": far, "test": math.nextafter(far, math.inf), "val": far}
+    ranges = {split: torch.tensor([[far / 2, value]] * 3, dtype=torch.float64) for split, value in depths.items()}
+    sequences = {split: [replace(orbit(3), depth_ranges=depth)] for split, depth in ranges.items()}
+    histogram = statistics(sequences)["histograms"]["far"]
+    assert {split: sum(counts) for split, counts in histogram["counts"].items()} == dict.fromkeys(depths, 1)
+    assert histogram["edges"][0] < far < histogram["edges"][-1]
+    assert np.all(np.diff(histogram["edges"]) > 0)
 
 
 def test_the_plot_has_a_line_for_each_split_with_sequences(orbit, tmp_path):

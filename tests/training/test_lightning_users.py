@@ -8,7 +8,7 @@ from pathlib import Path
 import lightning
 import pytest
 import torch
-from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
 from support import SMALL
 
 import completesplat
@@ -50,6 +50,28 @@ def test_validation_and_prediction_are_lightnings_own(pipeline):
     scenes = trainer.predict(model, data)
     assert all(isinstance(part, Gaussians) for part in scenes)
     assert sum(len(part.means) for part in scenes) == len(data.store("test").names)
+
+
+def test_overfit_batches_trains_and_validates_on_the_same_scenes_in_all_epochs(toy_root):
+    class Seen(Callback):
+        def __init__(self):
+            self.training, self.validation = [], []
+
+        def on_train_batch_start(self, trainer, model, batch, index):
+            self.training.append(batch)
+
+        def on_validation_batch_start(self, trainer, model, batch, index, loader=0):
+            self.validation += batch.names
+
+    seen, (data, model) = Seen(), opened(toy_root, "data.batch_size=1")
+    given = {"overfit_batches": 1, "max_epochs": 3, "enable_checkpointing": False, "enable_model_summary": False}
+    lightning.Trainer(**QUIET, **given, callbacks=[seen]).fit(model, data)
+    assert len(seen.training) == 3
+    assert len({name for batch in seen.training for name in batch.names}) == 1
+    for batch in seen.training[1:]:
+        assert torch.equal(batch.reference.images, seen.training[0].reference.images)
+        assert torch.equal(batch.targets.images, seen.training[0].targets.images)
+    assert len(set(seen.validation)) == 1
 
 
 def test_a_checkpoint_is_held_to_the_rules_of_a_run(pipeline, tmp_path):

@@ -18,7 +18,7 @@ from torch import Tensor
 from completesplat.errors import TensorFileError, WeightsError
 from completesplat.files import atomic_path, make_folder, write_text
 from completesplat.settings.schema import Entries, Few, Natural, Range, Width, refused, shown
-from completesplat.weights import RUN_WEIGHTS, first_line, read_small
+from completesplat.weights import RUN_WEIGHTS, from_hub, read_small
 from completesplat.weights.checkpoint_reading import read_tensor_file
 
 HUB = "szymanowiczs/splatter-image-v1"
@@ -129,18 +129,15 @@ def _local(path: Path) -> Path:
 
 
 def _download(name: str) -> tuple[Path, Path]:
-    from huggingface_hub import hf_hub_download
-
     if not re.fullmatch(r"\w+", name):
         raise WeightsError(f"{PREFIX}{shown(name)}: give NAME of a config_NAME.yaml at https://huggingface.co/{HUB}")
     files = f"config_{name}.yaml", GENERAL_FILE if name == GENERAL else f"model_{name}.pth"
-    try:
-        config, model = (Path(hf_hub_download(HUB, file)) for file in files)
-    except Exception as error:  # from the hub, its HTTP library or the file system
-        raise WeightsError(
-            f"{PREFIX}{name}: not to be had from the hub ({first_line(error)}); where there is a network, "
-            f"`hf download {HUB} {' '.join(files)} --local-dir DIR` fetches it; then give weights=DIR/{files[1]}"
-        ) from error
+    advice = f"where there is a network, `hf download {HUB} {' '.join(files)} --local-dir DIR` fetches it; "
+    advice += f"then give weights=DIR/{files[1]}"
+    folder = from_hub(HUB, files, advice)
+    config, model = (folder / file for file in files)
+    if not (config.is_file() and model.is_file()):
+        raise WeightsError(f"{PREFIX}{name}: {' or '.join(files)} is not in {folder}, the copy of {HUB}; {advice}")
     return config, model
 
 

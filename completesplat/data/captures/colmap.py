@@ -28,6 +28,7 @@ from completesplat.geometry.rotations import quaternion_to_matrix
 
 # Names and numbers of parameters by model id (colmap, `src/colmap/sensor/models.h`); other models are refused.
 MODELS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+PARTS = ("cameras", "images", "points3D")
 
 Row = Sequence[float | str]
 T = TypeVar("T")
@@ -52,7 +53,7 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
     if not images.is_dir():
         raise MissingFile("no such folder", str(images))
     suffix, read = _form(model)
-    files = tuple(require_file(model / f"{name}.{suffix}") for name in ("cameras", "images", "points3D"))
+    files = tuple(require_file(model / f"{name}.{suffix}") for name in PARTS)
     lenses = dict(_parsed(_camera_of, read, files[0]))
     with at(files[1]):
         posed = _parsed(partial(_frame_of, lenses=lenses, images=images, masks=masks), read, files[1])
@@ -77,7 +78,9 @@ def image_count(model: Path) -> int:
 
 
 def _form(model: Path) -> tuple[str, Callable[[Path], Iterator[Row]]]:
-    return ("bin", _binary_rows) if (model / "images.bin").is_file() else ("txt", _text_rows)
+    """Return the suffix that most of the model's files have, and its reader."""
+    suffix = max(READERS, key=lambda suffix: sum((model / f"{name}.{suffix}").is_file() for name in PARTS))
+    return suffix, READERS[suffix]
 
 
 def _parsed(parse: Callable[[Row], T], read: Callable[[Path], Iterator[Row]], path: Path) -> list[T]:
@@ -163,3 +166,7 @@ def _binary_rows(path: Path) -> Iterator[Row]:
             take(f"{8 * take('Q')[0]}x")
     if offset != len(content):
         raise ValueError
+
+
+READERS = {"bin": _binary_rows, "txt": _text_rows}
+"""Readers of the files of a model, the preferred one first."""

@@ -46,7 +46,8 @@ def set_list_path(category: Path, subset: str | None) -> Path | None:
     folder = category / "set_lists"
     subsets = sorted(path.stem.removeprefix("set_lists_") for path in folder.glob("set_lists_*.json"))
     if subset not in subsets:
-        advice = f"choose data.subset among {', '.join([*subsets, 'null'])}; data.subset=null splits by seed"
+        choice = f"choose data.subset among {', '.join(subsets)}, or" if subsets else "nor any other; give"
+        advice = f"{choice} data.subset=null, which splits by seed"
         raise DataError(f"no set list {subset!r} there; {advice}", str(folder))
     return folder / f"set_lists_{subset}.json"
 

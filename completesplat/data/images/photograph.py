@@ -35,6 +35,7 @@ from completesplat.tensors import TensorDataclass
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM")
 SMALLEST_SIDE = 8
+FOVS = 0.1, 179  # degrees; float32 holds neither the focal lengths nor the depths of others
 DEEP_GREY_MODES = (*SIXTEEN_BIT_MODES, "I", "F")
 LARGEST_OBJECT = 4096  # pixels; larger ones are reduced before they are padded to a square of unbounded size
 LANCZOS_REACH = 3  # radius of the filter, in pixels of the coarser image
@@ -83,11 +84,11 @@ def read_photograph(
     Raises:
         ImageError: the file is missing or not a complete image of one of these formats, has more than 50 million pixels
             (checked before decoding) or less than 8 pixels on a side, or its pixel values are ambiguous.
-        CompleteSplatError: the field of view is outside (0, 180) degrees, or errors of `without_background`.
+        CompleteSplatError: the field of view is outside `FOVS`, or errors of `without_background`.
     """
     for fov in (fov_degrees, default_fov_degrees):
-        if fov is not None and not 0 < fov < 180:
-            raise CompleteSplatError(f"the field of view must lie between 0 and 180 degrees, not {fov}")
+        if fov is not None and not FOVS[0] <= fov <= FOVS[1]:
+            raise CompleteSplatError(f"the field of view must lie between {FOVS[0]} and {FOVS[1]} degrees, not {fov}")
     try:
         image, recorded = _square(source, size, remove_background, background, object_share)
     except ImageError as error:
@@ -106,6 +107,8 @@ def _square(
     """Return the resized central or object square, and the central square's EXIF field of view in degrees, if any."""
     if isinstance(source, (np.ndarray, Tensor)):
         source = _pixels(source)
+    if not isinstance(source, str | Path | Image.Image):
+        raise ImageError(f"{type(source).__name__}: give a file name, a PIL image, an array or a tensor")
     if not isinstance(source, Image.Image):
         try:
             exists = Path(source).is_file()

@@ -18,7 +18,7 @@ from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.loading.augmentation import BoxMasks, CameraJitter, ColorJitter, augment
 from completesplat.data.loading.distributed import batch_per_process, processes
 from completesplat.data.loading.latent_cache import CachedTrainingScenes, LatentCache
-from completesplat.data.loading.loader import EpochSampler, SceneLoader
+from completesplat.data.loading.loader import EpochSampler, RepeatedEpoch, SceneLoader
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.loading.training_statistics import TypicalCamera, feature_moments, mean_camera, mean_image
 from completesplat.data.loading.view_selection import evaluation_views, spread_views, training_views
@@ -232,7 +232,8 @@ class SceneDataModule(LightningDataModule):
         scenes = self._training_scenes()
         accumulated = 1 if self.trainer is None else self.trainer.accumulate_grad_batches
         batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
-        return SceneLoader(scenes, batch_size, EpochSampler(scenes.groups(), self.seed), self.workers, *self.policy)
+        sampler = RepeatedEpoch if getattr(self.trainer, "overfit_batches", 0) else EpochSampler
+        return SceneLoader(scenes, batch_size, sampler(scenes.groups(), self.seed), self.workers, *self.policy)
 
     def _check_training(self) -> None:
         """Raise if an epoch has fewer scenes than a batch, or every sequence has fewer frames than a scene needs."""

@@ -2,11 +2,11 @@
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
-from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import DataLoader, Sampler, SequentialSampler
 from torch.utils.data.dataloader import _BaseDataLoaderIter
 
 from completesplat.data.loading.distributed import processes
@@ -39,12 +39,17 @@ class EpochSampler(Sampler[tuple[int, int]]):
         return sum(map(len, self.groups)) // processes()[1]
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
+        epoch = 0 if isinstance(self, RepeatedEpoch) else self.epoch
         # The index after the last belongs to no item, so the order is independent of what the items draw.
-        rng = draws(self.seed, self.epoch, sum(map(len, self.groups)))
+        rng = draws(self.seed, epoch, sum(map(len, self.groups)))
         order = [i for group in rng.permutation(len(self.groups)) for i in rng.permutation(self.groups[group])]
         rank, count = processes()
         local = order[rank::count][: len(self)]
-        return iter([(self.epoch, int(index)) for index in local[self.start :]])
+        return iter([(epoch, int(index)) for index in local[self.start :]])
+
+
+class RepeatedEpoch(EpochSampler, SequentialSampler):  # type: ignore[misc]
+    """Sampler of the first epoch's items in all epochs, for `trainer.overfit_batches`; Lightning asks for its base."""
 
 
 class SceneLoader:
@@ -68,7 +73,7 @@ class SceneLoader:
     ) -> None:
         self.dataset = scenes
         self.batch_size = batch_size
-        self.sampler = sampler
+        self._order = sampler
         self.batch_sampler = None  # Lightning asks for it wherever there is a sampler
         self.on_bad = on_bad
         self.max_bad_fraction = max_bad_fraction
@@ -93,8 +98,13 @@ class SceneLoader:
         return len(self._loader)
 
     @property
+    def sampler(self) -> Iterable[Any]:
+        """Return the sampler of items, whose epoch Lightning sets."""
+        return self._loader.sampler
+
+    @property
     def _items(self) -> int:  # number of this process's items in an epoch
-        return len(self.dataset if self.sampler is None else self.sampler)
+        return len(self.dataset if self._order is None else self._order)
 
     def __iter__(self) -> Iterator[Any]:
         """Yield the batches (`SceneBatch` or `CachedScene`) of an epoch, or the rest of it after `load_state_dict`.
@@ -105,8 +115,8 @@ class SceneLoader:
         resume, self._resume = self._resume, {}
         self.refused, self.refused_depths = [], []
         self._batches = resume.get("batches", 0) if resume.get("epoch") == self._epoch else 0
-        if self.sampler is not None:
-            self.sampler.start = self._batches * self.batch_size
+        if self._order is not None:
+            self._order.start = self._batches * self.batch_size
         try:
             for scenes, refused, refused_depths in self._loader:
                 self._batches += 1
@@ -134,7 +144,7 @@ class SceneLoader:
 
     @property
     def _epoch(self) -> int:
-        return self.sampler.epoch if self.sampler is not None else 0
+        return self._order.epoch if self._order is not None else 0
 
     def state_dict(self) -> dict[str, int]:
         """Return the current epoch and the number of its batches that were yielded."""
@@ -151,7 +161,7 @@ class SceneLoader:
         self.refused += refused
         too_many = len(self.refused) > max(1, self.max_bad_fraction * self._items)
         # Training replaces unreadable items, so an empty batch is an error there; evaluation does not replace them.
-        nothing = empty and (self.sampler is not None or len(self.refused) == self._items)
+        nothing = empty and (self._order is not None or len(self.refused) == self._items)
         if too_many or nothing:
             limit = f"more than data.max_bad_fraction={self.max_bad_fraction:g} allows"
             what = f"{len(self.refused)} of {self._items} items cannot be read"

@@ -42,7 +42,7 @@ from completesplat.weights.checkpoint_reading import read_tensor_file
 
 CAMERA_NUMBERS = 18
 FORMATS = ("JPEG", "PNG")
-SUFFIXES = (".png", ".jpg")
+SUFFIXES = (".png", ".jpg", ".jpeg")
 MOST_BYTES = 2**26  # a frame needs about 300
 CHUNKS_IN_MEMORY = 2
 
@@ -173,7 +173,8 @@ def _images_of(folder: Path) -> dict[int, Path]:
     """Return image files by timestamp; JPEG is preferred to PNG."""
     with os.scandir(folder) as entries:
         paths = [Path(entry.path) for entry in entries]
-    ordered = sorted((path for path in paths if path.suffix in SUFFIXES), key=lambda path: SUFFIXES.index(path.suffix))
+    suffixes = {path: path.suffix.lower() for path in paths}
+    ordered = sorted((path for path in paths if suffixes[path] in SUFFIXES), key=lambda path: suffixes[path] != ".png")
     return {int(path.stem): path for path in ordered if path.stem.isdecimal()}
 
 

@@ -1,15 +1,13 @@
 """Analytic ray tracer: ellipsoids, cone frusta and boxes on the ground of a coloured dome, or in a room."""
 
-import inspect
 import math
-from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from completesplat.data.toy.shapes import BOX, CHECKS, ELLIPSOID, FRUSTUM, RIPPLES, STRIPES, Array, Shapes
+from completesplat.rasterizers.kernels.compilation import helper, kernel
 
 # Numbers of faces. A room has two across each of x, y and z, the lower one first; else there are a ground and a dome.
 FLOOR, CEILING = 2, 3
@@ -18,8 +16,6 @@ GROUND, DOME = 6, 7
 
 SELF_INTERSECTION = 1e-6
 WHITE = (1.0, 1.0, 1.0)
-
-F = TypeVar("F", bound=Callable[..., object])
 
 
 class Light(NamedTuple):
@@ -81,15 +77,10 @@ class Room(NamedTuple):
     decal_textures: Array
 
 
-def compiled(function: F, cache: bool = True, forceinline: bool = False) -> F:
-    """Compile a function with numba at its first call."""
-    # Unwrapping removes a run-time type checker's wrapper.
-    compiled: F = njit(inspect.unwrap(function), cache=cache, forceinline=forceinline, nogil=True, error_model="numpy")
-    return compiled
-
-
+# Without the kernels' "fastmath", so that all machines draw the same images.
+compiled = partial(kernel, fastmath=False)
 # Passing a tuple of arrays to a function that is not inlined costs as much as intersecting a sphere.
-inlined = partial(compiled, cache=False, forceinline=True)
+inlined = partial(helper, fastmath=False)
 
 
 @inlined

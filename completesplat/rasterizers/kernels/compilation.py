@@ -1,4 +1,4 @@
-"""Compilation of the kernels by numba, and the cache of their machine code."""
+"""Compilation of kernels, also of other folders, by numba, and the cache of their machine code."""
 
 import hashlib
 import inspect
@@ -28,22 +28,22 @@ OPTIONS: dict[str, Any] = {
 }
 
 
-def kernel(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Compile an entry point on its first call; later processes load it from the cache."""
+def kernel(function: Callable[..., Result], **changed: object) -> Callable[..., Result]:
+    """Compile an entry point on its first call, with changed `OPTIONS`; later processes load it from the cache."""
     before, directory = numba_config.CACHE_DIR, cache_directory()
     numba_config.CACHE_DIR = before if directory is None else str(directory)
     cached = directory is not None
     try:
-        compiled: Callable[..., Result] = numba.njit(cache=cached, **OPTIONS)(inspect.unwrap(function))
+        compiled: Callable[..., Result] = numba.njit(cache=cached, **OPTIONS | changed)(inspect.unwrap(function))
     finally:
         numba_config.CACHE_DIR = before
     return compiled
 
 
-def helper(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Compile a part of a kernel that is always inlined."""
+def helper(function: Callable[..., Result], **changed: object) -> Callable[..., Result]:
+    """Compile a part of a kernel that is always inlined, with the kernel's options."""
     # Unwrapping removes a type checker's wrappers, which numba could not compile.
-    compiled: Callable[..., Result] = numba.njit(forceinline=True, **OPTIONS)(inspect.unwrap(function))
+    compiled: Callable[..., Result] = numba.njit(forceinline=True, **OPTIONS | changed)(inspect.unwrap(function))
     return compiled
 
 
@@ -67,8 +67,8 @@ def cache_directory() -> Path | None:
             tempfile.TemporaryFile(dir=folder).close()
         except OSError:
             continue
-        if not any(folder.glob("*/*.nbc")):
-            logger.info("rasterizer: compiling its kernels on first use, once on this machine, takes 10 to 30 s")
+        if not any(folder.glob("kernels_*/*.nbc")):
+            logger.info("compiling the kernels on first use, once on this machine, takes 10 to 30 s")
         return folder
     logger.info("no writable cache folder (%s): kernels are compiled anew in every process", bases[-1])
     return None

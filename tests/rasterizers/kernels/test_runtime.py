@@ -4,6 +4,7 @@ import gc
 import logging
 import multiprocessing
 import os
+import runpy
 import subprocess
 import sys
 from multiprocessing.connection import Connection
@@ -13,8 +14,10 @@ import numpy as np
 import pytest
 import torch
 from degenerate_gaussians import camera, healthy
+from numba.core.caching import CacheImpl
 from support import LIMIT
 
+from completesplat.data.toy import raytracing
 from completesplat.rasterizers.kernels import compilation, drawing
 from completesplat.rasterizers.kernels.drawing import parallel
 from completesplat.rasterizers.tiled import TiledRasterizer
@@ -95,10 +98,22 @@ def test_without_a_writable_folder_kernels_are_compiled_but_not_kept(tmp_path, m
         with caplog.at_level(logging.INFO):
             assert compilation.kernel(_double)(3) == 6
             assert list(tmp_path.glob("kernels-*/*/*.nbc"))
-            assert caplog.text.count("compiling its kernels on first use") == 1
+            assert caplog.text.count("compiling the kernels on first use") == 1
             compilation.cache_directory.cache_clear()
             compilation.cache_directory()
-            assert caplog.text.count("compiling its kernels on first use") == 1  # they are in the cache
+            assert caplog.text.count("compiling the kernels on first use") == 1  # they are in the cache
+    finally:
+        compilation.cache_directory.cache_clear()
+
+
+def test_the_ray_tracer_compiles_where_numba_can_write_nowhere(tmp_path, monkeypatch) -> None:
+    """As in a read-only installation of a user without a home: numba finds no folder for its cache."""
+    monkeypatch.setattr(CacheImpl, "_locator_classes", [])
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(compilation.numba_config, "CACHE_DIR", str(tmp_path / "file"))
+    compilation.cache_directory.cache_clear()
+    try:
+        assert runpy.run_path(raytracing.__file__)["_trace"].stats.cache_path is None
     finally:
         compilation.cache_directory.cache_clear()
 
