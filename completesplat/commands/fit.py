@@ -75,8 +75,8 @@ def run(config: DictConfig, out: Path) -> None:
     # A test that cannot work is refused now, not after the training.
     tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
     callbacks, loggers = (
-        [part for part in build(parts, _convert_="all").values() if part is not None]
-        for parts in (config.callbacks, config.logger)
+        [part for part in build(config.get(parts, {}), _convert_="all").values() if part is not None]
+        for parts in ("callbacks", "logger")
     )
     trainer = build(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
@@ -161,7 +161,7 @@ def _logged(trainer: Trainer) -> dict[str, float]:
 
 def _test(config: DictConfig, module: Stage, data: SceneDataModule) -> dict[str, float]:
     """Score as `completesplat test` does, in the protocol's precision, and return all logged figures."""
-    progress = build(config.callbacks.progress, _convert_="all")
+    progress = build(OmegaConf.select(config, "callbacks.progress"), _convert_="all")
     settings = {"callbacks": [] if progress is None else [progress], "logger": False, "enable_checkpointing": False}
     trainer = build(config.trainer, precision=config.evaluation.precision, **settings, _convert_="all")
     trainer.test(module, datamodule=data, verbose=False)

@@ -170,7 +170,8 @@ def counted(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
     copied.rasterizer = {"_target_": "completesplat.training.step_counts.StoreOnly", "gpu": gpu}
     for key, value in changes.items():
         OmegaConf.update(copied, key, value)
-    targets = [get_class(callback._target_) for callback in config.callbacks.values() if callback is not None]
+    callbacks = config.get("callbacks", {}).values()
+    targets = [get_class(callback._target_) for callback in callbacks if callback is not None]
     averaged = any(issubclass(target, WeightAveraging) for target in targets)
     data, make = config.data, partial(build, copied.model, _convert_="all")
     sizes = (data.image_size, batch, data.targets, precision(config), config.trainer.accumulate_grad_batches)
