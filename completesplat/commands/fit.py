@@ -138,7 +138,7 @@ def refuse_without_effect(config: DictConfig, out: Path) -> None:
     """Raise CompleteSplatError for a setting of a command, not of a sweep, that its model does not use."""
     stage, given = get_class(config.model._target_), read_record(out).get("overrides", [])
     unused: tuple[str, ...] = getattr(stage, "without_effect", ())
-    if (out.parent / PLAN).is_file():
+    if any((parent / PLAN).is_file() for parent in out.parents):
         return
     if "trainer.max_" in unused and not config.test:
         raise CompleteSplatError(f"test=false: {stage.__name__} only fits the scenes of a test; leave it out")

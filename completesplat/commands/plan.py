@@ -60,8 +60,10 @@ class Total(Callback):
 
     def on_multirun_end(self, config: Any, **kwargs: object) -> None:
         """Print the table of all `plan.json` in the sweep's folder, in the order of the jobs."""
-        paths = sorted(Path(config.hydra.sweep.dir).glob("*/plan.json"), key=lambda path: path.stat().st_mtime)
-        plans = {path.parent.name.removeprefix("experiment-"): json.loads(path.read_text()) for path in paths}
+        folder = Path(config.hydra.sweep.dir)
+        paths = {path: path.parent.relative_to(folder).as_posix() for path in folder.glob("*/**/plan.json")}
+        ordered = sorted(paths, key=lambda path: path.stat().st_mtime)
+        plans = {paths[path].removeprefix("experiment-"): json.loads(path.read_text()) for path in ordered}
         if plans:
             show(plan_table(plans), width=60 + 30 * len(plans))
 
