@@ -135,11 +135,13 @@ class SceneModel(nn.Module):
             **settings: `samples`, `skip_weight`, `color_fits`, `steps`, `seed`, ...: see `generate`.
 
         Raises:
-            CompleteSplatError: the image is not readable, or `generate` refuses an option.
+            CompleteSplatError: the image is not readable, or `visible` or an option of `generate` is not as needed.
         """
         check_settings(self.generate, settings)
         photograph = image if isinstance(image, Photograph) else self.read(image)
-        device = self.up.device
+        device, shape = self.up.device, (1, self.image_size, self.image_size)
+        if visible is not None and (visible.shape != shape or not ((visible >= 0) & (visible <= 1)).all()):
+            raise CompleteSplatError(f"visible: needs values from 0 to 1 in shape {list(shape)}")
         scenes = self.eval().generate(
             photograph.image[None].to(device),
             self.camera(photograph)[None],
