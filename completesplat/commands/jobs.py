@@ -160,7 +160,7 @@ def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) 
     hydra_config, begun = HydraConfig.get(), (out / LAST).is_file()
     sweep = hydra_config.mode == RunMode.MULTIRUN
     replaced = ("out=", "ckpt_path=") if begun and not sweep else ("out=",)
-    again = ["completesplat", verb, *(argument for argument in given if not argument.startswith(replaced))]
+    again = ["completesplat", verb, *(argument for argument in given if not argument.lstrip("-").startswith(replaced))]
     again += ["ckpt_path=last"] if begun and not sweep else []
     again.append(f"out={hydra_config.sweep.dir if sweep else out}")
     checkpoint = f"; the checkpoint is {out / LAST}" if begun else ""
