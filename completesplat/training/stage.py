@@ -103,9 +103,21 @@ class Stage(LightningModule):
         self.seconds: dict[str, list[float]] = defaultdict(list)  # for each scene, by the name of the work
         self.config: Mapping[str, Any] | None = None
         self.gradient_norm: Tensor | None = None  # of this step, if `BadSteps` has computed it
+        self._lr: float | None = None
         self.accumulated: list[int] = []  # numbers of scenes of the batches since the last step
         # Lightning's name: some of several processes that test may have no scene.
         self.allow_zero_length_dataloader_with_multiple_devices = True
+
+    @property
+    def lr(self) -> float | None:
+        """Return the learning rate that Lightning's `LearningRateFinder` has set, None if the optimizer has its own."""
+        return self._lr
+
+    @lr.setter
+    def lr(self, rate: float) -> None:
+        self._lr = rate
+        for config in [] if self._trainer is None else self._trainer.lr_scheduler_configs:  # of a run that has begun
+            config.scheduler.base_lrs = [rate] * len(config.scheduler.base_lrs)
 
     @abstractmethod
     def reconstruct(self, scenes: SceneBatch, seed: int) -> Gaussians:
@@ -304,6 +316,8 @@ class Stage(LightningModule):
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Build the optimizer, and a schedule that spans the run, whether its length is given in steps or epochs."""
         optimizer = self.optimizer([p for p in self.parameters() if p.requires_grad])
+        for group in optimizer.param_groups:
+            group["lr"] = group["lr"] if self.lr is None else self.lr
         schedule = self.schedule(optimizer, self.trainer.estimated_stepping_batches)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
