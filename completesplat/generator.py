@@ -30,7 +30,7 @@ from completesplat.settings.schema import Natural, Positive, Seed
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import concatenate, in_float32
 from completesplat.weights import first_line
-from completesplat.weights.checkpoint_reading import not_finite
+from completesplat.weights.checkpoint_reading import mismatch, not_finite
 
 
 class CompleteSplat(SceneModel):
@@ -242,5 +242,7 @@ def _checked(architecture: dict[str, Any], training: Mapping[str, object] | None
 
 def _loaded(architecture: dict[str, Any], tensors: Mapping[str, Tensor]) -> SceneModel:
     model = (OneAnswer if "network" in architecture else CompleteSplat)(**architecture)
+    if (difference := mismatch(model.state_dict(), tensors)) is not None:
+        raise WeightsError(difference)
     model.load_state_dict(tensors)
     return model

@@ -137,14 +137,17 @@ class SceneModel(nn.Module):
             **settings: `samples`, `skip_weight`, `color_fits`, `steps`, `seed`, ...: see `generate`.
 
         Raises:
-            CompleteSplatError: the image is not readable, the weights are not float32, or `generate` refuses an option.
+            CompleteSplatError: the image is not readable, the weights are not float32, or `visible` or an option of
+                `generate` is not as needed.
         """
         if (dtype := self.up.dtype) != torch.float32:
             message = f"the model's weights are {dtype}; model.float() makes them float32, which scenes need"
             raise CompleteSplatError(message)
         check_settings(self.generate, settings)
         photograph = image if isinstance(image, Photograph) else self.read(image)
-        device = self.up.device
+        device, shape = self.up.device, (1, self.image_size, self.image_size)
+        if visible is not None and (visible.shape != shape or not ((visible >= 0) & (visible <= 1)).all()):
+            raise CompleteSplatError(f"visible: needs values from 0 to 1 in shape {list(shape)}")
         scenes = self.eval().generate(
             photograph.image[None].to(device),
             self.camera(photograph)[None],

@@ -225,6 +225,27 @@ def test_skips_are_off_where_something_is_hidden_and_weights_out_of_place_refuse
             model(photo, visible, steps=1, **{name: weight})
 
 
+def test_what_is_visible_needs_the_images_shape_and_values_from_0_to_1(model, photo, half):
+    unfit = [torch.where(half > 0, half, value) for value in (math.nan, math.inf, -0.5, 2.0)]
+    for visible in (*unfit, half[..., 1:], half[:, 1:]):
+        with pytest.raises(CompleteSplatError, match=r"^visible: needs values from 0 to 1 in shape \[1, 32, 32\]"):
+            model(photo, visible, steps=1)
+
+
+@pytest.mark.parametrize("kind", [torch.complex64, torch.bool, torch.int64])
+@pytest.mark.parametrize("ending", [".bias", "latent_std"])
+def test_weights_of_another_kind_than_floats_are_refused_and_not_cast(folder, kind, ending):
+    tensors = load_file(folder / WEIGHTS_FILE)
+    name = next(name for name in tensors if name.endswith(ending))
+    tensors[name] = torch.ones_like(tensors[name]).to(kind)
+    (folder / WEIGHTS_FILE).write_bytes(save(tensors))
+    (folder / SUMS_FILE).unlink()
+    shape = list(tensors[name].shape)
+    with pytest.raises(WeightsError) as caught:
+        CompleteSplat.from_pretrained(folder)
+    assert f"{name} is {shape} of {kind} there and {shape} here" in str(caught.value)
+
+
 def test_the_scenes_of_all_steps_are_shown(model, photo):
     shown = []
     scenes = model(photo, samples=3, steps=4, batch=2, on_step=lambda *step: shown.append(step))

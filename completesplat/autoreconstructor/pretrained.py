@@ -1,4 +1,4 @@
-"""Pretrained weights of Stable Diffusion's VAE in diffusers' layout, from a folder or the Hugging Face hub."""
+"""Pretrained weights of Stable Diffusion's VAE, from a file, a folder in diffusers' layout or the Hugging Face hub."""
 
 import json
 import re
@@ -13,9 +13,12 @@ from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.errors import WeightsError
 from completesplat.weights import CONFIG_FILE, first_line, from_hub
-from completesplat.weights.checkpoint_reading import mismatch
+from completesplat.weights.checkpoint_reading import mismatch, not_finite
 
-WEIGHTS_FILES = ("diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.bin")
+ENDINGS = (".safetensors", ".bin", ".fp16.safetensors", ".fp16.bin")
+WEIGHTS_FILES = tuple(f"diffusion_pytorch_model{ending}" for ending in ENDINGS)
+SUFFIXES = (".safetensors", ".bin", ".ckpt", ".pt", ".pth")
+LDM = re.compile(r"(?:first_stage_model\.|vae\.)?encoder\.down\.(\d+)\.")  # names in Stable Diffusion's own files
 PLACES = ("", "vae/")  # a VAE by itself, or within a whole pipeline
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[\w.-]+)?")
 ENCODER = ("encoder.", "quant_conv.")
@@ -37,20 +40,23 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
     The reconstructor's skips have no counterpart in the checkpoint and keep their values.
 
     Args:
-        source: a folder with `config.json` and `diffusion_pytorch_model.safetensors` (or `.bin`), a folder with these
-            in a subfolder `vae`, or a hub id of either.
+        source: a folder with `config.json` and `diffusion_pytorch_model.safetensors` (or `.bin`, `.fp16.safetensors`),
+            a folder with these in a subfolder `vae`, a hub id of either, or a file of the VAE or of a whole model, with
+            diffusers' names or Stable Diffusion's own (`first_stage_model`).
         reconstructor: None loads the encoder of a conditioning; the checkpoint may then lack a decoder.
 
     Raises:
-        WeightsError: the checkpoint is missing or damaged, or its VAE has another kind or size.
+        WeightsError: the checkpoint is missing, damaged or not finite, or its VAE has another kind or size.
     """
     part = "conditioning" if reconstructor is None else "autoreconstructor"
-    folder = _vae_folder(source, part)
+    file = _vae_file(source, part)
+    place, config_file = file.parent if file.name in WEIGHTS_FILES else file, file.with_name(CONFIG_FILE)
     try:
-        config = dict(json.loads((folder / CONFIG_FILE).read_text()))
-        weights = _read_weights(folder)
+        config = dict(json.loads(config_file.read_text())) if config_file.is_file() else {}
+        weights = _read_weights(file)
     except Exception as error:  # torch and safetensors raise many kinds for a damaged file
-        raise WeightsError(f"{folder}: damaged, or not a VAE ({first_line(error)}); fetch it again") from error
+        reason = f"damaged, or not a VAE ({first_line(error).partition('. ')[0]})"
+        raise WeightsError(f"{place}: {reason}; fetch it again, as .safetensors if there is one") from error
     decoder: dict[str, nn.Module] = {}
     if reconstructor is None:
         weights = {name: value for name, value in weights.items() if name.startswith(ENCODER)}
@@ -66,7 +72,9 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
     if reason is None and (activation := config.get("act_fn", "silu")) != "silu":  # weights do not show it
         reason = f"its activation is {activation}, not silu"
     if reason is not None:
-        raise WeightsError(f"{folder}: {reason}; {_needed_settings(config, part)}")
+        raise WeightsError(f"{place}: {reason}; {_needed_settings(config, part)}")
+    if (name := not_finite(loaded)) is not None:
+        raise WeightsError(f"{place}: {name} is not finite; fetch it again")
     vae.load_state_dict(loaded, strict=False)
 
 
@@ -80,11 +88,13 @@ def _needed_settings(config: Mapping[str, object], part: str) -> str:
         for theirs, ours in names.items()
         if theirs in config
     ]
-    return f"its config.json asks for {' '.join(overrides)}" if overrides else "its config.json gives no sizes"
+    return (
+        f"its config.json asks for {' '.join(overrides)}" if overrides else "no config.json beside it gives its sizes"
+    )
 
 
-def _vae_folder(source: str, part: str) -> Path:
-    """Return the folder of the VAE's files; download it from the hub if `source` is not a folder."""
+def _vae_file(source: str, part: str) -> Path:
+    """Return the file of the VAE's tensors; download it from the hub if `source` is not a file or folder."""
     local, is_id = Path(source).expanduser(), HUB_ID.fullmatch(source) is not None
     hub_id = source if is_id and not local.exists() else "CompVis/stable-diffusion-v1-4"
     advice = (
@@ -93,22 +103,31 @@ def _vae_folder(source: str, part: str) -> Path:
     )
     if not local.exists() and not is_id:
         raise WeightsError(f"{source}: no such folder; {advice}")
+    if local.is_file():
+        if local.suffix not in SUFFIXES:
+            raise WeightsError(f"{source}: not one of the files that are read: {', '.join(SUFFIXES)}")
+        return local
     for file in WEIGHTS_FILES:
         names = [f"{place}{name}" for place in PLACES for name in (CONFIG_FILE, file)]
         folder = local if local.exists() else from_hub(source, names, advice)
         for place in PLACES:
             if (folder / place / CONFIG_FILE).is_file() and (folder / place / file).is_file():
-                return folder / place
-    files = f"{CONFIG_FILE} and {WEIGHTS_FILES[0]} (or .bin)"
-    raise WeightsError(f"{source}: no {files} there, nor in a subfolder vae; {advice}")
+                return folder / place / file
+    reason = f"no {CONFIG_FILE} and {WEIGHTS_FILES[0]} (or .bin) there, nor in a subfolder vae"
+    if others := sorted(str(path) for path in local.glob("*") if path.suffix in SUFFIXES):
+        raise WeightsError(f"{source}: {reason}; if one of its files is the VAE, give {part}.pretrained={others[0]}")
+    raise WeightsError(f"{source}: {reason}; {advice}")
 
 
-def _read_weights(folder: Path) -> dict[str, Tensor]:
-    path = folder / WEIGHTS_FILES[0]
-    if path.is_file():
-        weights = load_file(path)
-    else:
-        weights = torch.load(folder / WEIGHTS_FILES[1], map_location="cpu", weights_only=True)
+def _read_weights(file: Path) -> dict[str, Tensor]:
+    """Return tensors by the names of diffusers' AutoencoderKL."""
+    safe = file.suffix == ".safetensors"
+    weights = load_file(file) if safe else torch.load(file, map_location="cpu", weights_only=True)
+    weights = weights.get("state_dict", weights)
+    if levels := {match[1] for match in map(LDM.match, weights) if match}:
+        from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint
+
+        weights = convert_ldm_vae_checkpoint(weights, dict.fromkeys(("down_block_types", "up_block_types"), levels))
     return {_current_name(name): value for name, value in weights.items() if isinstance(value, Tensor)}
 
 

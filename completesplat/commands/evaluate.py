@@ -20,6 +20,7 @@ from completesplat.commands.trained import Trained
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
+from completesplat.results.runs import MODEL
 from completesplat.results.tables import Column, evaluation_table, show, table
 from completesplat.settings.schema import Natural, Positive, Range
 from completesplat.training.loggers import wandb_runs
@@ -96,7 +97,7 @@ def run(trained: Config, evaluation: Config, trainer: Config, logger: Config | N
             return
         described = protocol(evaluation, module, data, results, out) | tested.facts()
         write_json(out / METRICS, {"protocol": described} | results)
-    show(evaluation_table(results), width=160)
+    show(evaluation_table(results, tested.label), width=160)
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")
 
@@ -162,7 +163,9 @@ def run_hidden_modes(
             each.log_metrics(scores, step=0)
             each.save()
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
-    Console(width=140).print(table(title, COLUMNS, [{"method": name, **values} for name, values in results.items()]))
+    labels = dict.fromkeys(results) | {MODEL: tested.label}
+    records = [{"method": labels[name] or name, **values} for name, values in results.items()]
+    Console(width=140).print(table(title, COLUMNS, records))
     if skipped:
         print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
 

@@ -75,8 +75,8 @@ def run(config: DictConfig, out: Path) -> None:
     # A test that cannot work is refused now, not after the training.
     tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
     callbacks, loggers = (
-        [part for part in build(parts, _convert_="all").values() if part is not None]
-        for parts in (config.callbacks, config.logger)
+        [part for part in build(config.get(parts, {}), _convert_="all").values() if part is not None]
+        for parts in ("callbacks", "logger")
     )
     trainer = build(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
@@ -140,7 +140,7 @@ def refuse_without_effect(config: DictConfig, out: Path) -> None:
     """Raise CompleteSplatError for a setting of a command, not of a sweep, that its model does not use."""
     stage, given = get_class(config.model._target_), read_record(out).get("overrides", [])
     unused: tuple[str, ...] = getattr(stage, "without_effect", ())
-    if (out.parent / PLAN).is_file():
+    if any((parent / PLAN).is_file() for parent in out.parents):
         return
     if "trainer.max_" in unused and not config.test:
         raise CompleteSplatError(f"test=false: {stage.__name__} only fits the scenes of a test; leave it out")
@@ -163,7 +163,7 @@ def _logged(trainer: Trainer) -> dict[str, float]:
 
 def _test(config: DictConfig, module: Stage, data: SceneDataModule) -> dict[str, float]:
     """Score as `completesplat test` does, in the protocol's precision, and return all logged figures."""
-    progress = build(config.callbacks.progress, _convert_="all")
+    progress = build(OmegaConf.select(config, "callbacks.progress"), _convert_="all")
     settings = {"callbacks": [] if progress is None else [progress], "logger": False, "enable_checkpointing": False}
     trainer = build(config.trainer, precision=config.evaluation.precision, **settings, _convert_="all")
     trainer.test(module, datamodule=data, verbose=False)

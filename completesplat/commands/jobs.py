@@ -25,7 +25,7 @@ from completesplat import __version__
 from completesplat.commands.imports import importing, postponing
 from completesplat.commands.protocol import git_commit, write_json
 from completesplat.errors import CompleteSplatError
-from completesplat.files import atomic_path, writing
+from completesplat.files import UNFINISHED, atomic_path, write_bytes, writing
 from completesplat.settings.checks import check_verb
 from completesplat.settings.composition import resolved_settings, use_working_folder
 from completesplat.settings.options import did_you_mean
@@ -67,7 +67,8 @@ class LogFile(logging.FileHandler):
 def alone_in(out: Path) -> Iterator[None]:
     """Hold the lock of a job's directory in the job's first process; the lock file names process and computer.
 
-    The operating system releases the lock when the process ends, for whatever reason.
+    The operating system releases the lock when the process ends, for whatever reason. The unfinished files of a killed
+    process are removed, except below the directories of other jobs.
 
     Raises:
         CompleteSplatError: another process holds the lock, or its path is a link or a folder.
@@ -89,6 +90,10 @@ def alone_in(out: Path) -> Iterator[None]:
     with lock:
         with writing(path):
             path.write_text(f"{os.getpid()}\n{platform.node()}\n")
+        for place, folders, names in os.walk(out):
+            folders[:] = [name for name in folders if not Path(place, name, LOCK).exists()]
+            for name in filter(UNFINISHED.fullmatch, names):
+                Path(place, name).unlink(missing_ok=True)
         yield
 
 
@@ -121,11 +126,8 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
         return optimized(config.get("optimized_metric"), out)
     first = is_first()
     try:
-        with ended_by_signals():
-            if first:
-                _record(out, [f"completesplat {verb}", *given], list(hydra_config.overrides.task), resolved)
-                with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
-                    OmegaConf.save(resolved, temporary)
+        recorded = out, [f"completesplat {verb}", *given], list(hydra_config.overrides.task), resolved
+        with ended_by_signals(), _recorded(*recorded) if first else nullcontext():
             for key in ("checkpoint", "autoreconstructor_checkpoint"):
                 # The path may refer to the job's choices (`hydra:runtime.choices`), which `start` cannot resolve.
                 if (path := OmegaConf.select(config, f"model.{key}")) is not None:
@@ -158,7 +160,7 @@ def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) 
     hydra_config, begun = HydraConfig.get(), (out / LAST).is_file()
     sweep = hydra_config.mode == RunMode.MULTIRUN
     replaced = ("out=", "ckpt_path=") if begun and not sweep else ("out=",)
-    again = ["completesplat", verb, *(argument for argument in given if not argument.startswith(replaced))]
+    again = ["completesplat", verb, *(argument for argument in given if not argument.lstrip("-").startswith(replaced))]
     again += ["ckpt_path=last"] if begun and not sweep else []
     again.append(f"out={hydra_config.sweep.dir if sweep else out}")
     checkpoint = f"; the checkpoint is {out / LAST}" if begun else ""
@@ -219,11 +221,38 @@ def _differences(first: object, second: object, key: str = "") -> set[str]:
     return {name for place, part in parts for name in _differences(first.get(part), second.get(part), place)}
 
 
-def _record(out: Path, command: list[str], overrides: list[str], config: Mapping[str, object]) -> None:
-    """Write `run.json` with times, command and earlier ends; rename earlier results `metrics_N_steps.json`."""
+@contextmanager
+def _recorded(out: Path, command: list[str], overrides: list[str], config: Mapping[str, object]) -> Iterator[None]:
+    """Record a job and its config; restore those of an earlier job if this one ends before it has written a file."""
+    earlier = {path: path.read_bytes() for path in (out / RECORD, out / CONFIG) if path.is_file()}
+    before = _written(out)
+    renamed = _record(out, command, overrides, config)
+    with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
+        OmegaConf.save(config, temporary)
+    try:
+        yield
+    except BaseException:
+        if _written(out) == before:
+            for path, content in earlier.items():
+                write_bytes(path, content)
+            if renamed is not None:
+                renamed.rename(out / METRICS)
+        raise
+
+
+def _written(out: Path) -> set[tuple[int, int]]:
+    """Return inode and time of change of each file of a job but its lock, record, config, log and W&B's files."""
+    paths = [path for path in out.rglob("*") if path.name not in (LOCK, RECORD, CONFIG, "wandb_id")]
+    paths = [path for path in paths if path.suffix != ".log" and "wandb" not in path.relative_to(out).parts]
+    return {(path.stat().st_ino, path.stat().st_mtime_ns) for path in paths if path.is_file()}
+
+
+def _record(out: Path, command: list[str], overrides: list[str], config: Mapping[str, object]) -> Path | None:
+    """Write `run.json` with times, command and earlier ends; rename earlier results, and return their new name."""
     path, now = out / RECORD, time.strftime("%Y-%m-%dT%H:%M:%S%z")
     record: dict[str, Any] = {"version": __version__, "commit": git_commit(), "command": command}
     record |= {"overrides": overrides, "started": now}
+    renamed = None
     if path.is_file() and (out / LAST).is_file():
         earlier = json.loads(path.read_text())
         record |= {"started": earlier["started"], "continued": [*earlier.get("continued", []), now]}
@@ -231,8 +260,9 @@ def _record(out: Path, command: list[str], overrides: list[str], config: Mapping
         if "ckpt_path" in config and (before := _ends(OmegaConf.load(out / CONFIG))) != _ends(config):
             record["earlier_ends"] += [{"until": now, "command": earlier["command"], **before}]
             if (results := out / METRICS).is_file():
-                results.rename(out / f"metrics_{json.loads(results.read_text())['steps']}_steps.json")
+                renamed = results.rename(out / f"metrics_{json.loads(results.read_text())['steps']}_steps.json")
     write_json(path, record)
+    return renamed
 
 
 def _ends(config: object) -> dict[str, Any]:

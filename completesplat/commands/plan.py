@@ -60,8 +60,10 @@ class Total(Callback):
 
     def on_multirun_end(self, config: Any, **kwargs: object) -> None:
         """Print the table of all `plan.json` in the sweep's folder, in the order of the jobs."""
-        paths = sorted(Path(config.hydra.sweep.dir).glob("*/plan.json"), key=lambda path: path.stat().st_mtime)
-        plans = {path.parent.name.removeprefix("experiment-"): json.loads(path.read_text()) for path in paths}
+        folder = Path(config.hydra.sweep.dir)
+        paths = {path: path.parent.relative_to(folder).as_posix() for path in folder.glob("*/**/plan.json")}
+        ordered = sorted(paths, key=lambda path: path.stat().st_mtime)
+        plans = {paths[path].removeprefix("experiment-"): json.loads(path.read_text()) for path in ordered}
         if plans:
             show(plan_table(plans), width=60 + 30 * len(plans))
 
@@ -170,7 +172,8 @@ def counted(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
     copied.rasterizer = {"_target_": "completesplat.training.step_counts.StoreOnly", "gpu": gpu}
     for key, value in changes.items():
         OmegaConf.update(copied, key, value)
-    targets = [get_class(callback._target_) for callback in config.callbacks.values() if callback is not None]
+    callbacks = config.get("callbacks", {}).values()
+    targets = [get_class(callback._target_) for callback in callbacks if callback is not None]
     averaged = any(issubclass(target, WeightAveraging) for target in targets)
     data, make = config.data, partial(build, copied.model, _convert_="all")
     sizes = (data.image_size, batch, data.targets, precision(config), config.trainer.accumulate_grad_batches)

@@ -1,5 +1,6 @@
 """Distances between the sets of predicted and true images: FID and KID."""
 
+import math
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -9,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from completesplat.errors import WeightsError
+from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.metrics.images import Images, Missing, unless_missing
-from completesplat.weights import weights_file
+from completesplat.weights import first_line, weights_file
 
 URL = "https://nvlabs-fi-cdn.nvidia.com/stylegan2-ada-pytorch/pretrained/metrics/inception-2015-12-05.pt"
 SHA256 = "f58cb9b6ec323ed63459aa4fb441fe750cfe39fafad6da5cb504a16f19e958f4"
@@ -57,15 +58,22 @@ class ImageSets:
             if region in metric.regions and scene not in scenes:
                 scenes[scene] = metric.describe(images).float().cpu()
 
-    def results(self, owner: str, region: str) -> dict[str, float]:
-        """Return the distances of a predictor's images from the true images of the same scenes."""
+    def results(self, owner: str, region: str, missing: dict[str, str]) -> dict[str, float]:
+        """Return the distances of a predictor's images from the true images of the same scenes.
+
+        Distances that cannot be computed are left out, and their names added to `missing`, with the reasons.
+        """
         figures: dict[str, float] = {}
         for index, metric in enumerate(self.metrics):
             predicted, true = self.described[owner, region, index], self.described[self.TRUE, region, index]
             if predicted:
                 sets = (torch.cat([scenes[name] for name in sorted(predicted)]) for scenes in (true, predicted))
-                figures |= metric.distances(*sets)
-        return figures
+                try:
+                    figures |= metric.distances(*sets)
+                except Exception as error:  # of any metric; the other scores must not be lost
+                    missing |= dict.fromkeys(metric.settings(), f"missing: {first_line(error)}")
+        missing |= {name: f"missing: not finite ({x})" for name, x in figures.items() if not math.isfinite(x)}
+        return {name: value for name, value in figures.items() if math.isfinite(value)}
 
 
 class Inception:
@@ -89,7 +97,9 @@ class Inception:
         return features
 
     def distances(self, true: Descriptors, predicted: Descriptors) -> dict[str, float]:
-        """See `SetMetric`."""
+        """See `SetMetric`; raise CompleteSplatError for a single image, which has no covariance."""
+        if min(len(true), len(predicted)) < 2:
+            raise CompleteSplatError("needs at least 2 images, there is 1")
         return {"fid": frechet_distance(true, predicted), "kid": kernel_distance(true, predicted, self.subset_size)}
 
     def settings(self) -> dict[str, Settings]:

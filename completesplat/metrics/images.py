@@ -11,13 +11,12 @@ from torch import Tensor
 from completesplat.errors import WeightsError
 from completesplat.losses.lpips import PerceptualDistance, load_heads, load_vgg16
 from completesplat.losses.ssim import structural_similarity
+from completesplat.metrics import PSNR_LIMIT
 
 T = TypeVar("T")
 Images = Float[Tensor, "image 3 height width"]
 PerImage = Float[Tensor, " image"]
 
-PSNR_LIMIT = 100.0
-"""Largest reported PSNR (dB); identical images have an infinite one, and averages must stay finite."""
 FLATTEST = (1 / 255) ** 2
 """Smallest gradient energy of a truth that sharpness is measured against: one step of 8 bits in all images together."""
 ADVICE = "give torchvision's VGG16 as evaluation.scoring.perceptual.vgg_weights=FILE_OR_URL"

@@ -178,7 +178,7 @@ class Evaluation:
                 values = [scenes[name][key] for name in names if key in scenes[name]]
                 entry.setdefault(region, {}).setdefault(view, {})[metric] = sum(values) / len(values)
             for region in REGIONS:
-                entry[region]["novel"] |= self.sets.results(predictor, region)
+                entry[region]["novel"] |= self.sets.results(predictor, region, self.missing)
             results[predictor] = entry
         if self.drawn:
             names = sorted(self.drawn)

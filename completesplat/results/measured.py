@@ -8,7 +8,6 @@ from typing import TypeVar
 from completesplat.results.runs import MODEL, UPPER_BOUND, Protocol, Result, Scores
 from completesplat.results.tables import (
     ABSENT,
-    FORMATS,
     LEGEND,
     METRICS,
     SSIM_NOTE,
@@ -18,6 +17,7 @@ from completesplat.results.tables import (
     Table,
     TableRow,
     marks,
+    score_cell,
     score_heading,
 )
 
@@ -105,7 +105,7 @@ class Entry:
     def cell(self, name: str, notes: Notes) -> Cell:
         """Return a cell with the score `REGION_VIEW_METRIC`, or with the number of the note on why it is missing."""
         if (value := self.scores.get(name)) is not None:
-            return Cell(format(value, FORMATS[name.rpartition("_")[2]]), value=value)
+            return score_cell(name, value)
         return notes.missing(name, self.run.protocol, f"not measured for {self.predictor}")
 
     def leading(self, notes: Notes) -> dict[str, Cell]:

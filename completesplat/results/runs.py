@@ -3,7 +3,7 @@
 import json
 import os
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypedDict, cast
@@ -143,7 +143,7 @@ def typed(command: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Job:
-    """Job of a sweep: its folder's name (empty before its start), `run.json` and `metrics.json`.
+    """Job of a sweep: its folder in the sweep's (empty before its start), `run.json` and `metrics.json`.
 
     `test` and `protocol` are empty where nothing was tested. `label` tells the job from the others of its sweep.
     """
@@ -189,13 +189,22 @@ def _joined(parts: Sequence[list[Job]]) -> list[Job]:
 
 
 def _jobs(folder: Path) -> list[Job]:
-    jobs = [_job(path) for path in sorted(folder.iterdir()) if path.is_dir() and not path.name.startswith(".")]
+    jobs = [_job(path, path.relative_to(folder).as_posix()) for path in _job_folders(folder)]
     recorded = [job for job in jobs if job.record]
     known = [job.overrides for job in recorded]
     waiting = [Job("", overrides) for overrides in map(_pairs, _planned(folder)) if overrides not in known]
     # `waiting` also has the jobs that ended before their record, so that many folders without a record are left out.
     silent = [job for job in jobs if not job.record][len(waiting) :]
     return [*recorded, *silent, *waiting]
+
+
+def _job_folders(folder: Path) -> Iterator[Path]:
+    """Yield the folders with a job's record, at any depth, and those at the top that have none in them."""
+    for path in sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")):
+        if (path / RECORD).is_file() or (path / PLAN).is_file():  # a job, or another sweep
+            yield path
+        else:
+            yield from [job for job in _job_folders(path) if (job / RECORD).is_file()] or [path]
 
 
 def _planned(folder: Path) -> list[list[str]]:
@@ -223,15 +232,15 @@ def _pairs(overrides: Sequence[str]) -> dict[str, str]:
     return {key: value for key, _, value in split if key != "out" and (key, value) != ("ckpt_path", "last")}
 
 
-def _job(folder: Path) -> Job:
+def _job(folder: Path, name: str) -> Job:
     record, metrics = read_record(folder), read_mapping(folder / SCORES)
     if not record:
-        return Job(folder.name)
+        return Job(name)
     config = cast(Mapping[str, object], OmegaConf.to_container(OmegaConf.load(folder / CONFIG)))
     tested = _mapping(metrics.get("test"))
     test = {name: flat(_mapping(entry)) for name, entry in tested.items() if name != PROTOCOL}
     steps, protocol = cast(int, metrics.get("steps", 0)), cast(Protocol, _mapping(tested.get(PROTOCOL)))
-    return Job(folder.name, _pairs(record["overrides"]), config, record, bool(metrics), steps, test, protocol)
+    return Job(name, _pairs(record["overrides"]), config, record, bool(metrics), steps, test, protocol)
 
 
 def _labelled(jobs: Sequence[Job]) -> list[Job]:

@@ -16,13 +16,13 @@ from completesplat.results.machine import machine
 from completesplat.results.runs import MODEL, SEED, UPPER_BOUND, Job, collect, typed
 from completesplat.results.tables import (
     EVALUATED_IF_POSSIBLE,
-    FORMATS,
     SSIM_NOTE,
     Cell,
     Heading,
     Table,
     TableRow,
     marks,
+    score_cell,
     score_heading,
     show,
     write_csv,
@@ -134,9 +134,7 @@ def figures(rows: Sequence[SweepRow], names: Sequence[str]) -> list[list[Cell]]:
     for index, row in enumerate(rows):
         cells.append([])
         for name in names:
-            form, mean, deviation = FORMATS[name.rpartition("_")[2]], row.means.get(name), row.deviations.get(name)
-            after = "" if deviation is None else f" ± {deviation:{form}}"
-            cells[-1].append(Cell("" if mean is None else f"{mean:{form}}{after}", marked[name][index], mean))
+            cells[-1].append(score_cell(name, row.means.get(name), row.deviations.get(name), marked[name][index]))
     return cells
 
 

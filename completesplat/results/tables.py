@@ -2,13 +2,14 @@
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import groupby, pairwise, product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from completesplat.files import atomic_path, write_text
-from completesplat.results.runs import UPPER_BOUND, Protocol, flat
+from completesplat.metrics import PSNR_LIMIT
+from completesplat.results.runs import MODEL, UPPER_BOUND, Protocol, flat
 
 if TYPE_CHECKING:
     from rich.table import Table as PrintedTable
@@ -78,6 +79,15 @@ class Cell:
     text: str
     mark: str = UNMARKED
     value: float | None = None
+
+
+def score_cell(name: str, value: float | None, deviation: float | None = None, mark: str = UNMARKED) -> Cell:
+    """Return a cell with a score named `REGION_VIEW_METRIC` (empty for None), and its deviation if there is one."""
+    metric = name.rpartition("_")[2]
+    if value is None or (metric == "psnr" and value == PSNR_LIMIT):
+        return Cell("" if value is None else "the same image", mark, value)
+    after = "" if deviation is None else f" ± {deviation:{FORMATS[metric]}}"
+    return Cell(f"{value:{FORMATS[metric]}}{after}", mark, value)
 
 
 @dataclass(frozen=True)
@@ -180,30 +190,30 @@ def _written(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1000 else f"{value:,.0f}"
 
 
-def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
-    """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks."""
-    from completesplat.metrics.images import PSNR_LIMIT
+def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = MODEL) -> Table:
+    """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks.
 
-    records: list[Mapping[str, object]] = []
-    for predictor, entry in results.items():
-        scores = flat(entry)
-        label = f"{predictor} (upper bound)" if scores.get(UPPER_BOUND) else predictor
-        records.append({"predictor": label, **scores})
+    Args:
+        model: the label of the predictor that is the model.
+    """
+    records = [flat(entry) for entry in results.values()]
     names = [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]
     pairs = [(name, name.replace("object", "full")) for name in EVALUATED]
     masked = any(record.get(name) != record.get(whole) for record in records for name, whole in pairs)
     # Without masks, every pixel is the object's; with them, sharpness is the object's.
     names = [name for name in names if not name.startswith("full_novel_sharpness" if masked else "object")]
-    columns = [("predictor", "predictor", "")]
+    headings = [Heading("predictor", figures=False)]
     for name in names:
         region, view, kind = name.split("_")
-        columns.append((f"{LABELS[region]}\n{view}\n{METRICS[kind]}", name, FORMATS[kind]))
-    first = records[0]
-    result = table(f"{first['scenes']} scenes, {first['views']} novel views", columns, records)
-    fitted = [f"{name}: fitted to {entry['fitted_to']}." for name, entry in results.items() if entry.get("fitted_to")]
-    same = format(PSNR_LIMIT, FORMATS["psnr"])
-    rows = [[Cell("the same image") if cell.text == same else cell for cell in row.cells] for row in result.rows]
-    return replace(result, rows=[TableRow("", cells) for cells in rows], remarks=[*fitted, SSIM_NOTE, SHARPNESS_NOTE])
+        headings.append(Heading(f"{LABELS[region]}\n{view}\n{METRICS[kind]}"))
+    rows, fitted = [], []
+    for predictor, scores in zip(results, records, strict=True):
+        label = model if predictor == MODEL else predictor
+        fitted += [f"{label}: fitted to {of}." for of in [results[predictor].get("fitted_to")] if of]
+        bound = " (upper bound)" if scores.get(UPPER_BOUND) else ""
+        rows.append(TableRow("", [Cell(label + bound), *(score_cell(name, scores.get(name)) for name in names)]))
+    title = f"{records[0]['scenes']} scenes, {records[0]['views']} novel views"
+    return Table(title, title, headings, rows, [*fitted, SSIM_NOTE, SHARPNESS_NOTE])
 
 
 def show(*tables: Table, width: int = 120) -> None:

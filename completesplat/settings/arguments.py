@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Sequence
 
+from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
@@ -15,6 +16,11 @@ from completesplat.settings.options import TASKS, did_you_mean, groups, options
 EXPORT = "--export"
 WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--info", "-i", "--config-dir", "-cd")
 """Hydra's flags that take the next argument as their value."""
+FLAGS = {option: action for action in get_args_parser()._actions for option in action.option_strings}
+DASHES = (
+    "settings are key=value without dashes, such as out=DIR, and files are given by their names: "
+    "`completesplat predict PHOTO out=DIR`"
+)
 SWEEP = ("-m", "--multirun")
 WORDS = {"predict": ("image",), "view": ("path",), "new": ("kind", "name"), "data import": ("folder",)}
 """By verb, or verb and task, the settings whose values are given as words without `=`."""
@@ -37,19 +43,26 @@ def behind_dashes(arguments: Sequence[str]) -> list[str]:
 def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """Separate Hydra's flags and their values from the other arguments, because Hydra takes no flags between them.
 
-    `--export FILE`, which is not Hydra's, becomes the setting `export='FILE'`.
+    `--export FILE`, which is not Hydra's, becomes the setting `export='FILE'`, and `--key=value` becomes `key=value`,
+    because W&B's agents give settings so.
     """
     flags, others, remaining = [], [], iter(arguments)
     for argument in remaining:
         name, equals, value = argument.partition("=")
         if not name.startswith("-"):
             others.append(argument)
-        elif name not in (*WITH_VALUE, EXPORT):
+        elif name in FLAGS and name not in WITH_VALUE:
             flags.append(argument)
+        elif name not in (*WITH_VALUE, EXPORT):
+            if not equals or not name.startswith("--"):
+                raise CompleteSplatError(f"{argument}: {DASHES}")
+            others.append(argument.removeprefix("--"))
         elif not (value := value if equals else next(remaining, "")):
             raise CompleteSplatError(f"{name}: lacks its value; give {name} VALUE")
         elif name == EXPORT:
             others.append(f"export={quoted(value)}")
+        elif (choices := FLAGS[name].choices) and value not in choices:  # -i, say, which means an image elsewhere
+            raise CompleteSplatError(f"{name} {_short(value)}: {DASHES}")
         else:
             flags.append(f"{name}={value}")
     return flags, others

@@ -14,7 +14,7 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import DataError
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras
-from completesplat.metrics.images import PSNR_LIMIT
+from completesplat.metrics import PSNR_LIMIT
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
 

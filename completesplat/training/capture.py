@@ -36,7 +36,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import WeightedSum
 from completesplat.losses.weighted_sum import Prediction
-from completesplat.scene import SceneBatch, Views
+from completesplat.scene import Batch, SceneBatch, Views
 from completesplat.settings.schema import Positive, Range, Share
 from completesplat.tensors import stack
 from completesplat.training.optimization import Schedule, constant
@@ -150,8 +150,9 @@ class CaptureFit(Stage):
         self.count.fill_(len(points))
 
     @torch.no_grad()
-    def on_train_batch_start(self, batch: SceneBatch, index: int) -> None:
+    def on_train_batch_start(self, batch: Batch, index: int) -> None:
         """Move dead Gaussians, add new ones, and disturb transparent ones, before all steps but the first."""
+        super().on_train_batch_start(batch, index)
         step, total, settings = self.global_step, self.trainer.estimated_stepping_batches, self.fitting
         if step == 0 or index % self.trainer.accumulate_grad_batches:
             return

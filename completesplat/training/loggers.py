@@ -114,8 +114,9 @@ class WandbRun(WandbLogger):
         job_type: str | None = None,
     ) -> None:
         self.folder = Path(save_dir).absolute()
-        if group is None and (self.folder.parent / "multirun.yaml").is_file():  # Hydra's file in a sweep's folder
-            group = self.folder.parent.name
+        # Hydra's file in a sweep's folder, which may hold its jobs in further folders.
+        sweeps = (parent.name for parent in self.folder.parents if (parent / "multirun.yaml").is_file())
+        group = group or next(sweeps, None)
         try:
             options: dict[str, Any] = {"mode": mode, "group": group, "job_type": job_type}
             super().__init__(name=name or self.folder.name, save_dir=save_dir, project=project, **options)
@@ -130,6 +131,7 @@ class WandbRun(WandbLogger):
         """Return W&B's run, which begins at the first access."""
         if self._experiment is None:
             run = self._experiment = self._begin()
+            write_text(self.folder / "wandb_id", f"{run.id}\n")  # a sweep's agent sets another one (WANDB_RUN_ID)
             run.define_metric(AXIS)
             run.define_metric("*", step_metric=AXIS, step_sync=True)
         return self._experiment

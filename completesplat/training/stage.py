@@ -32,7 +32,7 @@ from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import MODEL, REGIONS, Evaluation
 from completesplat.opening import check_names, without_training
 from completesplat.rasterizers import Rasterizer, Rendering
-from completesplat.scene import SceneBatch, Views
+from completesplat.scene import Batch, SceneBatch, Views
 from completesplat.settings.schema import Share
 from completesplat.weights.checkpoint_reading import load_part, read_checkpoint
 
@@ -108,8 +108,21 @@ class Stage(LightningModule):
         self.seconds: dict[str, list[float]] = defaultdict(list)  # for each scene, by the name of the work
         self.config: Mapping[str, Any] | None = None
         self.gradient_norm: Tensor | None = None  # of this step, if `BadSteps` has computed it
+        self._lr: float | None = None
+        self.accumulated: list[int] = []  # numbers of scenes of the batches since the last step
         # Lightning's name: some of several processes that test may have no scene.
         self.allow_zero_length_dataloader_with_multiple_devices = True
+
+    @property
+    def lr(self) -> float | None:
+        """Return the learning rate that Lightning's `LearningRateFinder` has set, None if the optimizer has its own."""
+        return self._lr
+
+    @lr.setter
+    def lr(self, rate: float) -> None:
+        self._lr = rate
+        for config in [] if self._trainer is None else self._trainer.lr_scheduler_configs:  # of a run that has begun
+            config.scheduler.base_lrs = [rate] * len(config.scheduler.base_lrs)
 
     @abstractmethod
     def reconstruct(self, scenes: SceneBatch, seed: int) -> Gaussians:
@@ -275,6 +288,22 @@ class Stage(LightningModule):
         """Return one set of Gaussians for each reference image, in its camera's frame."""
         return self.reconstruct(scenes, seed=index)
 
+    def on_train_batch_start(self, batch: Batch, index: int) -> None:
+        """Note the number of scenes of this batch, whose gradient may be added to those of earlier ones."""
+        self.accumulated = self.accumulated if index % self.trainer.accumulate_grad_batches else []
+        self.accumulated.append(len(batch.names))
+
+    def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
+        """Give all scenes of accumulated batches the same weight, also in the incomplete group at an epoch's end.
+
+        Lightning divides each batch's loss, a mean over its scenes, by the number of batches in a complete group.
+        """
+        counts, batches = self.accumulated, self.trainer.accumulate_grad_batches
+        super().backward(loss * (counts[-1] / counts[0]), *args, **kwargs)
+        factor = batches * counts[0] / sum(counts)
+        if factor != 1 and (len(counts) == batches or self.trainer.is_last_batch):
+            torch._foreach_mul_([p.grad for p in self.parameters() if p.grad is not None], factor)
+
     def configure_gradient_clipping(
         self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
@@ -293,6 +322,8 @@ class Stage(LightningModule):
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Build the optimizer, and a schedule that spans the run, whether its length is given in steps or epochs."""
         optimizer = self.optimizer([p for p in self.parameters() if p.requires_grad])
+        for group in optimizer.param_groups:
+            group["lr"] = group["lr"] if self.lr is None else self.lr
         schedule = self.schedule(optimizer, self.trainer.estimated_stepping_batches)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 

@@ -200,12 +200,20 @@ def not_finite(weights: Mapping[str, object]) -> str | None:
 
 
 def mismatch(network: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> str | None:
-    """Describe the first difference between a network's tensors and a file's, in sizes or names, if there is one."""
-    sizes = {name: (list(weights[name].shape), list(x.shape)) for name, x in network.items() if name in weights}
-    different = (f"{name} is {there} there and {here} here" for name, (there, here) in sizes.items() if there != here)
+    """Describe the first difference between a network's tensors and a file's, in sizes, kinds or names, if any.
+
+    Floats of any precision are one kind, because they are converted; other kinds would be cast in silence.
+    """
+    pairs = {name: (_described(weights[name]), _described(x)) for name, x in network.items() if name in weights}
+    different = (f"{name} is {there} there and {here} here" for name, (there, here) in pairs.items() if there != here)
     missing = (f"{name} is missing there" for name in network if name not in weights)
     needless = (f"{name} has no place here" for name in weights if name not in network)
     return next(chain(different, missing, needless), None)
+
+
+def _described(tensor: Tensor) -> str:
+    kind = "" if tensor.is_floating_point() else f" of {tensor.dtype}"
+    return f"{list(tensor.shape)}{kind}"
 
 
 def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:

@@ -1,11 +1,16 @@
+import copy
+import re
 import shutil
 
 import huggingface_hub
+import pytest
 import torch
 from hydra.utils import instantiate
 from pretrained_vaes import BIN, SAFETENSORS, build, rewrite, stable_diffusion_vae
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from support import compose_config
+
+from completesplat.errors import WeightsError
 
 HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
 
@@ -75,6 +80,45 @@ def test_older_names_of_the_attention_are_known(vae, folder):
     rewrite(folder, age)
     assert any("proj_attn" in name for name in load_file(folder / SAFETENSORS))
     assert_loaded(build(str(folder)), vae)
+
+
+def by_ldms_names(vae) -> dict[str, torch.Tensor]:
+    """A VAE's tensors as Stable Diffusion's own files name them; the attention's layers are 1 x 1 convolutions there."""
+    renamed, blocks = {}, len(vae.config.up_block_types)
+    for name, value in vae.state_dict().items():
+        new = re.sub(r"down_blocks\.(\d)\.resnets", r"down.\1.block", name)
+        new = re.sub(r"down_blocks\.(\d)\.downsamplers\.0", r"down.\1.downsample", new)
+        new = re.sub(r"up_blocks\.(\d)\.resnets", lambda m: f"up.{blocks - 1 - int(m[1])}.block", new)
+        new = re.sub(r"up_blocks\.(\d)\.upsamplers\.0", lambda m: f"up.{blocks - 1 - int(m[1])}.upsample", new)
+        new = re.sub(r"mid_block\.resnets\.(\d)", lambda m: f"mid.block_{int(m[1]) + 1}", new)
+        new = new.replace("mid_block.attentions.0", "mid.attn_1").replace("conv_norm_out", "norm_out")
+        new = new.replace("conv_shortcut", "nin_shortcut")
+        if "attn_1" in new:
+            new = new.replace("group_norm", "norm").replace("to_out.0", "proj_out")
+            new = re.sub(r"to_([qkv])\b", r"\1", new)
+            value = value[:, :, None, None] if value.ndim == 2 else value
+        renamed[new] = value.contiguous()
+    return renamed
+
+
+@pytest.mark.parametrize("prefix", ["first_stage_model.", ""])
+@pytest.mark.parametrize("ending", [".safetensors", ".ckpt"])
+def test_one_file_with_diffusers_or_with_stable_diffusions_names_is_loaded(vae, folder, prefix, ending):
+    path = folder / f"model{ending}"
+    others = {"model.diffusion_model.input.weight": torch.ones(2), "loss.logvar": torch.ones(())}
+    for weights in (vae.state_dict(), {f"{prefix}{name}": x for name, x in by_ldms_names(vae).items()} | others):
+        save_file(weights, path) if ending == ".safetensors" else torch.save({"state_dict": weights}, path)
+        assert_loaded(build(str(path)), vae)
+    (folder / "config.json").unlink()
+    with pytest.raises(WeightsError, match="group normalisation has 32 groups, not 4"):  # as Stable Diffusion's has
+        build(str(path))
+
+
+def test_half_precision_under_its_own_name_is_loaded(vae, folder):
+    halves = {name: value.half() for name, value in load_file(folder / SAFETENSORS).items()}
+    save_file(halves, folder / "diffusion_pytorch_model.fp16.safetensors")
+    (folder / SAFETENSORS).unlink()
+    assert_loaded(build(str(folder)), copy.deepcopy(vae).half().float())
 
 
 def test_of_a_hub_pipeline_only_the_vae_is_fetched(vae, tmp_path, monkeypatch):

@@ -55,8 +55,35 @@ def test_a_truncated_file_is_damaged_and_a_bin_file_that_is_no_mapping_of_tensor
         path.write_bytes(path.read_bytes()[:kept])
         assert f"{folder}: damaged" in refusal(folder)
     path.unlink()
-    torch.save({"state_dict": vae.state_dict()}, folder / BIN)
+    torch.save({"weights": vae.state_dict()}, folder / BIN)
     assert "is missing there" in refusal(folder)
+
+
+def test_weights_that_are_not_finite_or_not_floats_are_refused(folder):
+    rewrite(folder, lambda weights: weights["encoder.conv_in.bias"].fill_(torch.nan))
+    assert f"{folder}: encoder.conv_in.bias is not finite; fetch it again" in refusal(folder)
+    for kind in (torch.int64, torch.complex64, torch.bool):
+        rewrite(folder, lambda weights: weights.update({"encoder.conv_in.bias": torch.ones(8).to(kind)}))  # noqa: B023
+        assert f"encoder.conv_in.bias is [8] of {kind} there and [8] here" in refusal(folder)
+
+
+def test_files_that_are_no_vae_are_named_without_advice_to_download_another(folder, tmp_path):
+    other = tmp_path / "vae.gguf"
+    other.write_bytes(b"GGUF")
+    assert refusal(other).startswith(f"{other}: not one of the files that are read: .safetensors, .bin, .ckpt")
+    (folder / SAFETENSORS).rename(folder / "kl-f8.safetensors")
+    message = refusal(folder)
+    assert message.endswith(
+        f"if one of its files is the VAE, give autoreconstructor.pretrained={folder}/kl-f8.safetensors"
+    )
+    torch.save({"state_dict": {"unet.weight": torch.ones(1)}}, other.with_suffix(".ckpt"))
+    assert f"{other.with_suffix('.ckpt')}: encoder.conv_in.weight is missing there" in refusal(
+        other.with_suffix(".ckpt")
+    )
+    other.with_suffix(".pt").write_bytes(b"\x80\x02c__builtin__\neval\n.")
+    message = refusal(other.with_suffix(".pt"))
+    assert message.startswith(f"{other.with_suffix('.pt')}: damaged, or not a VAE (")
+    assert not any("hf download" in text or "trust" in text for text in (message, refusal(folder), refusal(other)))
 
 
 @pytest.mark.parametrize("name", ["config.json", SAFETENSORS])
@@ -64,7 +91,8 @@ def test_a_folder_without_its_files_says_which_are_needed(folder, name):
     (folder / name).unlink()
     message = refusal(folder)
     assert message.startswith(f"{folder}: no config.json and {SAFETENSORS}")
-    assert "hf download" in message
+    advice = f"give autoreconstructor.pretrained={folder / SAFETENSORS}" if name == "config.json" else "hf download"
+    assert advice in message
     assert f"{folder / 'absent'}: no such folder" in refusal(folder / "absent")  # no id of the hub
 
 

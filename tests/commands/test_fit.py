@@ -105,3 +105,19 @@ def test_a_checkpoint_that_is_missing_or_cut_off_is_refused_before_data_are_made
         assert finished.status == 2
         assert finished.err.startswith(f"error: {path}: {reason}")
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("left_out", ["~callbacks.progress", "~callbacks", "~logger"])
+def test_a_run_without_callbacks_or_loggers_is_trained_and_scored(command, toy_root, tmp_path, left_out):
+    given = [setting for setting in SMALL if not setting.startswith(("callbacks", "trainer.max_steps"))]
+    given += ["experiment=toy_var", f"data.root={toy_root}", "trainer.max_steps=1", left_out, f"out={tmp_path / 'run'}"]
+    given += [] if left_out == "~callbacks" else ["callbacks.images=null"]
+    finished = command("fit", *given)
+    assert finished.status == 0, finished.err
+    metrics = strict_json(tmp_path / "run/metrics.json")
+    assert (metrics["steps"], metrics["test"]["model"]["scenes"]) == (1, 1)
+    assert (tmp_path / "run/metrics.csv").is_file() == (left_out != "~logger")
+
+
+def test_a_training_without_callbacks_is_planned(command):
+    assert command("plan", "experiment=toy_var", "~callbacks", "data.image_size=32").status == 0

@@ -1,9 +1,10 @@
 """`completesplat plan`: what a training takes, before it starts."""
 
 import pytest
+from omegaconf import OmegaConf
 from support import NETWORKS, compose_config, refused, strict_json
 
-from completesplat.commands.plan import plan_of, precision, steps_of
+from completesplat.commands.plan import Total, plan_of, precision, steps_of
 from completesplat.settings.options import choices_of_verb
 
 SMALL = ["experiment=toy_diffusion", "data.image_size=32", *NETWORKS]
@@ -24,6 +25,15 @@ def test_a_plan_is_printed_and_written_and_a_sweep_ends_in_a_total(command, tmp_
     assert mine["price"] == pytest.approx(2 * mine["gpu_hours"]) == pytest.approx(2 * 24 * mine["days"])
     assert a100["seconds_a_step"] == pytest.approx(8e-6 * a100["operations_of_a_step"])  # too small for such a GPU
     assert "The paper, on one A100: 15.7 ms" in swept.out
+
+
+def test_a_sweep_into_nested_folders_ends_in_its_total(tmp_path, capsys):
+    for gpu in ("a100", "h100"):
+        (tmp_path / f"x/{gpu}").mkdir(parents=True)
+        (tmp_path / f"x/{gpu}/plan.json").write_text('{"steps": 4000, "days": 2.0}')
+    Total().on_multirun_end(OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}}))
+    printed = capsys.readouterr().out
+    assert all(text in printed for text in ("x/a100", "x/h100", "8,000"))
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from completesplat.commands import jobs
 from completesplat.commands.jobs import alone_in
 from completesplat.data.toy import write_objects
 from completesplat.errors import CompleteSplatError
+from completesplat.files import atomic_path
 from completesplat.training.reconstruction import ReconstructionModule
 
 # Its child, as a loader's worker, outlives it for a while.
@@ -94,6 +95,21 @@ def test_a_removed_working_folder_is_named(command, tmp_path, monkeypatch):
         assert (refused.status, refused.err) == (2, "error: the working folder was removed: go to another folder\n")
 
 
+def test_unfinished_files_of_a_killed_process_are_removed_by_the_next_one(command, toy_root, tmp_path):
+    """As `predict` leaves them below its folder. Another job's folder within is left alone while it may be at work."""
+    left, of_another = tmp_path / "run/photo", tmp_path / "run/other/photo"
+    for folder in (left, of_another):
+        folder.mkdir(parents=True)
+        with atomic_path(folder / "orbit_01.mp4") as temporary:
+            temporary.touch()
+        temporary.touch()  # again, as if the process had been killed before it gave the file its name
+        (folder / ".mine.mp4").touch()
+    (tmp_path / "run/other/.lock").touch()
+    assert command("data", "stats", "data=toy_objects", f"data.root={toy_root}", f"out={tmp_path}/run").status == 0
+    assert sorted(path.name for path in left.iterdir()) == [".mine.mp4", "orbit_01.mp4"]
+    assert temporary.is_file()
+
+
 def test_links_in_a_run_s_folder_are_not_followed(command, toy_root, tmp_path):
     run, kept = tmp_path / "run", tmp_path / "kept"
     run.mkdir()
@@ -147,6 +163,12 @@ FIT = [*SMALL, "experiment=toy_var", "test=false", "trainer.max_steps=2", "train
 FIT += ["callbacks.images=null", "callbacks.checkpoint.every_n_train_steps=1", "ckpt_path=last"]
 
 
+def content(folder):
+    """The files of a run and what they hold, but for its log and its lock."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name not in ("commands.log", ".lock")]
+    return {path.relative_to(folder): path.read_bytes() for path in files}
+
+
 def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tmp_path, monkeypatch):
     root, run = tmp_path / "data", tmp_path / "run"
     write_objects(root, scenes=4, frames=4, size=32, seed=0, workers=1, progress=False)
@@ -167,7 +189,9 @@ def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tm
     root.rename(tmp_path / "before")
     more.rename(root)
 
+    before = content(run)
     refused = command(*given)
+    assert content(run) == before
     assert refused.status == 2
     message = f"{root}: not the training data that this run had before (2 sequences then, 5 now)"
     assert refused.err == f"error: {message}; data.allow_changed=true goes on with these\n"
@@ -177,3 +201,18 @@ def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tm
     assert strict_json(run / "metrics.json")["steps"] == 2
     assert OmegaConf.load(run / "config.yaml").data.allow_changed
     assert "finished before" in command(*given).out
+    before = content(run)
+    for unfit in (["trainer.devices=99"], ["trainer.strategy=none_such"]):
+        assert command(*given, "trainer.max_steps=4", *unfit).status == 2
+        assert content(run) == before
+
+
+def test_a_refused_job_leaves_an_earlier_ones_record_and_a_first_one_leaves_its_own(command, pipeline, tmp_path):
+    given = ["predict", "weights=toy_objects", f"out={tmp_path}/run", "video=[]", "steps=1", "samples=1"]
+    assert command(*given, str(pipeline.photograph())).status == 0
+    before = content(tmp_path / "run")
+    for unfit in (["absent.jpg"], [str(pipeline.photograph()), "fov=500"], [str(pipeline.photograph()), "formats=[x]"]):
+        assert command(*given, *unfit).status == 2
+        assert content(tmp_path / "run") == before
+    assert command(*given[:2], "absent.jpg", f"out={tmp_path}/first").status == 2
+    assert strict_json(tmp_path / "first/run.json")["command"][2] == "absent.jpg"

@@ -63,6 +63,8 @@ def test_samples_score_the_same_from_files_as_from_the_model(command, pipeline, 
         for name in expected:
             if "seconds" not in name:
                 assert actual[name] == pytest.approx(expected[name], abs=1e-3), (row, name)
+    assert "│ Mine (read from files) " in finished.out
+    assert "│ model " not in finished.out
     named = {"method": "Mine (read from files)", "frame": "opencv", "align": "none", "sampler": None}
     assert {key: described[key] for key in named} == named
     assert described["checkpoint"]["path"] == str(model_test / "splats")

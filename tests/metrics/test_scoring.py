@@ -9,6 +9,7 @@ import torch
 
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras
+from completesplat.metrics.image_sets import Inception
 from completesplat.metrics.images import Missing
 from completesplat.metrics.scoring import Evaluation, best, depth_errors, diversity, expected_best_curve
 from completesplat.scene import SceneBatch, Views
@@ -192,6 +193,34 @@ def test_missing_metrics_are_named_and_have_no_figure():
     evaluation.update("model", torch.full((1, 2, 3, 16, 16), 0.5), scenes(1, 1))
     assert evaluation.missing == {"lpips": "missing: no weights"} | dict.fromkeys(("fid", "kid"), "missing: none here")
     assert set(evaluation.results()["model"]["full"]["novel"]) == {"psnr", "ssim"}
+
+
+class Channels(torch.nn.Module):
+    """A network in the place of Inception, whose features are the means of the channels."""
+
+    def forward(self, pixels: torch.Tensor, return_features: bool) -> torch.Tensor:
+        return pixels.float().mean((2, 3))
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+def test_distances_of_a_single_image_are_missing_with_the_reason():
+    for targets in (1, 2):
+        evaluation = Evaluation(sets={"inception": Inception(torch.jit.script(Channels()))})
+        evaluation.update("model", torch.full((1, 1 + targets, 3, 16, 16), 0.5), scenes(1, targets))
+        distances = {"fid", "kid"} & evaluation.results()["model"]["full"]["novel"].keys()
+        assert distances == (set() if targets == 1 else {"fid", "kid"})
+        reason = "missing: needs at least 2 images, there is 1"
+        assert evaluation.missing == (dict.fromkeys(("fid", "kid"), reason) if targets == 1 else {})
+
+
+def test_a_set_metric_that_fails_or_gives_no_number_is_missing_and_the_others_are_kept():
+    broken, endless = Brightness(), Brightness()
+    broken.distances, broken.settings = lambda *_: 1 / 0, lambda: {"broken": {}}
+    endless.distances = lambda *_: {"endless": math.nan}
+    evaluation = Evaluation(sets={"a": broken, "b": endless, "c": Brightness()})
+    evaluation.update("model", torch.full((1, 2, 3, 16, 16), 0.5), scenes(1, 1))
+    assert set(evaluation.results()["model"]["full"]["novel"]) == {"psnr", "ssim", "brightness"}
+    assert evaluation.missing == {"broken": "missing: division by zero", "endless": "missing: not finite (nan)"}
 
 
 @pytest.mark.parametrize(

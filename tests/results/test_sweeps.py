@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from completesplat.results.machine import machine
 from completesplat.results.measured import time_cell
 from completesplat.results.sweeps import IDENTITY, SweepRow, figures, summarize, write_summary
-from completesplat.results.tables import SSIM_NOTE, escape, show
+from completesplat.results.tables import SSIM_NOTE, as_markdown, escape, show
 
 FILES = ["summary.csv", "summary.md", "summary.tex"]
 PSNR = "full_novel_psnr"
@@ -52,6 +52,22 @@ def test_the_summary_agrees_with_the_files_of_the_jobs(ablations) -> None:
     assert set(table.columns[4:]) == {f"{name}_{kind}" for _, name in scores for kind in ("mean", "deviation")}
     assert list(table.index) == ["m1", "no_skips", "full", "mean_image", "copy_reference"]
     assert list(table.loc["full"][:3]) == [3, 40, 9]
+
+
+def test_the_same_image_is_called_so_as_in_the_terminal_and_in_the_tables_of_reports(sweep) -> None:
+    for seed in range(2):
+        path = sweep.scored(f"seed={seed}", psnr=20.0, full_reference_psnr=100.0) / "metrics.json"
+        metrics = json.loads(path.read_text())
+        metrics["test"]["copy_reference"]["full"]["reference"] = {"psnr": 100.0}
+        path.write_text(json.dumps(metrics))
+    lines = as_markdown(write_summary(sweep.folder)).splitlines()
+    (model,), (copied,) = (
+        [line for line in lines if line.startswith(f"| {name} |")] for name in ("small", "copy_reference")
+    )
+    assert "the same image** |" in model
+    assert "| the same image |" in copied
+    assert "100.00" not in (sweep.folder / "summary.md").read_text()
+    assert read_back(sweep.folder).loc["copy_reference", "full_reference_psnr_mean"] == 100
 
 
 def test_one_seed_has_no_deviation_and_one_that_diverged_counts_in_the_mean(sweep) -> None:
@@ -211,6 +227,20 @@ def test_the_terminal_shows_the_headline_and_names_the_jobs_that_have_not_finish
     assert "…" not in printed
 
 
+def test_jobs_in_nested_folders_are_found(sweep) -> None:
+    """As `hydra.sweep.subdir='x/${seed}'` puts them."""
+    for seed in range(2):
+        sweep.scored(f"seed={seed}", psnr=20.0 + seed).rename(sweep.folder / f"moved={seed}")
+    sweep.add("seed=2").rename(sweep.folder / "moved=2")
+    (sweep.folder / "x/y").mkdir(parents=True)
+    for name, place in (("moved=0", "x/0"), ("moved=1", "x/y/1"), ("moved=2", "x/2")):
+        (sweep.folder / name).rename(sweep.folder / place)
+    (sweep.folder / "silent/below").mkdir(parents=True)  # ended before it could write its record
+    rows, _ = summarize(sweep.folder)
+    assert (rows[0].seeds, rows[0].means[PSNR]) == (2, 20.5)
+    assert remarks(sweep)[:2] == ["2 of 4 jobs have finished.", "Not finished: x/2; silent."]
+
+
 def test_jobs_that_have_not_started_are_named_and_a_plan_that_depends_on_files_is_not_guessed(sweep) -> None:
     given = ["experiment=small", "ablation=m1,full", "seed=range(2)", "data.root=/home/someone/data/set"]
     sweep.plan([*given, "out=written/in/another/way"])
@@ -270,6 +300,12 @@ def launched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., P
         return tmp_path / "swept"
 
     return launch
+
+
+def test_the_summary_of_a_sweep_into_nested_folders_has_its_jobs(launched) -> None:
+    folder = launched("-m", "seed=0,2", "hydra.sweep.subdir=x/${seed}")
+    assert (folder / "x/2/metrics.json").is_file()
+    assert "2 of 2 jobs have finished." in (folder / "summary.md").read_text()
 
 
 def test_a_sweep_ends_with_its_table_and_a_single_run_has_none(launched, tmp_path, capsys) -> None:

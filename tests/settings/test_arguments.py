@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.arguments import behind_dashes, for_hydra
 
+DASHES = "settings are key=value without dashes, such as out=DIR, and files are given by their names: `completesplat"
 NAMES = ["a.jpg", "a,b.jpg", "[a].jpg", "{a:1}.jpg", "a=b.jpg", "seed=1.jpg", " (1) .jpg", "it's.jpg", '"a".jpg']
 NAMES += [
     "a\\.jpg",
@@ -70,6 +71,13 @@ def test_numbers_and_lists_stay_what_they_are_beside_files_of_their_names(tmp_pa
         ("data", ["toy", "kind=rooms"], ["data_task=toy", "kind=rooms"]),
         ("data", ["import", "a b", "frames=3"], ["data_task=import", "folder='a b'", "frames=3"]),
         ("new", ["loss", "mine"], ["kind='loss'", "name='mine'"]),
+        # As an agent of W&B's sweeps gives settings, unless its command has ${args_no_hyphens}.
+        (
+            "fit",
+            ["--optimizer.lr=0.1", "-m", "--seed=0,1", "--test=False"],
+            ["-m", *["optimizer.lr=0.1", "seed=0,1", "test=False"]],
+        ),
+        ("predict", ["--image=a.png", "--config-dir=b"], ["--config-dir=b", "image=a.png"]),
     ],
 )
 def test_words_and_flags_become_settings(verb, typed, given):
@@ -84,6 +92,10 @@ def test_words_and_flags_become_settings(verb, typed, given):
         ("view", ["a.ply", "--export"], "--export: lacks its value; give --export VALUE"),
         ("fit", ["--config-dir"], "--config-dir: lacks its value; give --config-dir VALUE"),
         ("new", ["loss", "a", "b"], "give one kind and one name, not loss a b"),
+        ("predict", ["-i", "a.png", "-o", "b"], f"-i a.png: {DASHES}"),
+        ("predict", ["a.png", "-o", "b"], f"-o: {DASHES}"),
+        ("fit", ["--output", "b"], f"--output: {DASHES}"),
+        ("fit", ["-n=3"], f"-n=3: {DASHES}"),
         ("fit", ["nonsense"], "nonsense: no setting, which are given as key=value"),
         ("data", ["import", "a", "b"], "give one folder, not a b"),
         ("data", ["toy", "rooms"], "rooms: no setting, which are given as key=value"),

@@ -3,8 +3,9 @@
 import pytest
 import torch
 from PIL import Image
-from support import strict_json, write_capture
+from support import compose_config, strict_json, write_capture
 
+from completesplat.commands.fit import refuse_without_effect
 from completesplat.data.captures.capture import CapturedFrame
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_transforms
@@ -109,6 +110,16 @@ def test_settings_without_effect_and_several_captures_are_refused(command, captu
     refused = command("fit", *QUICK, change)
     assert (refused.status, refused.err.count("\n")) == (2, 1), refused.err
     assert reason in refused.err
+
+
+def test_settings_of_a_sweep_may_be_without_effect_in_one_of_its_jobs(tmp_path):
+    job, config = tmp_path / "sweep/x/0", compose_config("fit", "experiment=capture")
+    job.mkdir(parents=True)
+    (job / "run.json").write_text('{"overrides": ["optimizer.lr=1"]}')
+    with pytest.raises(CompleteSplatError, match=r"optimizer\.lr=1: CaptureFit does nothing with it"):
+        refuse_without_effect(config, job)
+    (tmp_path / "sweep/multirun.yaml").touch()
+    refuse_without_effect(config, job)
 
 
 @pytest.mark.slow

@@ -1,15 +1,25 @@
 """data.batch_size is the batch of an optimizer step, however many processes and accumulated batches share it."""
 
 import os
+from functools import partial
+from itertools import accumulate
 
+import lightning
 import pytest
+import torch
 from hydra.utils import instantiate
+from lightning.pytorch.callbacks import BatchSizeFinder
+from scenes_for_training import scene_batch
 from support import SMALL, compose_config, refused, strict_json
-from torch import distributed
+from torch import distributed, nn
 
+import completesplat
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
+from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.training.optimization import constant
 from completesplat.training.reconstruction import ReconstructionModule
+from completesplat.training.stage import Stage
 
 SETTINGS = ["data.image_size=32", "data.references_per_sequence=8"]
 
@@ -93,3 +103,68 @@ def test_launchers_say_how_many_processes_there_are(monkeypatch):
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
     monkeypatch.setenv("GROUP_WORLD_SIZE", "2")
     assert (trainer.devices, trainer.num_nodes) == (4, 2)
+
+
+class MeanOfScenes(Stage):
+    """One weight, whose gradient is the mean of the scenes' images, because the loss is the weight times that mean."""
+
+    def __init__(self) -> None:
+        super().__init__(ReferenceRasterizer(), partial(torch.optim.SGD, lr=1.0), constant)
+        self.weight = nn.Parameter(torch.zeros(()))
+        self.path = []
+
+    def reconstruct(self, scenes, seed):
+        raise NotImplementedError
+
+    def training_step(self, batch, index):
+        return self.weight * batch.reference.images.mean()
+
+    def on_train_batch_end(self, *_):
+        self.path.append(self.weight.item())
+
+
+@pytest.mark.parametrize("scenes", [8, 16, 17, 19, 20])
+@pytest.mark.parametrize("limit", [1.0, 5])
+def test_accumulated_batches_step_as_their_scenes_in_one_batch_also_at_an_epochs_end(scenes, limit, tmp_path):
+    """In closed form: a step of plain SGD moves the weight by minus the mean of the step's scenes."""
+    batch = scene_batch(scenes, size=8)
+    numbers, batches = batch.reference.images.mean((1, 2, 3)).tolist(), [batch[i : i + 2] for i in range(0, scenes, 2)]
+    module, quiet = MeanOfScenes(), {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+    quiet |= {"enable_checkpointing": False, "accelerator": "cpu", "default_root_dir": tmp_path}
+    trainer = lightning.Trainer(max_epochs=2, accumulate_grad_batches=4, limit_train_batches=limit, **quiet)
+    trainer.fit(module, torch.utils.data.DataLoader(batches, batch_size=None, collate_fn=lambda batch: batch))
+    seen = numbers if limit == 1.0 else numbers[: 2 * limit]
+    steps = [-sum(seen[i : i + 8]) / len(seen[i : i + 8]) for i in range(0, len(seen), 8)] * 2
+    assert trainer.global_step == len(steps)
+    assert [path for path in dict.fromkeys(module.path) if path] == pytest.approx(list(accumulate(steps)))
+
+
+def test_an_epoch_of_accumulated_batches_trains_as_whole_batches(toy_root, tmp_path):
+    """Six scenes in batches of four, by plain SGD: one step of four scenes, and one of two."""
+    given = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "data.batch_size=4", "ablation=no_variational"]
+    given += ["data.references_per_sequence=3"]
+    given += ["optimizer=adam", "optimizer._target_=torch.optim.SGD", "optimizer.lr=1"]
+    trained = []
+    for accumulated in (1, 2):
+        torch.manual_seed(0)
+        data, module = completesplat.instantiate(completesplat.compose("fit", *given))
+        quiet = {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False, "accelerator": "cpu"}
+        trainer = lightning.Trainer(max_epochs=1, accumulate_grad_batches=accumulated, limit_val_batches=0, **quiet)
+        trainer.fit(module, data)
+        assert trainer.global_step == 2
+        trained.append(torch.cat([parameter.detach().flatten() for parameter in module.parameters()]))
+    torch.testing.assert_close(*trained, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["power", "binsearch"])
+def test_lightnings_search_for_a_batch_size_ends_at_the_scenes_of_an_epoch(toy_root, tmp_path, mode):
+    given = [*SMALL, "experiment=toy_var", f"data.root={toy_root}", "data.references_per_sequence=5"]
+    data, module = completesplat.instantiate(completesplat.compose("fit", *given))
+    finder = BatchSizeFinder(mode, steps_per_trial=1, **({"margin": 0.0} if mode == "binsearch" else {}))
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False, "accelerator": "cpu"}
+    trainer = lightning.Trainer(
+        max_steps=1, callbacks=[finder], limit_val_batches=0, default_root_dir=tmp_path, **quiet
+    )
+    trainer.fit(module, data)
+    assert finder.optimal_batch_size == data.batch_size == 10  # five of each of two sequences
+    assert list(tmp_path.iterdir()) == []

@@ -2,18 +2,24 @@
 
 import json
 import re
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import lightning
 import pytest
 import torch
-from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, EarlyStopping, LearningRateFinder, ModelCheckpoint
+from lightning.pytorch.tuner import Tuner
+from scenes_for_training import scene_batch
 from support import SMALL
+from torch.optim.lr_scheduler import LambdaLR
 
 import completesplat
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
+from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.training.stage import Stage
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
 README = Path(__file__).parents[2] / "README.md"
@@ -100,6 +106,46 @@ def test_an_override_that_does_not_fit_is_refused_as_on_the_command_line(toy_roo
         opened(toy_root, "data.image_size=50")
     with pytest.raises(CompleteSplatError, match=r"model.checkpoint is needed"):
         opened(toy_root, "experiment=toy_var_stage2")
+
+
+class Quadratic(Stage):
+    """One weight w with the loss (w - 3)^2, and a schedule that halves the rate."""
+
+    def __init__(self) -> None:
+        halved = partial(LambdaLR, lr_lambda=lambda step: 1.0 if step < 2 else 0.5)
+        schedule = lambda optimizer, steps: halved(optimizer)  # noqa: E731
+        super().__init__(ReferenceRasterizer(), partial(torch.optim.SGD, lr=1e-6), schedule)
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.rates: list[float] = []
+
+    def reconstruct(self, scenes, seed):
+        raise NotImplementedError
+
+    def training_step(self, batch, index):
+        self.rates.append(self.trainer.optimizers[0].param_groups[0]["lr"])
+        return (self.weight - 3).square()
+
+
+def quadratic_run(module: Quadratic, folder: Path, *callbacks: lightning.Callback) -> lightning.Trainer:
+    quiet = {key: value for key, value in QUIET.items() if key != "logger"} | {"enable_checkpointing": False}
+    settings = {"max_steps": 4, "logger": False, "enable_model_summary": False, "default_root_dir": folder}
+    return lightning.Trainer(callbacks=list(callbacks), **settings, **quiet)
+
+
+def test_lightnings_search_for_a_learning_rate_sets_that_of_the_optimizer_and_its_schedule(tmp_path):
+    batches = torch.utils.data.DataLoader([scene_batch(1, size=8)] * 200, batch_size=None, collate_fn=lambda x: x)
+    module, finder = Quadratic(), LearningRateFinder(num_training_steps=40)
+    quadratic_run(module, tmp_path, finder).fit(module, batches)
+    found = finder.optimal_lr.suggestion()
+    assert found > 1e-5
+    assert module.lr == found
+    assert module.rates[-4:] == pytest.approx([found, found, found / 2, found / 2])
+
+    module = Quadratic()  # searched by itself before a run, in which the optimizer is built anew
+    found = Tuner(quadratic_run(module, tmp_path)).lr_find(module, batches, num_training=40).suggestion()
+    quadratic_run(module, tmp_path).fit(module, batches)
+    assert module.rates[-4:] == pytest.approx([found, found, found / 2, found / 2])
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from completesplat.training.loggers import ContinuedCSVLogger
+from completesplat.training.loggers import ContinuedCSVLogger, WandbRun
 
 
 def numbers(folder: Path) -> list[dict[str, float]]:
@@ -53,3 +53,12 @@ def test_a_line_that_was_cut_off_is_left_out(tmp_path):
     path.write_bytes(path.read_bytes()[:-3])
     log(tmp_path, {"a": 4.0, "step": 15})
     assert numbers(tmp_path) == [*OLD[:-1], {"a": 4.0, "step": 15}]
+
+
+def test_jobs_of_a_sweep_are_a_group_of_wandb_in_nested_folders_too(tmp_path):
+    pytest.importorskip("wandb")
+    (tmp_path / "sweep/x/0").mkdir(parents=True)
+    (tmp_path / "sweep/multirun.yaml").touch()
+    (tmp_path / "alone").mkdir()
+    for folder, group in (("sweep/x/0", "sweep"), ("sweep/0", "sweep"), ("alone", None)):
+        assert WandbRun(str(tmp_path / folder), "offline", "some")._wandb_init["group"] == group

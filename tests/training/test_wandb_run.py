@@ -62,3 +62,16 @@ def test_a_run_that_is_stopped_says_so(tmp_path):
         raise KeyboardInterrupt
     (run,) = offline_runs(tmp_path)
     assert run.only("exit").exit_code == 1
+
+
+@pytest.mark.parametrize("agent", [{}, {"WANDB_SWEEP_ID": "sweep", "WANDB_RUN_ID": "of_the_agent"}])
+def test_the_recorded_id_is_the_runs_also_under_a_sweeps_agent(tmp_path, monkeypatch, agent):
+    wandb.teardown()
+    for name, value in agent.items():
+        monkeypatch.setenv(name, value)
+    with wandb_runs([run_logger := WandbRun(str(tmp_path), "offline", "some")], OmegaConf.create({})):
+        run_logger.log_metrics({"a": 1.0})
+    wandb.teardown()
+    (run,) = offline_runs(tmp_path)
+    assert (tmp_path / "wandb_id").read_text() == f"{run.only('run').run_id}\n"
+    assert run.only("run").run_id == agent.get("WANDB_RUN_ID", run.only("run").run_id)

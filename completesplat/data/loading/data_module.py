@@ -231,6 +231,11 @@ class SceneDataModule(LightningDataModule):
         """Load random views of all training sequences in random order."""
         scenes = self._training_scenes()
         accumulated = 1 if self.trainer is None else self.trainer.accumulate_grad_batches
+        if (most := len(scenes) - len(scenes) % (processes()[1] * accumulated)) < self.batch_size:
+            logger.warning(
+                "data.batch_size=%d: an epoch has %d scenes; going on with %d", self.batch_size, len(scenes), most
+            )
+            self.batch_size = most  # Lightning's `BatchSizeFinder` doubles it after `setup`
         batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
         sampler = RepeatedEpoch if getattr(self.trainer, "overfit_batches", 0) else EpochSampler
         return SceneLoader(scenes, batch_size, sampler(scenes.groups(), self.seed), self.workers, *self.policy)
