@@ -25,21 +25,24 @@ $(READY): pyproject.toml $(if $(LOCKED),requirements.lock)
 	@touch $(READY)
 
 # The scenes have another seed than those of the weights' training. The toy image is the first frame of the last scene.
-demo: $(READY) ## Complete three images with the weights in the package, and score them (CPU, minutes)
+demo: $(READY) ## Complete four images with the weights in the package, and score some (CPU, minutes)
 	rm -rf $(DEMO)
 	$(BIN)/completesplat data toy kind=objects scenes=$(DEMO_SCENES) seed=1000 out=$(DEMO)/data
+	cp completesplat/weights/fruits/held_out.jpg $(DEMO)/fruit.jpg
 	cp completesplat/weights/rendered_couches/held_out.jpg $(DEMO)/couch.jpg
 	cp $(DEMO)/data/toy_objects/*$(DEMO_LAST)_*/images/frame000001.jpg $(DEMO)/toy.jpg
 	cp `$(BIN)/python -c "import skimage; print(skimage.__path__[0])"`/data/coffee.png $(DEMO)/photograph.png
+	$(BIN)/completesplat predict image=$(DEMO)/fruit.jpg weights=fruits out=$(DEMO)
 	$(BIN)/completesplat predict image=$(DEMO)/couch.jpg weights=rendered_couches out=$(DEMO)
-	$(BIN)/completesplat predict 'image=[$(DEMO)/toy.jpg,$(DEMO)/photograph.png]' out=$(DEMO)
+	$(BIN)/completesplat predict 'image=[$(DEMO)/toy.jpg,$(DEMO)/photograph.png]' weights=toy_objects out=$(DEMO)
 	$(BIN)/completesplat test weights=toy_objects data=toy_objects data.root=$(DEMO)/data out=$(DEMO)/test
 	@echo
 	@echo "In $(DEMO):"
-	@echo "  couch/        4 completions of a rendered couch that training never saw: look at sheet.png first;"
+	@echo "  fruit/        4 completions of a real photograph, of an apple that training never saw: look at sheet.png first;"
 	@echo "                sample_0*.ply open in any splat viewer, orbit_0*.mp4 in any player"
+	@echo "  couch/        the same for a rendered couch that training never saw"
 	@echo "  toy/          the same for a toy scene that training never saw"
-	@echo "  photograph/   the same for a real photograph, which these weights do not understand"
+	@echo "  photograph/   the same for a photograph of a cup, which no weights in the package understand"
 	@echo "  test/         metrics.json: scores of one sample for each held-out toy scene, beside naive predictors"
 	@echo "Next: $(BIN)/completesplat predict image=FILE, and make demo-train for both stages of training"
 

@@ -58,7 +58,7 @@ def test_the_readme_is_a_page_and_leads_to_every_document():
 
 def test_documents_are_short_and_a_change_is_one_line():
     words = {path: len(path.read_text().split()) for path in DOCUMENTS if path != STUDIES}
-    assert sum(words.values()) <= 10_500
+    assert sum(words.values()) <= 11_000
     assert words[ROOT / "completesplat/training/README.md"] <= 1_400
     entries = [line for line in CHANGELOG.read_text().partition("## [")[2].splitlines()[1:] if line]
     assert [line for line in entries if not line.startswith(("- ", "## ", "### ")) or len(line) > 160] == []
@@ -89,7 +89,7 @@ def test_the_citation_is_the_readmes_and_the_changelog_knows_this_version():
     for field, value in {"title": paper.title, "author": authors, "year": paper.year}.items():
         assert re.search(rf"{field} += {re.escape(f'{{{value}}}')}", text)
     assert citation.version == PROJECT["version"]
-    assert citation.license == PROJECT["license"]
+    assert PROJECT["license"] == f"{citation.license} AND CC-BY-SA-4.0"  # of the weights `fruits`
     assert f"## [{PROJECT['version']}] - {citation['date-released']}" in CHANGELOG.read_text()
     zenodo = json.loads((ROOT / ".zenodo.json").read_text())
     same = {"title": "title", "description": "abstract", "version": "version", "license": "license"}
