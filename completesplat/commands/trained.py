@@ -13,7 +13,6 @@ from completesplat.commands.protocol import checkpoint_facts
 from completesplat.errors import CompleteSplatError
 from completesplat.generator import CompleteSplat
 from completesplat.opening import config_of_run, locate
-from completesplat.results.runs import MODEL
 from completesplat.scene_model import SceneModel
 from completesplat.weights import RUN_CHECKPOINT, sha256_of, shipped
 from completesplat.weights.checkpoint_reading import load_part
@@ -65,11 +64,6 @@ class Trained:
         if self.data is not None and self.data.get("background") is not None:
             rendering["background"] = self.data["background"]
         return SceneFiles(str(self.scenes), self.frame, self.align, self.method, **rendering)
-
-    @property
-    def label(self) -> str:
-        """Return the name of the model in printed tables, that of the method for files of scenes."""
-        return MODEL if self.scenes is None else self.files.method
 
     def configuration(self) -> Any:
         """Return the config of the data, and with `ckpt` also of the model.

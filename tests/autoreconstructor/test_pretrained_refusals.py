@@ -73,9 +73,13 @@ def test_files_that_are_no_vae_are_named_without_advice_to_download_another(fold
     assert refusal(other).startswith(f"{other}: not one of the files that are read: .safetensors, .bin, .ckpt")
     (folder / SAFETENSORS).rename(folder / "kl-f8.safetensors")
     message = refusal(folder)
-    assert message.endswith(f"if one of its files is the VAE, give autoreconstructor.pretrained={folder}/kl-f8.safetensors")
+    assert message.endswith(
+        f"if one of its files is the VAE, give autoreconstructor.pretrained={folder}/kl-f8.safetensors"
+    )
     torch.save({"state_dict": {"unet.weight": torch.ones(1)}}, other.with_suffix(".ckpt"))
-    assert f"{other.with_suffix('.ckpt')}: encoder.conv_in.weight is missing there" in refusal(other.with_suffix(".ckpt"))
+    assert f"{other.with_suffix('.ckpt')}: encoder.conv_in.weight is missing there" in refusal(
+        other.with_suffix(".ckpt")
+    )
     other.with_suffix(".pt").write_bytes(b"\x80\x02c__builtin__\neval\n.")
     message = refusal(other.with_suffix(".pt"))
     assert message.startswith(f"{other.with_suffix('.pt')}: damaged, or not a VAE (")

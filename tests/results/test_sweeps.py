@@ -61,7 +61,9 @@ def test_the_same_image_is_called_so_as_in_the_terminal_and_in_the_tables_of_rep
         metrics["test"]["copy_reference"]["full"]["reference"] = {"psnr": 100.0}
         path.write_text(json.dumps(metrics))
     lines = as_markdown(write_summary(sweep.folder)).splitlines()
-    (model,), (copied,) = ([line for line in lines if line.startswith(f"| {name} |")] for name in ("small", "copy_reference"))
+    (model,), (copied,) = (
+        [line for line in lines if line.startswith(f"| {name} |")] for name in ("small", "copy_reference")
+    )
     assert "the same image** |" in model
     assert "| the same image |" in copied
     assert "100.00" not in (sweep.folder / "summary.md").read_text()

@@ -72,7 +72,11 @@ def test_numbers_and_lists_stay_what_they_are_beside_files_of_their_names(tmp_pa
         ("data", ["import", "a b", "frames=3"], ["data_task=import", "folder='a b'", "frames=3"]),
         ("new", ["loss", "mine"], ["kind='loss'", "name='mine'"]),
         # As an agent of W&B's sweeps gives settings, unless its command has ${args_no_hyphens}.
-        ("fit", ["--optimizer.lr=0.1", "-m", "--seed=0,1", "--test=False"], ["-m", *"optimizer.lr=0.1 seed=0,1 test=False".split()]),
+        (
+            "fit",
+            ["--optimizer.lr=0.1", "-m", "--seed=0,1", "--test=False"],
+            ["-m", *["optimizer.lr=0.1", "seed=0,1", "test=False"]],
+        ),
         ("predict", ["--image=a.png", "--config-dir=b"], ["--config-dir=b", "image=a.png"]),
     ],
 )

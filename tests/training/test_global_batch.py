@@ -162,7 +162,9 @@ def test_lightnings_search_for_a_batch_size_ends_at_the_scenes_of_an_epoch(toy_r
     data, module = completesplat.instantiate(completesplat.compose("fit", *given))
     finder = BatchSizeFinder(mode, steps_per_trial=1, **({"margin": 0.0} if mode == "binsearch" else {}))
     quiet = {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False, "accelerator": "cpu"}
-    trainer = lightning.Trainer(max_steps=1, callbacks=[finder], limit_val_batches=0, default_root_dir=tmp_path, **quiet)
+    trainer = lightning.Trainer(
+        max_steps=1, callbacks=[finder], limit_val_batches=0, default_root_dir=tmp_path, **quiet
+    )
     trainer.fit(module, data)
     assert finder.optimal_batch_size == data.batch_size == 10  # five of each of two sequences
     assert list(tmp_path.iterdir()) == []

@@ -216,7 +216,9 @@ class SceneDataModule(LightningDataModule):
         scenes = self._training_scenes()
         accumulated = 1 if self.trainer is None else self.trainer.accumulate_grad_batches
         if (most := len(scenes) - len(scenes) % (processes()[1] * accumulated)) < self.batch_size:
-            logger.warning("data.batch_size=%d: an epoch has %d scenes; going on with %d", self.batch_size, len(scenes), most)
+            logger.warning(
+                "data.batch_size=%d: an epoch has %d scenes; taken are %d", self.batch_size, len(scenes), most
+            )
             self.batch_size = most  # Lightning's `BatchSizeFinder` doubles it after `setup`
         batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
         return SceneLoader(scenes, batch_size, EpochSampler(scenes.groups(), self.seed), self.workers, *self.policy)
