@@ -56,8 +56,8 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
         config = dict(json.loads(config_file.read_text())) if config_file.is_file() else {}
         weights = _read_weights(file)
     except Exception as error:  # torch and safetensors raise many kinds for a damaged file
-        reason = f"damaged, or not a VAE ({first_line(error).partition('. ')[0]})"
-        raise WeightsError(f"{place}: {reason}; fetch it again, as .safetensors if there is one") from error
+        cause = first_line(error).partition(". ")[0]  # torch adds advice to trust the file
+        raise WeightsError(f"{place}: damaged, or not a VAE ({cause}); fetch it again") from error
     decoder: dict[str, nn.Module] = {}
     if reconstructor is None:
         weights = {name: value for name, value in weights.items() if name.startswith(ENCODER)}
