@@ -2,8 +2,9 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors.torch import load_file
@@ -55,8 +56,8 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
         config = dict(json.loads(config_file.read_text())) if config_file.is_file() else {}
         weights = _read_weights(file)
     except Exception as error:  # torch and safetensors raise many kinds for a damaged file
-        reason = f"damaged, or not a VAE ({first_line(error).partition('. ')[0]})"
-        raise WeightsError(f"{place}: {reason}; fetch it again, as .safetensors if there is one") from error
+        cause = first_line(error).partition(". ")[0]  # torch adds advice to trust the file
+        raise WeightsError(f"{place}: damaged, or not a VAE ({cause}); fetch it again") from error
     decoder: dict[str, nn.Module] = {}
     if reconstructor is None:
         weights = {name: value for name, value in weights.items() if name.startswith(ENCODER)}
@@ -73,8 +74,8 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
         reason = f"its activation is {activation}, not silu"
     if reason is not None:
         raise WeightsError(f"{place}: {reason}; {_needed_settings(config, part)}")
-    if (name := not_finite(loaded)) is not None:
-        raise WeightsError(f"{place}: {name} is not finite; fetch it again")
+    if (unfit := not_finite(loaded)) is not None:
+        raise WeightsError(f"{place}: {unfit} is not finite; fetch it again")
     vae.load_state_dict(loaded, strict=False)
 
 
@@ -88,9 +89,7 @@ def _needed_settings(config: Mapping[str, object], part: str) -> str:
         for theirs, ours in names.items()
         if theirs in config
     ]
-    return (
-        f"its config.json asks for {' '.join(overrides)}" if overrides else "no config.json beside it gives its sizes"
-    )
+    return f"its config.json asks for {' '.join(overrides)}" if overrides else "no config.json gives its sizes"
 
 
 def _vae_file(source: str, part: str) -> Path:
@@ -122,12 +121,13 @@ def _vae_file(source: str, part: str) -> Path:
 def _read_weights(file: Path) -> dict[str, Tensor]:
     """Return tensors by the names of diffusers' AutoencoderKL."""
     safe = file.suffix == ".safetensors"
-    weights = load_file(file) if safe else torch.load(file, map_location="cpu", weights_only=True)
-    weights = weights.get("state_dict", weights)
+    contents: dict[str, Any] = load_file(file) if safe else torch.load(file, map_location="cpu", weights_only=True)
+    weights = contents.get("state_dict", contents)
     if levels := {match[1] for match in map(LDM.match, weights) if match}:
         from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint
 
-        weights = convert_ldm_vae_checkpoint(weights, dict.fromkeys(("down_block_types", "up_block_types"), levels))
+        convert: Callable[..., dict[str, Tensor]] = convert_ldm_vae_checkpoint
+        weights = convert(weights, dict.fromkeys(("down_block_types", "up_block_types"), levels))
     return {_current_name(name): value for name, value in weights.items() if isinstance(value, Tensor)}
 
 

@@ -97,7 +97,7 @@ def run(trained: Config, evaluation: Config, trainer: Config, logger: Config | N
             return
         described = protocol(evaluation, module, data, results, out) | tested.facts()
         write_json(out / METRICS, {"protocol": described} | results)
-    show(evaluation_table(results, tested.label), width=160)
+    show(evaluation_table(results, MODEL if tested.scenes is None else module.method), width=160)
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")
 
@@ -163,8 +163,8 @@ def run_hidden_modes(
             each.log_metrics(scores, step=0)
             each.save()
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
-    labels = dict.fromkeys(results) | {MODEL: tested.label}
-    records = [{"method": labels[name] or name, **values} for name, values in results.items()]
+    labels = {} if tested.scenes is None else {MODEL: module.method}
+    records = [{"method": labels.get(name, name), **values} for name, values in results.items()]
     Console(width=140).print(table(title, COLUMNS, records))
     if skipped:
         print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")

@@ -15,7 +15,6 @@ from completesplat.errors import CompleteSplatError, ImageError, WeightsError
 from completesplat.files import printable
 from completesplat.generator import CompleteSplat
 from completesplat.opening import config_of_run, locate
-from completesplat.results.runs import MODEL
 from completesplat.scene_model import SceneModel, distances_to_shipped
 from completesplat.settings.checks import REMOVE
 from completesplat.weights import AUTO, RUN_CHECKPOINT, sha256_of, shipped
@@ -68,11 +67,6 @@ class Trained:
         if self.data is not None and self.data.get("background") is not None:
             rendering["background"] = self.data["background"]
         return SceneFiles(str(self.scenes), self.frame, self.align, self.method, **rendering)
-
-    @property
-    def label(self) -> str:
-        """Return the name of the model in printed tables, that of the method for files of scenes."""
-        return MODEL if self.scenes is None else self.files.method
 
     def configuration(self) -> Any:
         """Return the config of the data, and with `ckpt` also of the model.

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.errors import WeightsError
 from completesplat.metrics.images import Images, Missing, unless_missing
 from completesplat.weights import first_line, weights_file
 
@@ -97,9 +97,7 @@ class Inception:
         return features
 
     def distances(self, true: Descriptors, predicted: Descriptors) -> dict[str, float]:
-        """See `SetMetric`; raise CompleteSplatError for a single image, which has no covariance."""
-        if min(len(true), len(predicted)) < 2:
-            raise CompleteSplatError("needs at least 2 images, there is 1")
+        """See `SetMetric`; raise RuntimeError for a single image, which has no covariance."""
         return {"fid": frechet_distance(true, predicted), "kid": kernel_distance(true, predicted, self.subset_size)}
 
     def settings(self) -> dict[str, Settings]:

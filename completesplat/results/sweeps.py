@@ -130,12 +130,10 @@ def figures(rows: Sequence[SweepRow], names: Sequence[str]) -> list[list[Cell]]:
     """
     competing = [row.seeds is not None and not row.upper_bound for row in rows]
     marked = {name: marks([row.means.get(name) for row in rows], competing, name) for name in names}
-    cells: list[list[Cell]] = []
-    for index, row in enumerate(rows):
-        cells.append([])
-        for name in names:
-            cells[-1].append(score_cell(name, row.means.get(name), row.deviations.get(name), marked[name][index]))
-    return cells
+    return [
+        [score_cell(name, row.means.get(name), row.deviations.get(name), marked[name][index]) for name in names]
+        for index, row in enumerate(rows)
+    ]
 
 
 def summarize(*folders: Path) -> tuple[list[SweepRow], Table]:

@@ -206,13 +206,13 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = M
     for name in names:
         region, view, kind = name.split("_")
         headings.append(Heading(f"{LABELS[region]}\n{view}\n{METRICS[kind]}"))
-    rows, fitted = [], []
-    for predictor, scores in zip(results, records, strict=True):
-        label = model if predictor == MODEL else predictor
-        fitted += [f"{label}: fitted to {of}." for of in [results[predictor].get("fitted_to")] if of]
+    labelled = {model if predictor == MODEL else predictor: entry for predictor, entry in results.items()}
+    fitted = [f"{name}: fitted to {entry['fitted_to']}." for name, entry in labelled.items() if entry.get("fitted_to")]
+    rows = []
+    for label, scores in zip(labelled, records, strict=True):
         bound = " (upper bound)" if scores.get(UPPER_BOUND) else ""
         rows.append(TableRow("", [Cell(label + bound), *(score_cell(name, scores.get(name)) for name in names)]))
-    title = f"{records[0]['scenes']} scenes, {records[0]['views']} novel views"
+    title = f"{records[0]['scenes']:.0f} scenes, {records[0]['views']:.0f} novel views"
     return Table(title, title, headings, rows, [*fitted, SSIM_NOTE, SHARPNESS_NOTE])
 
 

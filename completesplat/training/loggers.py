@@ -140,9 +140,8 @@ class WandbRun(WandbLogger):
         import wandb
 
         path = self.folder / "wandb_id"
-        if not (path.is_file() and path.read_text().strip()):
-            write_text(path, secrets.token_hex(4) + "\n")
-        settings = {"id": path.read_text().strip(), "settings": wandb.Settings(init_timeout=START_SECONDS)}
+        known = path.read_text().strip() if path.is_file() else ""
+        settings = {"id": known or secrets.token_hex(4), "settings": wandb.Settings(init_timeout=START_SECONDS)}
         try:
             return wandb.init(**self._wandb_init | settings)
         except wandb.Error as error:

@@ -83,7 +83,7 @@ def test_older_names_of_the_attention_are_known(vae, folder):
 
 
 def by_ldms_names(vae) -> dict[str, torch.Tensor]:
-    """A VAE's tensors as Stable Diffusion's own files name them; the attention's layers are 1 x 1 convolutions there."""
+    """A VAE's tensors by Stable Diffusion's own names; the attention's layers are 1 x 1 convolutions there."""
     renamed, blocks = {}, len(vae.config.up_block_types)
     for name, value in vae.state_dict().items():
         new = re.sub(r"down_blocks\.(\d)\.resnets", r"down.\1.block", name)

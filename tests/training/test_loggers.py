@@ -1,8 +1,12 @@
 import csv
+import re
 from pathlib import Path
 
 import pytest
+import yaml
+from omegaconf import OmegaConf
 
+import completesplat.training
 from completesplat.training.loggers import ContinuedCSVLogger, WandbRun
 
 
@@ -62,3 +66,15 @@ def test_jobs_of_a_sweep_are_a_group_of_wandb_in_nested_folders_too(tmp_path):
     (tmp_path / "alone").mkdir()
     for folder, group in (("sweep/x/0", "sweep"), ("sweep/0", "sweep"), ("alone", None)):
         assert WandbRun(str(tmp_path / folder), "offline", "some")._wandb_init["group"] == group
+
+
+def test_the_sweep_of_wandb_in_the_readme_gives_settings_that_there_are():
+    text = (Path(completesplat.training.__file__).parent / "README.md").read_text()
+    (written,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    sweep = yaml.safe_load(written)
+    program, verb, *given, last = sweep["command"]
+    assert (program, last) == ("completesplat", "${args_no_hyphens}")
+    values = {name: values.get("min", 0.5) for name, values in sweep["parameters"].items()}
+    for dashes in ("", "--"):  # of `${args_no_hyphens}`, and of `${args}`, W&B's default
+        config = completesplat.compose(verb, *given, *(f"{dashes}{name}={value}" for name, value in values.items()))
+        assert {name: OmegaConf.select(config, name) for name in values} == values

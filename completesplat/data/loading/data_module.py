@@ -233,7 +233,7 @@ class SceneDataModule(LightningDataModule):
         accumulated = 1 if self.trainer is None else self.trainer.accumulate_grad_batches
         if (most := len(scenes) - len(scenes) % (processes()[1] * accumulated)) < self.batch_size:
             logger.warning(
-                "data.batch_size=%d: an epoch has %d scenes; going on with %d", self.batch_size, len(scenes), most
+                "data.batch_size=%d: an epoch has %d scenes; taken are %d", self.batch_size, len(scenes), most
             )
             self.batch_size = most  # Lightning's `BatchSizeFinder` doubles it after `setup`
         batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
