@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import strict_json
+from realestate10k_trees import make_clip, write_tree
+from support import SMALL, strict_json
 
 from completesplat.data.toy import write_objects
 
@@ -103,3 +104,21 @@ def test_validation_on_test_sequences_is_reported(command, damaged, tmp_path):
     finished, results = checked(command, damaged.parent, tmp_path / "allowed", "data.allow_shared_sequences=true")
     assert (finished.status, list(results["shared"])) == (0, ["val and test"])
     assert len(results["shared"]["val and test"]) == 1
+
+
+def test_clips_without_the_frames_of_an_evaluation_index_are_unusable_and_refused_before_training(command, tmp_path):
+    clips = [make_clip(f"c{number}", frames=4) for number in range(3)]
+    root = write_tree(tmp_path / "rooms", "text", clips, clips)
+    index = {f"c{number}": {"context": [0], "target": [3 if number == 0 else 4]} for number in range(3)}
+    (tmp_path / "index.json").write_text(json.dumps(index))
+    given = ["data=realestate10k", f"data.root={root}", f"data.evaluation_index={tmp_path / 'index.json'}"]
+    command("data", "check", *given, "data.image_size=16", "splits=[test]", "workers=1", "out=CHECK")
+    results = strict_json(tmp_path / "CHECK/check.json")
+    assert results["usable"] == {"sequences": 1, "frames": 4}
+    assert [error["sequence"] for error in results["refused"]] == ["c1", "c2"]
+    started = [*given, *SMALL, "data.batch_size=1", "data.val_fraction=0.5", "data.targets=1", "data.max_gap=2"]
+    fitted = command("fit", *started, "out=RUN")
+    assert (fitted.status, fitted.err.count("\n")) == (2, 1), fitted.err
+    assert "2 of 3 items cannot be read" in fitted.err
+    assert "c2, frame 4: the frame is in the evaluation index, not in the data" in fitted.err
+    assert not list((tmp_path / "RUN").glob("checkpoints/*"))

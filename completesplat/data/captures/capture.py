@@ -136,8 +136,8 @@ class CapturedFrame:
                 as_stored, sideways = image.size == (width, height), orientation in SIDEWAYS
                 as_upright = image.size == (height, width) if sideways else as_stored
                 if not as_stored and not as_upright:
-                    size = f"has {image.height} x {image.width} pixels, its camera {height} x {width}"
-                    raise ImageError(f"{size}: give the photos that the cameras were computed for, of any size")
+                    differs = f"has {image.height} x {image.width} pixels, its camera {height} x {width}"
+                    raise ImageError(f"{differs}: give the photos that the cameras were computed for, of any size")
                 if orientation not in TRANSPOSITIONS:
                     return None
                 unclear = as_stored and (as_upright or self.orientation == "unknown") and self.orientation != "ignored"

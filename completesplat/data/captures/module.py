@@ -192,7 +192,7 @@ class CaptureDataModule(ObjectDataModule):
 
     def open(self, split: str) -> Mapping[str, CaptureSource]:
         """Read the cameras of all captures; the error of one capture is only raised if no other can be read."""
-        for left in (self.root.with_name(f".{self.root.name}.unfinished"), *self.root.glob(".*.unfinished")):
+        for left in (self.root.parent / f".{self.root.name}.unfinished", *self.root.glob(".*.unfinished")):
             if left.is_dir():
                 logger.warning("%s: left by an import that was interrupted: start it again", left)
         if not self.root.exists():

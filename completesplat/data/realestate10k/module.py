@@ -190,11 +190,11 @@ class RE10KDataModule(SceneDataModule):
     def check_test(self) -> None:
         """Read all clips of an evaluation index, chunks as a whole, because clips may lack its frames."""
         if self.index is not None:
-            loader, refused = self.test_dataloader(), list[DataError]()
-            for name in loader.dataset.names:
+            store, refused = self.store("test"), list[DataError]()
+            for name in store.names:
                 with refused_to(refused.append), at(sequence=name):
-                    loader.dataset.store.source.read(name)
-            loader.account(refused, empty=len(refused) == len(loader.dataset))
+                    store.source.read(name)
+            self.test_dataloader().account(refused, empty=len(refused) == len(store.names))
 
     def stackable(self, scenes: EvaluationScenes) -> bool:
         """Decide by the evaluation index, because reading all clips would take hours."""
