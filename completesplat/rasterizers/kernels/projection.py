@@ -199,27 +199,17 @@ def splat_gradients(row_x, row_y, root, blur, sums):
 
 
 @helper
-def slopes(mean, camera, rotation):
-    """Return (x / z, y / z, 1 / z) of the means in camera coordinates."""
+def view_gradients(mean, root, camera, blur, sums):
+    """Return the gradients of means and roots from one view's sums: through pixel position, Jacobian and depth."""
+    rotation = nine(camera, layout.ROTATION)
     x, y, z = camera_point(camera, rotation, mean)
     inverse_z = ONE / z
-    return x * inverse_z, y * inverse_z, inverse_z
-
-
-@helper
-def row_gradients(slope_x, slope_y, inverse_z, root, camera, rotation, blur, sums):
-    """Return gradients with respect to the centre (two numbers), the rows of J W, and the root."""
+    slope_x, slope_y = x * inverse_z, y * inverse_z
     row_x, row_y = image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
     grad_center_x, grad_center_y, grad_a, grad_b = splat_gradients(row_x, row_y, root, blur, sums)
     grad_root = add_each(outer(row_x, grad_a), outer(row_y, grad_b))
-    return grad_center_x, grad_center_y, matrix_times_column(root, grad_a), matrix_times_column(root, grad_b), grad_root
+    grad_row_x, grad_row_y = matrix_times_column(root, grad_a), matrix_times_column(root, grad_b)
 
-
-@helper
-def point_gradient(
-    camera, rotation, slope_x, slope_y, inverse_z, grad_row_x, grad_row_y, grad_center_x, grad_center_y, grad_depth
-):
-    """Return the gradient of the mean in camera coordinates, through its pixel position, the Jacobian and depth."""
     focal_x, focal_y = camera[layout.FOCAL_X], camera[layout.FOCAL_Y]
     min_x, max_x = camera[layout.MIN_SLOPE_X], camera[layout.MAX_SLOPE_X]
     min_y, max_y = camera[layout.MIN_SLOPE_Y], camera[layout.MAX_SLOPE_Y]
@@ -233,4 +223,5 @@ def point_gradient(
     grad_slope_y = focal_y * grad_center_y - keep(free_y, focal_y * inverse_z * along_y)
     # slope = point / z, and d(1 / z) / dz = -1 / z^2.
     grad_z = -inverse_z * (grad_slope_x * slope_x + grad_slope_y * slope_y + grad_inverse_z * inverse_z)
-    return grad_slope_x * inverse_z, grad_slope_y * inverse_z, grad_z + grad_depth
+    grad_point = grad_slope_x * inverse_z, grad_slope_y * inverse_z, grad_z + sums[layout.SUM_DEPTH]
+    return row_times_matrix(grad_point, rotation), grad_root
