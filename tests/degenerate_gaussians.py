@@ -80,21 +80,21 @@ def camera() -> Cameras:
 
 
 def draw(
-    rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras | None = None, intrinsics: bool = True
+    rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras | None = None, followed: tuple[str, ...] = ()
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return all images in one tensor, and gradients of the Gaussians and cameras under random cotangents."""
+    """Return all images in one tensor, and gradients of the Gaussians (and of `followed`) under random cotangents."""
     cameras = (camera() if cameras is None else cameras).to(gaussians.means)
     cotangents = [cotangent.to(gaussians.means) for cotangent in cotangents_for(cameras, 1)]
-    rendering, gradients = render_with_gradients(rasterizer, gaussians, cameras, cotangents, intrinsics)
+    rendering, gradients = render_with_gradients(rasterizer, gaussians, cameras, cotangents, followed)
     return torch.cat(list(vars(rendering).values()), dim=2), gradients
 
 
 def assert_changes_nothing(
-    rasterizer: Rasterizer, gaussian: Gaussians, gradients_agree: float = 0.0, intrinsics: bool = True
+    rasterizer: Rasterizer, gaussian: Gaussians, gradients_agree: float = 0.0, followed: tuple[str, ...] = ()
 ) -> None:
     rest = healthy(12).to(gaussian.means)
-    expected, expected_gradients = draw(rasterizer, rest, intrinsics=intrinsics)
-    images, gradients = draw(rasterizer, concatenate([gaussian, rest]), intrinsics=intrinsics)
+    expected, expected_gradients = draw(rasterizer, rest, followed=followed)
+    images, gradients = draw(rasterizer, concatenate([gaussian, rest]), followed=followed)
     assert expected.any()
     assert torch.equal(images, expected)
     for name, without in expected_gradients.items():
@@ -105,8 +105,8 @@ def assert_changes_nothing(
         assert (gradient - without).norm() <= gradients_agree * without.norm(), name
 
 
-def assert_drawn_as_by_the_reference(rasterizer: Rasterizer, kind: str, intrinsics: bool = True) -> None:
-    gaussians, of = concatenate([healthy(12), changed(DRAWN[kind])]), partial(draw, intrinsics=intrinsics)
+def assert_drawn_as_by_the_reference(rasterizer: Rasterizer, kind: str, followed: tuple[str, ...] = ()) -> None:
+    gaussians, of = concatenate([healthy(12), changed(DRAWN[kind])]), partial(draw, followed=followed)
     images, gradients = of(rasterizer, gaussians)
     expected, expected_gradients = of(ReferenceRasterizer(), gaussians.to(torch.float64))
     assert not torch.equal(images, of(rasterizer, healthy(12))[0])

@@ -90,13 +90,14 @@ def scenes(
 
 
 def render_with_gradients(
-    rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras, cotangents: list[Tensor], intrinsics: bool = True
-) -> tuple[Rendering, dict[str, Tensor]]:
-    """The images, and the gradients of all inputs under these cotangents of colour, depth and alpha."""
+    rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras, cotangents: list[Tensor],
+    followed: tuple[str, ...] = (),
+) -> tuple[Rendering, dict[str, Tensor]]:  # fmt: skip
+    """The images, and gradients under these cotangents: of the Gaussians and the `followed` tensors of the cameras."""
     gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
-    cameras = cameras.map(lambda tensor: tensor.detach().requires_grad_())
-    cameras.intrinsics.requires_grad_(intrinsics)
-    followed = ("world_to_camera", "intrinsics") if intrinsics else ("world_to_camera",)
+    cameras = cameras.map(lambda tensor: tensor.detach())
+    for name in followed:
+        getattr(cameras, name).requires_grad_()
     inputs = vars(gaussians) | {name: getattr(cameras, name) for name in followed}
     rendering = rasterizer(gaussians, cameras)
     # In one sum: an image of nothing but constants has no gradient of its own.
@@ -113,23 +114,25 @@ def cotangents_for(cameras: Cameras, seed: int) -> list[Tensor]:
 
 def assert_agrees(
     rasterizer: Rasterizer, constants: RenderingConstants, gaussians: Gaussians, cameras: Cameras, seed: int,
-    image: float = 1e-5, gradient: float = 1e-4, of: tuple[str, ...] | None = None,
+    image: float = 1e-5, gradient: float = 1e-4, followed: tuple[str, ...] = (),
 ) -> None:  # fmt: skip
     """Compare with the float64 reference, under random cotangents.
 
     Args:
         image: largest error of the images, absolute, and of each image as a whole, relative in L2.
         gradient: largest relative L2 error of a gradient.
-        of: the inputs whose gradients are compared; by default all, cameras included.
+        followed: tensors of the cameras whose gradients are compared, too.
     """
     cotangents = cotangents_for(cameras, seed)
-    rendering, gradients = render_with_gradients(rasterizer, gaussians, cameras, cotangents)
+    rendering, gradients = render_with_gradients(rasterizer, gaussians, cameras, cotangents, followed)
     doubles = [tensor.double() for tensor in cotangents]
     gaussians, cameras = gaussians.to(torch.float64), cameras.to(torch.float64)
-    exact, exact_gradients = render_with_gradients(ReferenceRasterizer(constants), gaussians, cameras, doubles)
+    exact, exact_gradients = render_with_gradients(
+        ReferenceRasterizer(constants), gaussians, cameras, doubles, followed
+    )
     for name, expected in vars(exact).items():
         difference = getattr(rendering, name) - expected
         assert difference.abs().max() <= image, name
         assert difference.norm() <= image * expected.norm(), name
-    for name in of or exact_gradients:
-        assert (gradients[name] - exact_gradients[name]).norm() <= gradient * exact_gradients[name].norm(), name
+    for name, expected in exact_gradients.items():
+        assert (gradients[name] - expected).norm() <= gradient * expected.norm(), name

@@ -74,7 +74,7 @@ class CudaRasterizer:
             return self(gaussians.to(DEVICE), cameras.to(DEVICE)).to(home)
         require_float32("cuda", gaussians, cameras, home)
         if torch.is_grad_enabled() and cameras.intrinsics.requires_grad:
-            message = "the cuda rasterizer has no gradient to the intrinsics: detach them, or take rasterizer=tiled"
+            message = "the cuda rasterizer has no gradient to the intrinsics: detach them, or take rasterizer=reference"
             raise CompleteSplatError(message)
         height, width = cameras.image_size
         prepared = prepare(gaussians, drawable(gaussians, cameras, self.constants))

@@ -21,12 +21,12 @@ SMALLEST_BLUR = 1e-5  # px^2; with it, the reference's clamp on the determinant 
 class TiledRasterizer:
     """CPU rasterizer that computes the function of `ReferenceRasterizer` in float32, hundreds of times faster.
 
-    Gradients reach all parameters of the Gaussians and the cameras (of the intrinsics, focal lengths and principal
-    point). Results do not depend on the number of threads (`torch.set_num_threads`). The kernels are compiled on
-    first use, which takes some seconds once per machine.
+    Gradients reach all parameters of the Gaussians, not the cameras. Results do not depend on the number of threads
+    (`torch.set_num_threads`). The kernels are compiled on first use, which takes some seconds once per machine.
 
     Raises:
-        CompleteSplatError: constants that it does not support; on a call, tensors of another dtype, device or shape.
+        CompleteSplatError: constants that it does not support; on a call, tensors of another dtype, device or shape, or
+            cameras that require a gradient.
     """
 
     def __init__(self, constants: RenderingConstants | None = None) -> None:
@@ -42,8 +42,7 @@ class TiledRasterizer:
         if gaussians.means.is_cuda:
             return self(gaussians.to("cpu"), cameras.to("cpu")).to(gaussians.means.device)
         _check(gaussians, cameras)
-        tensors = (*vars(gaussians).values(), cameras.world_to_camera, cameras.intrinsics)
-        images = _Rasterize.apply(cameras.image_size, self.constants, *tensors)  # type: ignore[no-untyped-call]
+        images = _Rasterize.apply(cameras, self.constants, *vars(gaussians).values())  # type: ignore[no-untyped-call]
         return Rendering(*images)
 
 
@@ -54,6 +53,9 @@ def _check(gaussians: Gaussians, cameras: Cameras) -> None:
         if actual != shape:
             raise CompleteSplatError(f"{name} should have the shape {shape}, not {actual}")
     require_float32("tiled", gaussians, cameras, torch.device("cpu"))
+    if torch.is_grad_enabled() and (cameras.world_to_camera.requires_grad or cameras.intrinsics.requires_grad):
+        message = "the tiled rasterizer has no gradient to the cameras: detach them, or take rasterizer=reference"
+        raise CompleteSplatError(message)
 
 
 def pack_cameras(cameras: Cameras, frustum_margin: float) -> np.ndarray:
@@ -74,27 +76,14 @@ def pack_cameras(cameras: Cameras, frustum_margin: float) -> np.ndarray:
     return packed
 
 
-def unpack_camera_gradients(packed: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Return gradients of `world_to_camera` and `intrinsics` from those of the kernels, [batch view 16]."""
-    shape = packed.shape[:2]
-    world_to_camera, intrinsics = np.zeros((*shape, 4, 4), np.float32), np.zeros((*shape, 3, 3), np.float32)
-    rotation = packed[..., layout.ROTATION : layout.ROTATION + 9]
-    world_to_camera[..., :3, :3] = rotation.reshape(*shape, 3, 3)
-    world_to_camera[..., :3, 3] = packed[..., layout.TRANSLATION : layout.TRANSLATION + 3]
-    for axis in range(2):
-        intrinsics[..., axis, axis] = packed[..., layout.FOCAL_X + axis]
-        intrinsics[..., axis, 2] = packed[..., layout.PRINCIPAL_X + axis]
-    return torch.from_numpy(world_to_camera), torch.from_numpy(intrinsics)
-
-
 class _Rasterize(torch.autograd.Function):
-    """Map (size, constants, means, quaternions, scales, opacities, colors, world_to_camera, intrinsics) to images."""
+    """Map (cameras, constants, means, quaternions, scales, opacities, colors) to images."""
 
     @staticmethod
-    def forward(ctx: Any, size: tuple[int, int], constants: RenderingConstants, *tensors: Tensor) -> tuple[Tensor, ...]:
-        parameters = Parameters(*_arrays([tensor.detach().contiguous() for tensor in tensors[:5]]))
-        cameras = pack_cameras(Cameras(tensors[5], tensors[6], size), constants.frustum_margin)
-        drawing = Drawing(parameters, cameras, size, constants, keep=any(ctx.needs_input_grad))
+    def forward(ctx: Any, cameras: Cameras, constants: RenderingConstants, *tensors: Tensor) -> tuple[Tensor, ...]:
+        parameters = Parameters(*_arrays([tensor.detach().contiguous() for tensor in tensors]))
+        packed = pack_cameras(cameras, constants.frustum_margin)
+        drawing = Drawing(parameters, packed, cameras.image_size, constants, keep=any(ctx.needs_input_grad))
         images = tuple(torch.from_numpy(image) for image in drawing.draw())
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*tensors, *images)
@@ -104,16 +93,14 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *image_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        images = ctx.saved_tensors[7:]
+        images = ctx.saved_tensors[5:]
         filled = [
             # Zeros from NumPy, because torch would wake its threads, which then spin for a while on the kernels' cores.
             torch.from_numpy(np.zeros(image.shape, np.float32)) if gradient is None else gradient.contiguous()
             for image, gradient in zip(images, image_gradients, strict=True)
         ]
-        arrays, to_cameras = (Images(*_arrays(tensors)) for tensors in (images, filled)), any(ctx.needs_input_grad[7:])
-        gradients, of_cameras = ctx.drawing.backward(*arrays, to_cameras)
-        matrices = (None, None) if of_cameras is None else unpack_camera_gradients(of_cameras)
-        return None, None, *(torch.from_numpy(gradient) for gradient in gradients), *matrices
+        gradients = ctx.drawing.backward(Images(*_arrays(images)), Images(*_arrays(filled)))
+        return None, None, *(torch.from_numpy(gradient) for gradient in gradients)
 
 
 def _arrays(tensors: Sequence[Tensor]) -> list[np.ndarray]:

@@ -193,8 +193,8 @@ def pretend_gsplat(monkeypatch: pytest.MonkeyPatch, folder: Path, **constants: f
 RELEASE_1_6 = {"MAX_ALPHA": 0.99, "ALPHA_THRESHOLD": 1.0 / 255.0, "TRANSMITTANCE_THRESHOLD": 1e-4}
 
 
-draw = partial(degenerate_gaussians.draw, intrinsics=False)
-assert_changes_nothing = partial(degenerate_gaussians.assert_changes_nothing, intrinsics=False)
+draw = partial(degenerate_gaussians.draw, followed=("world_to_camera",))
+assert_changes_nothing = partial(degenerate_gaussians.assert_changes_nothing, followed=("world_to_camera",))
 
 
 def assert_agrees(gaussians, cameras, constants, of_images: float, of_gradients: float, exceptions: float = 0.0):
@@ -267,7 +267,7 @@ def test_a_gaussian_that_cannot_be_drawn_changes_nothing(kind: str, front_end: l
 
 @pytest.mark.parametrize("kind", sorted(DRAWN.keys() - {"very far"}))
 def test_an_extreme_gaussian_is_drawn_as_by_the_float64_reference(kind: str, front_end: list) -> None:
-    degenerate_gaussians.assert_drawn_as_by_the_reference(CudaRasterizer(), kind, intrinsics=False)
+    degenerate_gaussians.assert_drawn_as_by_the_reference(CudaRasterizer(), kind, followed=("world_to_camera",))
 
 
 def test_a_gaussian_that_overflows_in_one_view_is_left_out_of_all_views_of_its_scene(front_end: list) -> None:

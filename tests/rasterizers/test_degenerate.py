@@ -26,8 +26,9 @@ from completesplat.rasterizers.reference import ReferenceRasterizer, alphas_at
 from completesplat.rasterizers.tiled import TiledRasterizer
 
 DTYPES = [torch.float32, torch.float64]
-RASTERIZERS = [(ReferenceRasterizer(), torch.float32), (ReferenceRasterizer(), torch.float64)]
-RASTERIZERS += [(TiledRasterizer(), torch.float32)]
+CAMERAS = ("world_to_camera", "intrinsics")
+RASTERIZERS = [(ReferenceRasterizer(), torch.float32, CAMERAS), (ReferenceRasterizer(), torch.float64, CAMERAS)]
+RASTERIZERS += [(TiledRasterizer(), torch.float32, ())]
 
 LEFT_OUT = NEVER_DRAWN | {
     "on the camera's plane": {"means": (1.0, 0.5, 0.0)},
@@ -51,7 +52,7 @@ def degenerate(changes: dict[str, object], dtype: torch.dtype) -> Gaussians:
     return changed(changes).to(dtype)
 
 
-render_and_differentiate = partial(draw, ReferenceRasterizer())
+render_and_differentiate = partial(draw, ReferenceRasterizer(), followed=CAMERAS)
 
 
 def assert_finite(image: Tensor, gradients: dict[str, Tensor]) -> None:
@@ -59,17 +60,17 @@ def assert_finite(image: Tensor, gradients: dict[str, Tensor]) -> None:
     assert [name for name, gradient in gradients.items() if not gradient.isfinite().all()] == []
 
 
-@pytest.mark.parametrize(("rasterizer", "dtype"), RASTERIZERS)
+@pytest.mark.parametrize(("rasterizer", "dtype", "followed"), RASTERIZERS)
 @pytest.mark.parametrize("kind", LEFT_OUT)
-def test_a_gaussian_that_cannot_be_drawn_changes_nothing(kind: str, rasterizer, dtype: torch.dtype) -> None:
-    assert_changes_nothing(rasterizer, degenerate(LEFT_OUT[kind], dtype))
+def test_a_gaussian_that_cannot_be_drawn_changes_nothing(kind: str, rasterizer, dtype: torch.dtype, followed) -> None:
+    assert_changes_nothing(rasterizer, degenerate(LEFT_OUT[kind], dtype), followed=followed)
 
 
-@pytest.mark.parametrize(("rasterizer", "dtype"), RASTERIZERS)
+@pytest.mark.parametrize(("rasterizer", "dtype", "followed"), RASTERIZERS)
 @pytest.mark.parametrize("count", [0, 3])
-def test_nothing_to_draw(count: int, rasterizer, dtype: torch.dtype) -> None:
+def test_nothing_to_draw(count: int, rasterizer, dtype: torch.dtype, followed) -> None:
     gaussians = healthy(count).to(dtype)
-    images, gradients = draw(rasterizer, replace(gaussians, means=gaussians.means - 100))
+    images, gradients = draw(rasterizer, replace(gaussians, means=gaussians.means - 100), followed=followed)
     assert images.shape == (1, 1, 5, *SIZE)
     assert all(gradients[name].shape == tensor.shape for name, tensor in vars(gaussians).items())
     assert not any(tensor.any() for tensor in (images, *gradients.values()))

@@ -44,7 +44,6 @@ TRANSLATION = 9
 FOCAL_X, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y = 12, 13, 14, 15
 MIN_SLOPE_X, MAX_SLOPE_X, MIN_SLOPE_Y, MAX_SLOPE_Y = 16, 17, 18, 19  # limits of x/z and y/z in the Jacobian
 CAMERA_WIDTH = 20
-GRAD_CAMERA_WIDTH = 16  # the same columns up to PRINCIPAL_Y
 
 # images are processed in blocks of 4 x 4 pixels, row-major, with one SIMD lane for each pixel
 BLOCK = 4

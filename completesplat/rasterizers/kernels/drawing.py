@@ -16,7 +16,6 @@ from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.kernels import array_layout as layout
 from completesplat.rasterizers.kernels.composite import STATE_VECTORS, WORD_BITS, composite
 from completesplat.rasterizers.kernels.project import prepare, project, project_backward
-from completesplat.rasterizers.kernels.projection import camera_backward
 from completesplat.rasterizers.kernels.simd import LANES
 
 LARGE = 2**20  # bytes; for smaller blocks, advice to the system would cost more than it gains
@@ -196,11 +195,8 @@ class Drawing:
             parallel(partial(self._composite, images, start), number * len(self.bands))
         return images
 
-    def backward(self, images: Images, gradients: Images, to_cameras: bool) -> tuple[Parameters, np.ndarray | None]:
-        """Return gradients of the parameters and optionally the cameras from those of the images that `draw` returned.
-
-        The cameras' gradients are [batch view 16], for the first 16 columns of `cameras`.
-        """
+    def backward(self, images: Images, gradients: Images) -> Parameters:
+        """Return gradients of the parameters from those of the images that `draw` returned."""
         bands, views = len(self.bands), self.scenes * self.views
         sums = Sums(
             empty((self.scenes, self.views, bands, self.count + 1, layout.GRADIENT_WIDTH)),
@@ -210,11 +206,7 @@ class Drawing:
         result = Parameters(*(empty(x.shape) for x in self.parameters))
         chunks = -(-self.count // CHUNK)
         parallel(partial(self._project_backward, result, sums), self.scenes * chunks)
-        if not to_cameras:
-            return result, None
-        grad_cameras = np.empty((self.scenes, self.views, layout.GRAD_CAMERA_WIDTH))
-        parallel(partial(self._camera_backward, grad_cameras, sums), views)
-        return result, grad_cameras
+        return result
 
     def _prepare(self, scene: int) -> None:
         prepare(*(x[scene] for x in self.parameters), self.log2_min_alpha, self.prepared[scene])
@@ -256,11 +248,4 @@ class Drawing:
             *(x[scene] for x in self.parameters[1:4]), self.prepared[scene], self.cameras[scene],
             float(self.constants.blur), *(x[scene] for x in sums),
             chunk * CHUNK, min((chunk + 1) * CHUNK, self.count), *(x[scene] for x in result),
-        )  # fmt: skip
-
-    def _camera_backward(self, grad_cameras: np.ndarray, sums: Sums, task: int) -> None:
-        scene, view = divmod(task, self.views)
-        camera_backward(
-            self.prepared[scene], self.cameras[scene, view],
-            float(self.constants.blur), *(x[scene, view] for x in sums), grad_cameras[scene, view],
         )  # fmt: skip

@@ -20,12 +20,10 @@ from completesplat.rasterizers.kernels.projection import (
     lane_gaussians,
     lane_sums_of_view,
     nine,
-    point_gradient,
     rotation_matrix,
-    row_gradients,
     row_times_matrix,
-    slopes,
     unit_quaternion,
+    view_gradients,
 )  # fmt: skip
 from completesplat.rasterizers.kernels.simd import (
     I32,
@@ -270,16 +268,7 @@ def sum_views(prepared, cameras, blur, gradients, places, start):
         mask = sums[layout.REACHED] > ZERO
         if not any_lane(mask):
             continue
-        camera = cameras[view]
-        rotation = nine(camera, layout.ROTATION)
-        slope_x, slope_y, inverse_z = slopes(mean, camera, rotation)
-        center_x, center_y, row_x, row_y, grad_root = row_gradients(
-            slope_x, slope_y, inverse_z, root, camera, rotation, blur, sums
-        )
-        grad_point = point_gradient(
-            camera, rotation, slope_x, slope_y, inverse_z, row_x, row_y, center_x, center_y, sums[layout.SUM_DEPTH]
-        )
-        grad_mean = row_times_matrix(grad_point, rotation)
+        grad_mean, grad_root = view_gradients(mean, root, cameras[view], blur, sums)
         parts = (sums[0], sums[1], sums[2], sums[layout.SUM_S]) + grad_mean + grad_root + (sums[layout.REACHED],)  # noqa: RUF005
         # Lanes that are not reached may hold any value, even NaN.
         results = add_each(results, keep_each(mask, parts))

@@ -1,4 +1,4 @@
-"""Steps of the projection for 16 Gaussians at once, one in each lane; their backward pass, also to the cameras.
+"""Steps of the projection for 16 Gaussians at once, one in each lane; their backward pass.
 
 Scalars, and lanes in the forward pass, are float64, because huge scales must not overflow.
 """
@@ -8,18 +8,14 @@ import math
 import numpy as np
 
 from completesplat.rasterizers.kernels import array_layout as layout
-from completesplat.rasterizers.kernels.compilation import helper, kernel
+from completesplat.rasterizers.kernels.compilation import helper
 from completesplat.rasterizers.kernels.simd import (
-    LANES,
     add_each,
-    any_lane,
     choose,
     columns,
     gathered_rows,
     keep,
-    keep_each,
     square_root,
-    store,
     zeros,
 )  # fmt: skip
 
@@ -203,27 +199,17 @@ def splat_gradients(row_x, row_y, root, blur, sums):
 
 
 @helper
-def slopes(mean, camera, rotation):
-    """Return (x / z, y / z, 1 / z) of the means in camera coordinates."""
+def view_gradients(mean, root, camera, blur, sums):
+    """Return the gradients of means and roots from one view's sums: through pixel position, Jacobian and depth."""
+    rotation = nine(camera, layout.ROTATION)
     x, y, z = camera_point(camera, rotation, mean)
     inverse_z = ONE / z
-    return x * inverse_z, y * inverse_z, inverse_z
-
-
-@helper
-def row_gradients(slope_x, slope_y, inverse_z, root, camera, rotation, blur, sums):
-    """Return gradients with respect to the centre (two numbers), the rows of J W, and the root."""
+    slope_x, slope_y = x * inverse_z, y * inverse_z
     row_x, row_y = image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
     grad_center_x, grad_center_y, grad_a, grad_b = splat_gradients(row_x, row_y, root, blur, sums)
     grad_root = add_each(outer(row_x, grad_a), outer(row_y, grad_b))
-    return grad_center_x, grad_center_y, matrix_times_column(root, grad_a), matrix_times_column(root, grad_b), grad_root
+    grad_row_x, grad_row_y = matrix_times_column(root, grad_a), matrix_times_column(root, grad_b)
 
-
-@helper
-def point_gradient(
-    camera, rotation, slope_x, slope_y, inverse_z, grad_row_x, grad_row_y, grad_center_x, grad_center_y, grad_depth
-):
-    """Return the gradient of the mean in camera coordinates, through its pixel position, the Jacobian and depth."""
     focal_x, focal_y = camera[layout.FOCAL_X], camera[layout.FOCAL_Y]
     min_x, max_x = camera[layout.MIN_SLOPE_X], camera[layout.MAX_SLOPE_X]
     min_y, max_y = camera[layout.MIN_SLOPE_Y], camera[layout.MAX_SLOPE_Y]
@@ -237,62 +223,5 @@ def point_gradient(
     grad_slope_y = focal_y * grad_center_y - keep(free_y, focal_y * inverse_z * along_y)
     # slope = point / z, and d(1 / z) / dz = -1 / z^2.
     grad_z = -inverse_z * (grad_slope_x * slope_x + grad_slope_y * slope_y + grad_inverse_z * inverse_z)
-    return grad_slope_x * inverse_z, grad_slope_y * inverse_z, grad_z + grad_depth
-
-
-@kernel
-def camera_backward(
-    prepared: Array, camera: Array, blur: float, gradients: Array, places: Array, grad_camera: Array
-) -> None:
-    """Apply the chain rule from one view's Gaussians to its camera.
-
-    Args:
-        camera: [20] float64.
-        gradients, places: [band row 16] and [band lane], written by `composite`.
-        grad_camera: [16] float64, receives the gradients of the first 16 columns of `camera`.
-    """
-    grad_camera[:] = 0
-    rotation = nine(camera, layout.ROTATION)
-    totals = np.empty(LANES, np.float32)
-    for start in range(0, prepared.shape[1], LANES):
-        sums = lane_sums_of_view(gradients, places, start)
-        mask = sums[layout.REACHED] > ZERO
-        if not any_lane(mask):
-            continue
-        mean, root = lane_gaussians(prepared, start)
-        slope_x, slope_y, inverse_z = slopes(mean, camera, rotation)
-        center_x, center_y, row_x, row_y, _ = row_gradients(
-            slope_x, slope_y, inverse_z, root, camera, rotation, blur, sums
-        )
-        grad_point = point_gradient(
-            camera, rotation, slope_x, slope_y, inverse_z, row_x, row_y, center_x, center_y, sums[layout.SUM_DEPTH]
-        )
-        x = axis_gradients(camera, rotation, 0, slope_x, inverse_z, row_x, center_x)
-        y = axis_gradients(camera, rotation, 1, slope_y, inverse_z, row_y, center_y)
-        r = outer(grad_point, mean)
-        to_rotation = add_each(r[:3], x[2]) + add_each(r[3:6], y[2]) + add_each(r[6:], add_each(x[3], y[3]))
-        parts = keep_each(mask, to_rotation + grad_point + (x[0], y[0], x[1], y[1]))
-        for column in range(layout.GRAD_CAMERA_WIDTH):
-            store(totals, 0, parts[column])
-            # Lanes are added one by one, so that a Gaussian that is left out does not change the sum of the others.
-            for lane in range(LANES):
-                grad_camera[column] += totals[lane]
-
-
-@helper
-def axis_gradients(camera, rotation, axis, slope, inverse_z, grad_row, grad_center):
-    """Return gradients (focal, principal, R_axis, R_z) from the image's x (0) or y (1) axis, by the centre and J's row.
-
-    The centre is focal * slope + principal; the row is focal / z * (R_axis - s R_z), where s is the slope between its
-    limits. At a limit, s is (constant - principal) / focal and depends on the intrinsics, too.
-    """
-    low, high = camera[layout.MIN_SLOPE_X + 2 * axis], camera[layout.MAX_SLOPE_X + 2 * axis]
-    s = clamp(slope, low, high)
-    along = inverse_z * dot(grad_row, rotation[6:])
-    across = inverse_z * dot(grad_row, (rotation[3 * axis], rotation[3 * axis + 1], rotation[3 * axis + 2]))
-    limited_along = along - keep((slope >= low) & (slope <= high), along)
-    grad_focal = grad_center * slope + across - s * along + s * limited_along
-    scale = camera[layout.FOCAL_X + axis] * inverse_z
-    grad_axis = (scale * grad_row[0], scale * grad_row[1], scale * grad_row[2])
-    grad_z = (-s * grad_axis[0], -s * grad_axis[1], -s * grad_axis[2])
-    return grad_focal, grad_center + limited_along, grad_axis, grad_z
+    grad_point = grad_slope_x * inverse_z, grad_slope_y * inverse_z, grad_z + sums[layout.SUM_DEPTH]
+    return row_times_matrix(grad_point, rotation), grad_root
