@@ -51,6 +51,10 @@ class Gaussians(TensorDataclass):
         quaternions = quaternion_multiply(rotation, normalize_quaternion(self.quaternions))
         return replace(self, means=transform_points(matrix, self.means), quaternions=quaternions)
 
+    def seen_from(self, centers: Float[Tensor, "*batch 3"]) -> "Gaussians":
+        """Return the Gaussians with the colours that they have as seen from these points: the same from all."""
+        return self
+
     def finite(self) -> Bool[Tensor, "*batch gaussian"]:
         """Return a mask of the Gaussians whose values are all finite."""
         marks = [self.opacities.isfinite()]

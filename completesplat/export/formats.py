@@ -26,7 +26,7 @@ from completesplat.export.mesh import VOXELS, Mesh, mesh_of
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform, write_page
 from completesplat.files import write_bytes
-from completesplat.gaussians import DirectionalGaussians, Gaussians
+from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import transform_points
 from completesplat.geometry.harmonics import SH_C0
 from completesplat.geometry.rotations import normalize_quaternion
@@ -77,9 +77,7 @@ def write_formats(
         CompleteSplatError: there is nothing to write, the converter (for `CONVERTED` formats) or the rasterizer (for a
             mesh) is missing, or one of them fails.
     """
-    seen = gaussians
-    if isinstance(gaussians, DirectionalGaussians):
-        seen = gaussians.seen_from(view.reference.centers)
+    seen = gaussians.seen_from(view.reference.centers)
     clipped = replace(seen, colors=seen.colors.clamp(0, 1))
     files = {kind: name + suffix(kind) for kind in formats}
     for kind, file in files.items():

@@ -49,7 +49,7 @@ CONVENTIONS = {
     "units": "the data set's or model's own scale; not metres",
     "offset": "if settings have one: add it to all positions, in float64, for the capture's own coordinates",
     "quaternions": "(w, x, y, z), unit length",
-    "colors": "sRGB, 0 to 1, the same from every direction",
+    "colors": "sRGB, 0 to 1; the same from every direction, except where a .ply has f_rest_* (3D Gaussian Splatting's)",
 }
 
 
@@ -155,7 +155,7 @@ def write_prediction(
     title = f"{settings['image']}: views around each sample"
     contact_sheet(folder / "sheet.png", title, image, torch.stack(views), torch.stack(depths))
     recorded = {**settings, "gaussians": [scene.count for scene in scenes], "up": up.tolist()}
-    recorded["colors_clipped"] = [int(beyond_gamut(scene).sum()) for scene in scenes]
+    recorded["colors_clipped"] = [int(beyond_gamut(x.seen_from(reference.centers)).sum()) for x in scenes]
     if "spz" in wanted.formats:
         recorded["left_out_of_spz"] = [int(transparent(scene).sum()) for scene in scenes]
     if wanted.maps:

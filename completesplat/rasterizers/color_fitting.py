@@ -37,8 +37,7 @@ def fit_colors(
     with torch.inference_mode(False), torch.enable_grad():
         # Autograd cannot use tensors that were made in inference mode, but it can use copies.
         fixed, views = gaussians.map(torch.clone).detach(), cameras.map(lambda x: x[:, None].clone())
-        if isinstance(fixed, DirectionalGaussians):
-            fixed = fixed.seen_from(views.centers[:, 0])
+        fixed = fixed.seen_from(views.centers[:, 0])
         shown = 1.0 if visible is None else visible[:, None].clone()
         colors, total = fixed.colors, torch.ones(())
         for number in range(rounds):

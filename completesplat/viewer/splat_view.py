@@ -178,7 +178,8 @@ class SplatView:
             drawing.remove()
 
     def _draw_splats(self, samples: Sequence[Sample], arrangement: Arrangement) -> None:
-        scenes = [sample.for_viewers() for sample in samples]
+        # viser draws one colour for all directions.
+        scenes = [sample.for_viewers().seen_from(sample.reference.centers) for sample in samples]
         if self.depth:
             scenes = depth_colored(scenes)
         wanted = {}
