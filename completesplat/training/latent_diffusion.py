@@ -79,8 +79,7 @@ class LatentDiffusion(Stage):
             load_part(completesplat.autoreconstructor, autoreconstructor_checkpoint, prefix="model.")
         if checkpoint is not None:
             load_part(completesplat, checkpoint, prefix="completesplat.")
-        self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
-        prepare_network(completesplat.denoiser, channels_last, compile)
+        self.memory_format = prepare_network(completesplat.denoiser, channels_last, compile)
 
     @property
     def up(self) -> Float[Tensor, "3"]:

@@ -58,8 +58,7 @@ class ReconstructionModule(Stage):
         self.camera: dict[str, float | list[float]] = {}
         if checkpoint is not None:
             load_part(model, checkpoint, prefix="model.")
-        self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
-        prepare_network(model, channels_last, compile)
+        self.memory_format = prepare_network(model, channels_last, compile)
 
     @property
     def up(self) -> Float[Tensor, "3"]:

@@ -64,12 +64,13 @@ def now() -> float:
     return time.perf_counter()
 
 
-def prepare_network(network: nn.Module, channels_last: bool, compile: bool) -> None:
-    """Order convolution weights in NHWC (images should be too), or compile on the first call; names stay the same."""
+def prepare_network(network: nn.Module, channels_last: bool, compile: bool) -> torch.memory_format:
+    """Order convolution weights in NHWC, or compile on the first call; return the order that images should have."""
     if channels_last:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if compile:
         network.compile()
+    return torch.channels_last if channels_last else torch.contiguous_format
 
 
 class Stage(LightningModule):
