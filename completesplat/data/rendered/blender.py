@@ -4,6 +4,7 @@ import json
 import math
 import os
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -72,7 +73,12 @@ def _output_of(*command: str) -> str:
 
 
 def run_job(
-    blender: Blender, job: dict[str, Any], folder: Path, stopped: Event, minutes: float = math.inf
+    blender: Blender,
+    job: dict[str, Any],
+    folder: Path,
+    stopped: Event,
+    minutes: float = math.inf,
+    memory: int = resource.RLIM_INFINITY,
 ) -> dict[str, Any]:
     """Run `_scene_script.py` with a job; return its result, or `refused` with the reason for which Blender failed.
 
@@ -80,6 +86,7 @@ def run_job(
         folder: an existing folder for the job's files and Blender's messages.
         stopped: an event after which Blender is killed.
         minutes: time after which Blender is killed.
+        memory: bytes that it may take, on Linux.
     """
     end = time.monotonic() + 60 * minutes
     path, messages = folder / "job.json", folder / "messages.txt"
@@ -88,17 +95,22 @@ def run_job(
     with messages.open("wb") as output:
         command = [*blender.command, str(SCRIPT), *separator, str(path)]
         env = {**os.environ, "TMPDIR": str(folder)}
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, env=env)
-        while process.poll() is None:
-            if stopped.is_set() or time.monotonic() > end:
-                process.kill()
-            time.sleep(SECONDS_BETWEEN_LOOKS)
+        # The script ends when its standard input does, that is, when this process has ended.
+        pipes: Any = {"stdin": subprocess.PIPE, "stdout": output, "stderr": subprocess.STDOUT}
+        with subprocess.Popen(command, env=env, **pipes) as process:
+            if sys.platform == "linux":
+                resource.prlimit(process.pid, resource.RLIMIT_DATA, (memory, memory))
+            while process.poll() is None:
+                if stopped.is_set() or time.monotonic() > end:
+                    process.kill()
+                time.sleep(SECONDS_BETWEEN_LOOKS)
     result = folder / "result.json"
     if process.returncode == 0 and result.is_file():
         return dict(json.loads(result.read_text()))
     if time.monotonic() > end:
         return {"refused": f"took longer than max_minutes={minutes:g}"}
     if process.returncode < 0:
-        return {"refused": f"Blender ended by signal {-process.returncode} (a crash, or out of memory)"}
+        limit = f"more than {memory / 1e9:.1f} GB" if memory != resource.RLIM_INFINITY else "out"
+        return {"refused": f"Blender ended by signal {-process.returncode} (a crash, or {limit} of memory)"}
     last = (messages.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
     return {"refused": f"Blender failed: {last[:200]}"}
