@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import shlex
 import subprocess
 from functools import partial
@@ -14,7 +15,15 @@ from rich.progress import Progress, track
 
 from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
 from completesplat.data.captures.module import CaptureDataModule
-from completesplat.data.images.files import FORMATS, check_sums, opened, refused_as_bad, save_image, stored_size
+from completesplat.data.images.files import (
+    FORMATS,
+    MOST_PIXELS,
+    check_sums,
+    opened,
+    refused_as_bad,
+    save_image,
+    stored_size,
+)
 from completesplat.data.validation import refused_to
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder, folder_names
@@ -76,7 +85,7 @@ def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> 
 def _copy_photos(folder: Path, images: Path) -> None:
     """Write upright photos, with the rest of their EXIF records, which has the focal length."""
     suffixes = {suffix for suffix, kind in Image.registered_extensions().items() if kind in FORMATS}
-    photos = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes)
+    photos = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.is_file())
     stems = folder_names("_".join(path.stem.split()) for path in photos)  # COLMAP lists pairs with a space between
     for photo, stem in track(list(zip(photos, stems, strict=True)), "photos"):
         with refused_to(leave_out), refused_as_bad(str(photo)):
@@ -89,16 +98,17 @@ def _copy_photos(folder: Path, images: Path) -> None:
 
 def _split_video(video: Path, images: Path, frames: int) -> None:
     """Write the first frame of each of equal parts of a video, or all frames if there are fewer."""
-    from imageio_ffmpeg import count_frames_and_secs, get_ffmpeg_exe
+    from imageio_ffmpeg import get_ffmpeg_exe
 
-    try:
-        count, _ = count_frames_and_secs(str(video.absolute()))
-    except RuntimeError:
-        raise DataError("ffmpeg finds no video there", str(video)) from None
+    limit = "-max_pixels", str(MOST_PIXELS)  # else a small file could take gigabytes
+    start = [get_ffmpeg_exe(), "-nostdin", *limit, "-i", str(video.absolute())]
+    output = subprocess.run([*start, "-map", "0:v:0", "-f", "null", "-"], capture_output=True).stderr
+    count = int((re.findall(rb"frame= *(\d+)", output) or [b"0"])[-1])
+    if not count:
+        raise DataError(f"ffmpeg finds no video of at most {MOST_PIXELS:,} pixels there", str(video))
     part = f"{min(frames, count)}/{count}"
     options = ["-vf", f"select=gt(floor(n*{part})\\,floor((n-1)*{part}))", "-fps_mode", "passthrough", "-q:v", "2"]
-    command = [get_ffmpeg_exe(), "-nostdin", "-v", "error", "-i", str(video.absolute()), *options]
-    if subprocess.run([*command, "%05d.jpg"], cwd=images).returncode:
+    if subprocess.run([*start, "-v", "error", *options, "%05d.jpg"], cwd=images).returncode:
         raise DataError("ffmpeg cannot split it; the reason is above", str(video))
 
 
