@@ -252,7 +252,7 @@ def run(job: dict[str, Any]) -> dict[str, Any]:
         else:
             make_object(job["factory"], job["seed"])
         objects = baked_objects()
-        place = normalize(objects)
+        place: dict[str, Any] = normalize(objects)
     except RefusedMesh as reason:
         return {"refused": str(reason)}
     set_up_renderer(objects)

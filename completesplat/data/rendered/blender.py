@@ -73,23 +73,17 @@ def _output_of(*command: str) -> str:
 
 
 def run_job(
-    blender: Blender,
-    job: dict[str, Any],
-    folder: Path,
-    stopped: Event,
-    minutes: float = math.inf,
-    memory: int = resource.RLIM_INFINITY,
+    blender: Blender, job: dict[str, Any], folder: Path, stopped: Event, minutes: float = math.inf
 ) -> dict[str, Any]:
     """Run `_scene_script.py` with a job; return its result, or `refused` with the reason for which Blender failed.
 
     Args:
         folder: an existing folder for the job's files and Blender's messages.
         stopped: an event after which Blender is killed.
-        minutes: time after which Blender is killed.
-        memory: bytes that it may take, on Linux.
+        minutes: time after which Blender is killed; the job's `memory` (bytes) limits it on Linux.
     """
     end = time.monotonic() + 60 * minutes
-    path, messages = folder / "job.json", folder / "messages.txt"
+    path, messages, memory = folder / "job.json", folder / "messages.txt", job.get("memory", resource.RLIM_INFINITY)
     path.write_text(json.dumps(job))
     separator = () if PYTHON_OPTIONS[0] in blender.command else ("--",)
     with messages.open("wb") as output:

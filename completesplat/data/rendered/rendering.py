@@ -4,7 +4,6 @@ import json
 import logging
 import math
 import os
-import resource
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -85,7 +84,7 @@ def find_meshes(folder: Path) -> list[Asset]:
 
 
 def check_named_files(mesh: Path, root: Path) -> None:
-    """Refuse files that an OBJ or glTF names and that Blender would open, unless they are regular files below `root`.
+    """Refuse files that an OBJ or glTF names and Blender would open, unless they are regular files below `root`.
 
     Raises:
         BrokenMesh: there is such a file, or an OBJ's material file is missing.
@@ -107,7 +106,7 @@ def _check_named_file(mesh: Path, name: str, root: Path) -> None:
     for path in (named, mesh.parent / named.name):  # Blender looks beside the mesh, too
         if not os.path.exists(path) or path.is_dir():
             continue
-        if not path.resolve().is_relative_to(root.resolve()):
+        if not path.resolve().is_relative_to(root):
             raise BrokenMesh(f"{path.name} lies outside of the folder of meshes")
         if not path.is_file():
             raise BrokenMesh(f"{path.name} is no regular file")
@@ -186,7 +185,7 @@ def render(
         with atomic_folder(category) as unfinished:
             (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
     waiting = [asset for asset in objects if not (category / asset.name).exists()]
-    write_one = partial(_write_object, category, program, settings, (MEGABYTE * max_megabytes, max_minutes), meshes)
+    write_one = partial(_write_object, category, program, settings, (MEGABYTE * max_megabytes, max_minutes))
     results = track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting), disable=not progress)
     broken = {name: reason for name, reason in sorted(results) if reason}
     _write_lists(category, broken)
@@ -222,33 +221,26 @@ def _in_threads(
 
 
 def _write_object(
-    category: Path,
-    program: Blender,
-    settings: RenderSettings,
-    most: tuple[int, float],
-    root: str | None,
-    asset: Asset,
-    stopped: Event,
+    category: Path, program: Blender, settings: RenderSettings, most: tuple[int, float], asset: Asset, stopped: Event
 ) -> tuple[str, str]:
     """Render an object into its folder, whole or not at all; return its name, and why it is left out (or "")."""
-    mesh, (most_bytes, minutes), memory = asset.mesh, most, resource.RLIM_INFINITY
+    mesh, (most_bytes, minutes) = asset.mesh, most
     try:
         job, cameras = draw_scene(asset.key, settings)
         job["factory"] = asset.factory
         if mesh is not None:
-            size = mesh.stat().st_size
-            if size > most_bytes:
+            if (size := mesh.stat().st_size) > most_bytes:
                 raise BrokenMesh(f"{size // MEGABYTE:,} MB, more than max_megabytes={most_bytes // MEGABYTE}")
-            check_named_files(mesh, Path(str(root)))
-            job |= {"mesh": str(mesh.absolute()), "root": os.path.realpath(str(root))}
-            memory = LEAST_MEMORY + MEMORY_OF_BYTE * size
+            root = mesh.parents[asset.key.count("/")].resolve()
+            check_named_files(mesh, root)
+            job |= {"mesh": str(mesh.absolute()), "root": str(root), "memory": LEAST_MEMORY + MEMORY_OF_BYTE * size}
         # Blender's importer would move such vertices to the origin.
         if mesh is not None and mesh.suffix.lower() == ".ply" and not np.isfinite(read_points(mesh)).all():
             raise BrokenMesh("it has vertices that are not finite")
         with atomic_folder(category / asset.name) as folder:
             files = folder / "blender"
             files.mkdir()
-            result = run_job(program, job | {"folder": str(files.absolute())}, files, stopped, minutes, memory)
+            result = run_job(program, job | {"folder": str(files.absolute())}, files, stopped, minutes)
             if "refused" in result:
                 raise BrokenMesh(result["refused"])
             if result["left_out"]:
