@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.errors import PlyError
-from completesplat.export.cleaning import cleaned
+from completesplat.export.cleaning import bounded, cleaned
 from completesplat.files import write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
@@ -61,7 +61,7 @@ def read_ply(path: str | Path) -> Gaussians:
     other 3DGS renderers.
 
     Raises:
-        PlyError: `read_vertices` fails, or a value is not finite.
+        PlyError: `read_vertices` fails, or no Gaussian is finite; a warning counts those that are not.
     """
     try:
         vertices = read_vertices(path, REQUIRED)
@@ -78,7 +78,4 @@ def read_ply(path: str | Path) -> Gaussians:
         opacities=gather(["opacity"])[:, 0].sigmoid().float(),
         colors=(0.5 + SH_C0 * gather(COLORS)).clamp(min=0).float(),
     )
-    damaged = int((~gaussians.finite()).sum())
-    if damaged:
-        raise PlyError(f"{path}: {damaged} of {gaussians.count} Gaussians are not finite")
-    return gaussians
+    return cleaned(gaussians, path, bounded)
