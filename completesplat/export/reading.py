@@ -6,6 +6,7 @@ installed, unpacks others.
 
 import logging
 import math
+import os
 import shutil
 import struct
 import tempfile
@@ -58,11 +59,13 @@ def read_gaussians(path: str | Path) -> Gaussians:
 
 
 def _packed_format(path: Path) -> str | None:
-    """Return the name of a format that `splat-transform` unpacks, None for a plain `.ply` or a missing file."""
-    if path.suffix.lower() == ".ply" and path.is_file():
-        with path.open("rb") as file:
-            return "SuperSplat's compressed PLY" if f" {PACKED}\n".encode() in file.read(LONGEST_HEADER) else None
-    return path.suffix[1:].upper() if path.suffix.lower() in (".sog", ".ksplat") else None
+    """Return the name of a format that `splat-transform` unpacks, None for what `read_ply` reads or refuses."""
+    if path.suffix.lower() in (".sog", ".ksplat"):
+        return path.suffix[1:].upper()
+    if not path.is_file() or not os.access(path, os.R_OK):
+        return None
+    with path.open("rb") as file:
+        return "SuperSplat's compressed PLY" if f" {PACKED}\n".encode() in file.read(LONGEST_HEADER) else None
 
 
 def _read_by_splat_transform(path: Path, kind: str) -> Gaussians:

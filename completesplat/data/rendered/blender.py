@@ -4,11 +4,11 @@ import json
 import math
 import os
 import re
-import resource
 import shutil
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Event
@@ -83,7 +83,7 @@ def run_job(
         minutes: time after which Blender is killed; the job's `memory` (bytes) limits it on Linux.
     """
     end = time.monotonic() + 60 * minutes
-    path, messages, memory = folder / "job.json", folder / "messages.txt", job.get("memory", resource.RLIM_INFINITY)
+    path, messages, memory = folder / "job.json", folder / "messages.txt", job.get("memory")
     path.write_text(json.dumps(job))
     separator = () if PYTHON_OPTIONS[0] in blender.command else ("--",)
     with messages.open("wb") as output:
@@ -92,8 +92,11 @@ def run_job(
         # The script ends when its standard input does, that is, when this process has ended.
         pipes: Any = {"stdin": subprocess.PIPE, "stdout": output, "stderr": subprocess.STDOUT}
         with subprocess.Popen(command, env=env, **pipes) as process:
-            if sys.platform == "linux":
-                resource.prlimit(process.pid, resource.RLIMIT_DATA, (memory, memory))
+            if sys.platform == "linux" and memory is not None:
+                import resource
+
+                with suppress(OSError, ValueError):  # a lower limit is in force
+                    resource.prlimit(process.pid, resource.RLIMIT_DATA, (memory, memory))
             while process.poll() is None:
                 if stopped.is_set() or time.monotonic() > end:
                     process.kill()
@@ -104,7 +107,7 @@ def run_job(
     if time.monotonic() > end:
         return {"refused": f"took longer than max_minutes={minutes:g}"}
     if process.returncode < 0:
-        limit = f"more than {memory / 1e9:.1f} GB" if memory != resource.RLIM_INFINITY else "out"
+        limit = "out" if memory is None else f"more than {memory / 1e9:.1f} GB"
         return {"refused": f"Blender ended by signal {-process.returncode} (a crash, or {limit} of memory)"}
     last = (messages.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
     return {"refused": f"Blender failed: {last[:200]}"}
