@@ -99,7 +99,7 @@ gpu: $(READY) ## What only a GPU can show, 25 minutes, in outputs/gpu: tests, ti
 	PYTHONPATH=. $(BIN)/python tests/gpu_day.py $(if $(SMALL),--small)
 
 docs: $(READY) ## The API reference, from the docstrings, in outputs/api
-	$(BIN)/pdoc --docformat google --output-directory outputs/api completesplat '!completesplat.data.rendered._scene_script'
+	$(BIN)/pdoc --docformat google --output-directory outputs/api completesplat '!completesplat.data.rendered._scene_script' '!completesplat.data.rendered._scene_meshes'
 	@echo "outputs/api/completesplat.html"
 
 notebooks: $(READY) ## Run every notebook from top to bottom, and store what it prints and draws

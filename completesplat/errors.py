@@ -37,7 +37,7 @@ class ImageError(CompleteSplatError):
 
 
 class PlyError(CompleteSplatError):
-    """A file of Gaussians (`.ply`, `.splat`, `.spz`) that is damaged or not finite."""
+    """A file of Gaussians (`.ply`, `.splat`, `.spz`) that is damaged, not finite or of a format that is not read."""
 
 
 class TensorFileError(CompleteSplatError):

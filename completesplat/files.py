@@ -20,7 +20,7 @@ BLOCK_BYTES = 512  # unit of `st_blocks`
 LONGEST = 100  # bytes of UTF-8
 MOST_SHOWN = 500  # characters
 UNNAMED = "unnamed"
-SPLATS = (".ply", ".splat", ".spz")  # files of Gaussians that are read
+SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")  # files of Gaussians that are read
 # Control characters, line breaks, and the surrogates that stand for bytes that are not UTF-8.
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}(\.\w+)?")  # names of temporary files

@@ -13,6 +13,7 @@ import numpy as np
 
 from completesplat.errors import PlyError
 
+PACKED = "packed_position"  # a property of the vertices in compressed files
 LONGEST_HEADER, LONGEST_COUNT = 1 << 16, 15  # bytes, digits
 HEADER = re.compile(rb"ply\s*\n(.*?)(?<=\n)end_header[ \t\r]*\n", re.DOTALL)
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
@@ -83,6 +84,8 @@ def _vertices(file: BinaryIO, needed: Sequence[str]) -> np.ndarray:
     index = names.index("vertex")
     if any(element.lists for element in elements[: index + 1]):
         raise PlyError("a list in the vertices, or before them")
+    if PACKED in elements[index].fields:
+        raise PlyError("SuperSplat's compressed PLY; `splat-transform FILE x.ply` unpacks it")
     if missing := [name for name in needed if name not in elements[index].fields]:
         raise PlyError(f"no property {', '.join(missing)}")
     file.seek(header_match.end())

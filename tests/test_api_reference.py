@@ -8,8 +8,8 @@ from urllib.parse import unquote
 
 import pytest
 
-FOR_BLENDER = "!completesplat.data.rendered._scene_script"
-PDOC = [sys.executable, "-m", "pdoc", "--docformat", "google", "completesplat", FOR_BLENDER, "--output-directory"]
+FOR_BLENDER = [f"!completesplat.data.rendered._scene_{name}" for name in ("script", "meshes")]
+PDOC = [sys.executable, "-m", "pdoc", "--docformat", "google", "completesplat", *FOR_BLENDER, "--output-directory"]
 
 
 @pytest.mark.slow

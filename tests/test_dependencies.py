@@ -30,8 +30,8 @@ NEVER_IMPORTED = {
     "ruff": "a program",
 }
 
-# A script that Blender's Python runs, which has its own packages.
-FOR_BLENDER = ROOT / "completesplat/data/rendered/_scene_script.py"
+# Scripts that Blender's Python runs, which has its own packages.
+FOR_BLENDER = {*(ROOT / "completesplat/data/rendered").glob("_scene_*.py")}
 
 
 def declared(lines: Iterable[str]) -> set[str]:
@@ -55,7 +55,10 @@ def imported(folder: str) -> dict[str, set[str]]:
     Modules of the configurations' `_target_` are imported as well.
     """
     names = {
-        name.split(".")[0] for path in (ROOT / folder).rglob("*.py") if path != FOR_BLENDER for name in modules(path)
+        name.split(".")[0]
+        for path in (ROOT / folder).rglob("*.py")
+        if path not in FOR_BLENDER
+        for name in modules(path)
     }
     if folder == "completesplat":
         texts = [path.read_text() for path in (ROOT / "conf").rglob("*.yaml")]

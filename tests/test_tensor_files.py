@@ -15,8 +15,8 @@ from fuzzing import CLEAR, bounded
 
 from completesplat.baselines.splatter_image.files import STATE, read_tensors
 from completesplat.data.realestate10k.clips import read_chunk
-from completesplat.errors import CompleteSplatError
-from completesplat.weights.checkpoint_reading import read_checkpoint
+from completesplat.errors import CompleteSplatError, TensorFileError
+from completesplat.weights.checkpoint_reading import read_checkpoint, read_tensor_file
 
 pytestmark = pytest.mark.skipif(not CLEAR.exists(), reason="memory is measured as Linux tells it")
 READERS: dict[str, Callable[[Path], Any]] = {}
@@ -167,8 +167,18 @@ def test_records_and_tensors_that_are_larger_than_the_file_are_refused(tmp_path,
         READERS[reader](path)
     for value in (torch.zeros(1).expand(2**28), [(torch.zeros(1).expand(2**40),)]):
         torch.save(contents(value), path)
-        with bounded(2**26), pytest.raises(CompleteSplatError, match="a tensor is larger than the file"):
+        with bounded(2**26), pytest.raises(CompleteSplatError, match="its tensors are larger than the file"):
             READERS[reader](path)
+
+
+def test_many_tensors_that_repeat_one_are_refused_by_their_total(tmp_path):
+    one, large = torch.zeros(1), torch.zeros(2**20)
+    for tensors in ([one.expand(2**21) for _ in range(3)], [large.view(-1) for _ in range(12)]):
+        torch.save(tensors, tmp_path / "a.pt")
+        with pytest.raises(TensorFileError, match="its tensors are larger than the file"):
+            read_tensor_file(tmp_path / "a.pt")
+    torch.save({"embedding": large, "tied": large}, tmp_path / "a.pt")
+    assert read_tensor_file(tmp_path / "a.pt").keys() == {"embedding", "tied"}
 
 
 def test_numbers_that_the_file_does_not_have_are_refused(tmp_path):

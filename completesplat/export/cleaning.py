@@ -1,13 +1,14 @@
 """Preparation of Gaussians for files: removal of broken ones, and enlargement by the rasterizer's blur."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import PlyError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.rasterizers import RenderingConstants
@@ -18,24 +19,28 @@ LARGEST = 1e18
 log = logging.getLogger(__name__)
 
 
+def bounded(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:
+    """Return a mask of Gaussians with finite values of at most 1e18."""
+    return gaussians.map(lambda values: values.where(values.abs() <= LARGEST, torch.inf)).finite()
+
+
 def storable(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:
-    """Return a mask of Gaussians with finite values (at most 1e18) and extents above 0 (as float32) along all axes."""
-    bounded = gaussians.map(lambda values: values.where(values.abs() <= LARGEST, torch.inf)).finite()
-    return bounded & (gaussians.scales.float() > 0).all(-1)
+    """Return a mask of `bounded` Gaussians with extents above 0 (as float32) along all axes."""
+    return bounded(gaussians) & (gaussians.scales.float() > 0).all(-1)
 
 
-def cleaned(gaussians: Gaussians, name: object) -> Gaussians:
-    """Return one unbatched set without the Gaussians that cannot be stored, and log their number as a warning.
+def cleaned(gaussians: Gaussians, name: object, usable: Callable[[Gaussians], Tensor] = storable) -> Gaussians:
+    """Return one unbatched set without the Gaussians that are not usable, and log their number as a warning.
 
     Raises:
-        CompleteSplatError: no Gaussian of a nonempty set can be stored. Messages name the file or sample, `name`.
+        PlyError: no Gaussian of a nonempty set is usable. Messages name the file or sample, `name`.
     """
-    mask = storable(gaussians)
+    mask = usable(gaussians)
     broken = gaussians.count - int(mask.sum())
     if not broken:
         return gaussians
     if broken == gaussians.count:
-        raise CompleteSplatError(f"{name}: all {broken} Gaussians are broken (not finite, or no extent)")
+        raise PlyError(f"{name}: all {broken} Gaussians are broken (not finite, or no extent)")
     log.warning("%s: left out %d of %d Gaussians (not finite, or no extent)", name, broken, gaussians.count)
     return gaussians[mask]
 

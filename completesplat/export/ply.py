@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.errors import PlyError
-from completesplat.export.cleaning import cleaned
+from completesplat.export.cleaning import bounded, cleaned
 from completesplat.files import write_bytes
 from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.harmonics import LARGEST_DEGREE, SH_C0, coefficients, degree_of
@@ -74,7 +74,7 @@ def read_ply(path: str | Path) -> Gaussians:
     become 0, as in other 3DGS renderers.
 
     Raises:
-        PlyError: `read_vertices` fails, or a value is not finite.
+        PlyError: `read_vertices` fails, or no Gaussian is finite; a warning counts those that are not.
     """
     try:
         vertices = read_vertices(path, REQUIRED)
@@ -96,10 +96,7 @@ def read_ply(path: str | Path) -> Gaussians:
     if further:
         values = rearrange(gather(further), "gaussian (rgb coefficient) -> gaussian coefficient rgb", rgb=3)
         gaussians = DirectionalGaussians(**vars(gaussians), harmonics=values.float())
-    damaged = int((~gaussians.finite()).sum())
-    if damaged:
-        raise PlyError(f"{path}: {damaged} of {gaussians.count} Gaussians are not finite")
-    return gaussians
+    return cleaned(gaussians, path, bounded)
 
 
 def _further_harmonics(vertices: np.ndarray, path: str | Path) -> list[str]:

@@ -1,10 +1,15 @@
 """Reader of Gaussians in files of any program (`SPLATS`): `.ply`, `.splat`, and `.spz` of versions 2 to 4.
 
-Formats: antimatter15's splat (32 bytes a Gaussian), and Niantic's `load-spz.cc`.
+Formats: antimatter15's splat (32 bytes a Gaussian), and Niantic's `load-spz.cc`. `splat-transform`, where it is
+installed, unpacks others.
 """
 
+import logging
 import math
+import os
+import shutil
 import struct
+import tempfile
 import zlib
 from gzip import GzipFile
 from io import BytesIO
@@ -15,59 +20,104 @@ import torch
 from jaxtyping import Float, UInt8
 
 from completesplat.errors import PlyError
-from completesplat.export.formats import RECORD, TO_GLTF
+from completesplat.export.cleaning import bounded, cleaned
+from completesplat.export.formats import RECORD
 from completesplat.export.ply import read_ply
+from completesplat.export.splat_transform import PROGRAM, SplatTransform
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.harmonics import SH_C0
+from completesplat.ply_files import LONGEST_HEADER, PACKED
 
 HEADER = struct.Struct("<4sIIBBBBI")  # magic, version, count, degree, fractional bits, flags, streams, their table
 WIDTHS = {2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}  # bytes of a Gaussian in each part, by version
+EXTENDED, COORDINATES, RIGHT_UP_BACK = 2, 0xADBE0003, 4  # flag, type of an extension, its default
+OUR_AXES = np.array([1, -1, 1])  # right, down, forward
 LARGEST_RATIO = 40  # of what a file unpacks to; splat-transform's have 2
+
+log = logging.getLogger(__name__)
 
 
 def read_gaussians(path: str | Path) -> Gaussians:
     """Read a file of the format that its suffix names, in our axes; colours are the zeroth harmonics.
 
     Raises:
-        PlyError: the file is missing or damaged, or has values that are not finite.
+        PlyError: the file is missing or damaged, needs `splat-transform`, which is not installed, or has no finite
+            Gaussian. A warning counts those that are not finite.
+        CompleteSplatError: `splat-transform` fails.
     """
-    read = {".splat": _read_splat, ".spz": _read_spz}.get(Path(path).suffix.lower())
+    path = Path(path)
+    read = {".splat": _read_splat, ".spz": _read_spz}.get(path.suffix.lower())
     if read is None:
-        return read_ply(path)
+        packed = _packed_format(path)
+        return read_ply(path) if packed is None else _read_by_splat_transform(path, packed)
     try:
-        values = read(Path(path).read_bytes())
+        values = read(path.read_bytes(), path)
     except (OSError, EOFError, ValueError, struct.error, zlib.error) as error:
         raise PlyError(f"{path}: damaged, missing, or of another version ({error})") from error
     gaussians = Gaussians(*(torch.from_numpy(value.astype(np.float32)) for value in values))
-    if not gaussians.finite().all():
-        raise PlyError(f"{path}: some Gaussians are not finite")
-    return gaussians.transform(TO_GLTF) if read is _read_spz else gaussians  # `.spz` has +y up, +z towards the viewer
+    return cleaned(gaussians, path, bounded)
 
 
-def _read_splat(content: bytes) -> list[np.ndarray]:
+def _packed_format(path: Path) -> str | None:
+    """Return the name of a format that `splat-transform` unpacks, None for what `read_ply` reads or refuses."""
+    if path.suffix.lower() in (".sog", ".ksplat"):
+        return path.suffix[1:].upper()
+    if not path.is_file() or not os.access(path, os.R_OK):
+        return None
+    with path.open("rb") as file:
+        return "SuperSplat's compressed PLY" if f" {PACKED}\n".encode() in file.read(LONGEST_HEADER) else None
+
+
+def _read_by_splat_transform(path: Path, kind: str) -> Gaussians:
+    program = shutil.which(PROGRAM)
+    if program is None:
+        advice = f"`{PROGRAM} {path.name} x.ply` unpacks it, or install {PROGRAM} to read it here"
+        raise PlyError(f"{path}: {kind}; {advice}")
+    with tempfile.TemporaryDirectory() as folder:
+        SplatTransform(program).convert(path.absolute(), Path(folder) / "unpacked.ply")
+        return read_ply(Path(folder) / "unpacked.ply")
+
+
+def _read_splat(content: bytes, _: Path) -> list[np.ndarray]:
     records = np.frombuffer(content, RECORD)
     colors, rotations = records["colors"] / 255, records["quaternions"] / 128 - 1
     return [records["means"], rotations, records["scales"], colors[:, 3], colors[:, :3]]
 
 
-def _read_spz(content: bytes) -> list[np.ndarray]:
+def _read_spz(content: bytes, path: Path) -> list[np.ndarray]:
     most = max(LARGEST_RATIO * len(content), 2**24)
     data = content if content.startswith(b"NGSP") else GzipFile(fileobj=BytesIO(content)).read(most)
-    magic, version, count, _, bits, _, streams, table = HEADER.unpack_from(data)
+    magic, version, count, degree, bits, flags, streams, table = HEADER.unpack_from(data)
     if magic != b"NGSP" or version not in WIDTHS or count * sum(WIDTHS[version]) > most:
         raise ValueError(f"version {version}, {count} Gaussians")
+    if degree:
+        log.warning("%s: harmonics of degree %d are left out: one colour for all directions", path, degree)
+    signs = _signs(data[32:table] if version == 4 and flags & EXTENDED else b"")
     ends = count * np.cumsum(WIDTHS[version])
     parts = _unpacked(data, table, streams, np.diff(ends, prepend=0)) if version == 4 else data[16 : 16 + ends[-1]]
     blocks = np.split(np.frombuffer(parts, np.uint8, ends[-1]), ends[:-1])
     places, opacities, colors, scales, rotations = (block.reshape(count, -1) for block in blocks)
     whole = np.pad(places.reshape(count, 3, 3), ((0, 0), (0, 0), (1, 0)))  # 24 bits in the upper part of 32
     return [
-        np.ldexp(whole.view("<i4")[..., 0] >> 8, -bits),
-        _quaternions(rotations),
+        np.ldexp(whole.view("<i4")[..., 0] >> 8, -bits) * signs,
+        _quaternions(rotations) * [1, *(signs.prod() * signs)],
         np.exp(scales / 16 - 10),
         opacities[:, 0] / 255,
         np.maximum(0.5 + SH_C0 * (colors / 255 - 0.5) / 0.15, 0),
     ]
+
+
+def _signs(extensions: bytes) -> np.ndarray:
+    """Return the signs that turn the axes of a file to ours; its extensions may name them (0 to 8)."""
+    system = 0
+    while len(extensions) >= 12:
+        kind, size, value = struct.unpack_from("<III", extensions)
+        system, extensions = value if kind == COORDINATES else system, extensions[8 + size :]
+    if system > 8:
+        raise ValueError(f"coordinate system {system}")
+    right_up_front = (system or RIGHT_UP_BACK) - 1 >> np.arange(3) & 1
+    signs: np.ndarray = (2 * right_up_front - 1) * OUR_AXES
+    return signs
 
 
 def _unpacked(data: bytes, table: int, streams: int, sizes: np.ndarray) -> bytes:

@@ -12,7 +12,7 @@ from torch.optim import Adam
 
 from completesplat.errors import CompleteSplatError, PlyError
 from completesplat.export.images import surface_depth
-from completesplat.export.ply import read_ply
+from completesplat.export.reading import read_gaussians
 from completesplat.files import safe_name
 from completesplat.gaussians import Gaussians
 from completesplat.scene import SceneBatch, Views
@@ -78,7 +78,7 @@ class SceneFiles(Stage):
         """Read one scene's samples and place them in the reference camera's frame, in the data's units."""
         sets, paths = [], self.files[str(scene.names)][:samples]
         for path in paths:
-            gaussians = read_ply(path)
+            gaussians = read_gaussians(path)
             if not gaussians.count:
                 raise PlyError(f"{path}: holds 0 Gaussians; write it again")
             turned = gaussians.transform(FROM_OPENGL) if self.frame == "opengl" else gaussians

@@ -192,6 +192,7 @@ class Page:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"upload{suffix if suffix in SPLATS else ''}"
             path.write_bytes(file.content)
+            file.content = b""  # which the button would keep until the next upload
             try:
                 if suffix in SPLATS:
                     self.open(path, name)
@@ -202,6 +203,8 @@ class Page:
                     self.complete(path, name, event.client)
             except CompleteSplatError as error:
                 self.tell(CompleteSplatError(str(error).replace(str(path), name)), event.client)
+            except Exception as error:
+                self.tell(error, event.client)
 
     def _let_choose_another(self, name: str) -> None:
         """Name an uploaded scene in the choice, so that each of `scenes` can be chosen next."""

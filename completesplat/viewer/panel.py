@@ -18,8 +18,9 @@ from completesplat.diffusion.sampling import Sampler
 from completesplat.files import SPLATS
 from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
+from completesplat.viewer.sample import MOST_LAYERS
 
-MOST_SAMPLES, MOST_STEPS, MOST_SEED, MOST_LAYERS = 8, 100, 99, 16
+MOST_SAMPLES, MOST_STEPS, MOST_SEED = 8, 100, 99
 SLIDERS = ("samples", "skip_weight", "guidance_weight", "color_fits", "steps", "seed")  # settings of `CompleteSplat`
 SIDE_BY_SIDE = "all, side by side"
 CUT_OUT = (

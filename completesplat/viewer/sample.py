@@ -1,28 +1,32 @@
 """Scenes that the page shows, with the cameras that they belong to."""
 
-import json
+import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from completesplat.data.images.files import MOST_PIXELS
+from completesplat.data.validation import BadAnnotation, BadCamera, at, field, finite_array, read_json, require_rotation
 from completesplat.errors import CompleteSplatError
-from completesplat.export.cleaning import with_screen_space_dilation
+from completesplat.export.cleaning import LARGEST, with_screen_space_dilation
 from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 
 UP = (0.0, -1.0, 0.0)
 NEWEST_FILE = "scenes.json"
+MOST_LAYERS = 16
+EXTREME = 1e6  # ratio of focal length and image, and length of the direction up
 FRAMING_FOV, FRAMING_SIZE = 50.0, 512
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Sample:
     """One scene, unbatched.
 
@@ -37,7 +41,7 @@ class Sample:
     gaussians: Gaussians
     layers: int
     reference: Cameras
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     finished: bool = True
     exact: bool = False
 
@@ -75,28 +79,24 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     description = (path.parent if path.is_file() else path) / "scene.json"
     if not description.is_file() or not all(file.name.startswith(("sample_", "scene.")) for file in files):
         return [Sample(scene, 1, framing_camera(scene)) for scene in scenes], UP
-    try:
-        data = json.loads(description.read_text(encoding="utf-8"))
-        reference, settings = _camera(data["reference_camera"]), dict(data["settings"])
+    with at(description):
+        data = read_json(description)
+        reference, settings = _camera(field(data, "reference_camera", dict)), field(data, "settings", dict)
         up = _up(settings)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CompleteSplatError(f"{description}: not the description of a prediction") from error
     return [Sample(scene, _layers(scene, reference), reference, settings) for scene in scenes], up
 
 
 def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
     """Return a run's newest step, scenes and direction up (`write_newest`); raise CompleteSplatError if unreadable."""
     path = folder / NEWEST_FILE
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        step, up = int(data["step"]), _up(data)
-        described = [(str(row["file"]), str(row["scene"]), _camera(row["reference_camera"])) for row in data["scenes"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CompleteSplatError(f"{path}: not the newest scenes of a run") from error
     samples = []
-    for file, name, camera in described:
-        scene = read_gaussians(folder / Path(file).name)
-        samples.append(Sample(scene, _layers(scene, camera), camera, {"scene": name, "step": step}))
+    with at(path):
+        data = read_json(path)
+        step, up = field(data, "step", int), _up(data)
+        for row in field(data, "scenes", list):
+            camera, settings = _camera(field(row, "reference_camera", dict)), {"scene": field(row, "scene", str)}
+            scene = read_gaussians(folder / Path(field(row, "file", str)).name)
+            samples.append(Sample(scene, _layers(scene, camera), camera, settings | {"step": step}))
     return step, samples, up
 
 
@@ -113,19 +113,29 @@ def framing_camera(gaussians: Gaussians) -> Cameras:
 
 
 def _layers(gaussians: Gaussians, reference: Cameras) -> int:
-    """Return the number of layers, or 1 if Gaussians were left out of the file, so that it is unknown."""
+    """Return the number of layers, or 1 if it is unknown because Gaussians were left out of the file."""
     layers, rest = divmod(gaussians.count, math.prod(reference.image_size))
-    return layers if layers and not rest else 1
+    return layers if 1 <= layers <= MOST_LAYERS and not rest else 1
 
 
 def _up(settings: Mapping[str, Any]) -> tuple[float, ...]:
-    x, y, z = settings.get("up", UP)
-    return float(x), float(y), float(z)
+    up = finite_array(settings.get("up", UP), (3,), "up")
+    if not 1 / EXTREME < np.abs(up).max() < EXTREME:
+        raise BadAnnotation(f"up must have a length, not {settings['up']}")
+    return tuple(up.tolist())
 
 
 def _camera(plain: Mapping[str, Any]) -> Cameras:
-    pose, intrinsics = (torch.tensor(plain[name]).float() for name in ("world_to_camera", "intrinsics"))
-    height, width = plain["image_size"]
-    if (pose.shape, intrinsics.shape) != ((4, 4), (3, 3)):
-        raise ValueError("matrices of other sizes")
-    return Cameras(pose, intrinsics, (int(height), int(width)))
+    """Convert a camera of a description; raise DataError for one that cannot be."""
+    pose = finite_array(plain.get("world_to_camera"), (4, 4), "world_to_camera")
+    intrinsics = finite_array(plain.get("intrinsics"), (3, 3), "intrinsics")
+    height, width = size = finite_array(plain.get("image_size"), (2,), "image_size").tolist()
+    require_rotation(pose[:3, :3], "world_to_camera")
+    if np.abs(pose).max() > LARGEST:
+        raise BadCamera(f"world_to_camera is farther than {LARGEST:g} from the origin")
+    if not 1 <= min(size) <= height * width <= MOST_PIXELS:
+        raise BadAnnotation(f"image_size must be from 1 to {MOST_PIXELS:,} pixels, not {plain['image_size']}")
+    relative = np.abs(intrinsics) / max(size)
+    if intrinsics.diagonal()[:2].min() < max(size) / EXTREME or relative.max() > EXTREME:
+        raise BadCamera(f"intrinsics of no camera: {plain['intrinsics']}")
+    return Cameras(torch.from_numpy(pose).float(), torch.from_numpy(intrinsics).float(), (int(height), int(width)))

@@ -26,7 +26,7 @@ END, END_BYTES = b"PK\5\6", 22
 """First bytes of a zip archive's last record, and the record's length without the comment at its end."""
 CHECKSUM, DIGEST_BYTES = b"sha256:", 64
 ZIP = b"PK\3\4"
-MOST_REPEATED = 2**22  # elements of a tensor that has more of them than its file, because it repeats them
+MOST_REPEATED, MOST_VIEWS = 2**22, 4  # elements of all tensors together: this many, and of each in the file so many
 PLAIN = re.compile(
     r"torch (\w+Storage|Size|device|[a-z]\w*)|torch\._utils _rebuild_(tensor(_v[23])?|parameter)"
     r"|collections (OrderedDict|Counter)|_codecs encode"
@@ -86,6 +86,8 @@ def _check_steps(pickle: bytes) -> None:
     stack: list[_Op] = []
     marks: list[int] = []
     memo: dict[object, _Op] = {}
+    stored: dict[str, int] = {}  # lengths of the storages by their names
+    elements = 0
     for opcode, argument, _ in pickletools.genops(pickle):
         name, before = opcode.name, opcode.stack_before
         if name == "MARK":
@@ -103,9 +105,22 @@ def _check_steps(pickle: bytes) -> None:
             if not _is_plain(step):
                 made = next((value.argument for value in step.inputs if value.name == "GLOBAL"), argument or name)
                 raise TensorFileError(f"made of {shown(made)}, not of tensors alone")
-            # Keep the length of a storage, and only the name of any other call.
-            length = step.inputs[0].inputs[-1].argument if name == "BINPERSID" else None
-            stack[first:] = [_Op(name, length) if name in CALLS else step] * len(opcode.stack_after)
+            if name == "BINPERSID":
+                _, _, key, _, length = step.inputs[0].inputs
+                stored[key.argument] = length.argument
+            elements += _elements(step)
+            # Only the names of calls are needed.
+            stack[first:] = [_Op(name) if name in CALLS else step] * len(opcode.stack_after)
+    if elements > MOST_VIEWS * sum(stored.values()) + MOST_REPEATED:
+        raise TensorFileError("its tensors are larger than the file")
+
+
+def _elements(step: _Op) -> int:
+    """Return the number of elements of the tensor that a step makes, 0 if it makes none."""
+    match step:
+        case _Op("REDUCE", _, (_Op("GLOBAL", function), _Op(_, _, (_Op("BINPERSID"), _, sizes, *_)))):
+            return abs(math.prod(size.argument for size in sizes.inputs)) if "_rebuild_tensor" in function else 0
+    return 0
 
 
 def _is_plain(step: _Op) -> bool:
@@ -139,12 +154,8 @@ def _is_plain_call(function: str, arguments: tuple[_Op, ...]) -> bool:
             return text.name in TEXTS and codec == _Op(codec.name, "latin1")
         case "_rebuild_parameter", _:
             return True
-        case "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_tensor_v3", (_Op("BINPERSID", length), _, sizes, *_):
-            if any(size.name not in NUMBERS for size in sizes.inputs):
-                return False
-            if math.prod(size.argument for size in sizes.inputs) > max(length, MOST_REPEATED):
-                raise TensorFileError("a tensor is larger than the file")
-            return sizes.name in TUPLES
+        case "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_tensor_v3", (_Op("BINPERSID"), _, sizes, *_):
+            return sizes.name in TUPLES and all(size.name in NUMBERS for size in sizes.inputs)
     return False
 
 

@@ -61,7 +61,11 @@ def test_the_scenes_of_a_folder_can_be_chosen(tmp_path):
 def test_what_cannot_be_shown_is_refused(tmp_path):
     for path, message in (
         ("nowhere.ply", "nowhere.ply: no such file or folder"),
-        (".", "neither weights nor scenes in it or in weights/ (config.json, model.safetensors, .ply, .splat, .spz)"),
+        (
+            ".",
+            "neither weights nor scenes in it or in weights/ "
+            "(config.json, model.safetensors, .ply, .splat, .spz, .sog, .ksplat)",
+        ),
     ):
         with pytest.raises(CompleteSplatError, match=re.escape(message)):
             settings_of(tmp_path / path)

@@ -3,6 +3,7 @@
 import errno
 import io
 import logging
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -140,6 +141,24 @@ def test_a_video_is_split_into_evenly_spread_frames(tmp_path, asked, expected):
     np.testing.assert_allclose(means, 6 * np.array(expected), atol=2)
 
 
+def test_a_video_of_more_pixels_than_an_image_may_have_is_refused_before_it_is_decoded(tmp_path, monkeypatch):
+    imageio.imwrite(tmp_path / "a.mp4", np.zeros((3, 64, 64, 3), np.uint8), fps=10)
+    (images := tmp_path / "images").mkdir()
+    importing._split_video(tmp_path / "a.mp4", images, 3)
+    assert len(list(images.iterdir())) == 3
+    monkeypatch.setattr(importing, "MOST_PIXELS", 64 * 64 - 1)
+    with pytest.raises(DataError, match=r"a\.mp4: ffmpeg finds no video of at most 4,095 pixels there"):
+        importing._split_video(tmp_path / "a.mp4", images, 3)
+
+
+def test_a_pipe_among_photos_is_left_out(tmp_path):
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
+    os.mkfifo(tmp_path / "b.png")
+    importing._copy_photos(tmp_path, tmp_path / "images")
+    assert [path.name for path in (tmp_path / "images").iterdir()] == ["a.png"]
+
+
 def test_what_makes_no_capture_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):
     def line(path: str, cameras: str | None = "colmap") -> str:
         with pytest.raises(CompleteSplatError) as caught:
@@ -155,7 +174,7 @@ def test_what_makes_no_capture_is_one_line_and_leaves_nothing(tmp_path, monkeypa
     assert line("blank").startswith("blank: COLMAP finds poses for 0 of 6 images; a capture needs 6: take more")
     assert line("blank", None).endswith("get cameras by: completesplat data import blank cameras=colmap")
     Path("-a.mp4").write_bytes(bytes(1000))
-    assert line("-a.mp4") == "-a.mp4: ffmpeg finds no video there"
+    assert line("-a.mp4") == "-a.mp4: ffmpeg finds no video of at most 50,000,000 pixels there"
     assert line("typo") == "typo: no such file or folder"
     assert not list(Path("out").iterdir())
     monkeypatch.setitem(sys.modules, "pycolmap", None)

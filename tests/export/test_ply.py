@@ -106,9 +106,8 @@ def test_gaussians_that_cannot_be_stored_are_left_out(tmp_path, caplog):
 
 def test_broken_files_are_refused_in_one_line_with_their_name(tmp_path, written):
     path, good = tmp_path / "bad.ply", written[1]
-    not_a_number, too_large = np.float32("nan").tobytes(), np.float32(1000).tobytes()  # of the rotation, the scale
     without_property = good.replace(b"property float rot_3\n", b"property float rot_9\n")
-    for data in (b"", good[:-4] + not_a_number, good[:-20] + too_large + good[-16:], without_property):
+    for data in (b"", without_property):
         path.write_bytes(data)
         with pytest.raises(PlyError, match=re.escape(str(path))) as caught:
             read_ply(path)

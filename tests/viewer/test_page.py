@@ -213,10 +213,23 @@ def test_an_uploaded_scene_is_shown_from_the_front_with_switches_for_its_layers(
     assert page.view.up.tolist() == completion.model.up.tolist()
 
 
+def test_an_upload_is_dropped_when_it_is_read_and_any_error_is_shown(page, monkeypatch):
+    browser = Browser()
+    load(page, "photo.png", png(), browser)
+    assert page.opening.upload.value.content == b""
+    said = titles(page, monkeypatch)
+    monkeypatch.setattr(page, "open", lambda *_: 1 / 0)
+    load(page, "a.ply", b"ply", browser)
+    assert browser.messages[-1].startswith("ZeroDivisionError: ")
+    assert said[-1] == "completesplat"  # no longer that it is reading
+
+
 def test_a_page_without_weights_takes_no_image(page):
     browser = Browser()
     load(page, "photo.png", png(), browser)
-    assert browser.messages == ["photo.png: not .ply, .splat, .spz; images need completesplat view IMAGE"]
+    assert browser.messages == [
+        "photo.png: not .ply, .splat, .spz, .sog, .ksplat; images need completesplat view IMAGE"
+    ]
 
 
 def test_one_of_several_scenes_is_chosen(server, tmp_path):

@@ -45,12 +45,19 @@ def test_a_ply_alone_is_seen_as_a_whole(tmp_path):
 CAMERA = '{"world_to_camera": [[1.0]], "intrinsics": [[1.0]], "image_size": [4, 4]}'
 
 
-@pytest.mark.parametrize("text", ["", '{"settings": {}}', f'{{"reference_camera": {CAMERA}, "settings": {{}}}}'])
-def test_broken_descriptions_and_folders_without_samples_are_refused(tmp_path, text):
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "not a JSON file"),
+        ('{"settings": {}}', "no reference_camera in {'settings': {}}"),
+        (f'{{"reference_camera": {CAMERA}, "settings": {{}}}}', "world_to_camera must be 4 x 4 numbers"),
+    ],
+)
+def test_broken_descriptions_and_folders_without_samples_are_refused(tmp_path, text, reason):
     with pytest.raises(CompleteSplatError, match=r"no sample_\*\.ply"):
         read_scene(tmp_path)
     (prediction(tmp_path) / "scene.json").write_text(text)
-    with pytest.raises(CompleteSplatError, match="not the description of a prediction"):
+    with pytest.raises(CompleteSplatError, match=rf"scene\.json: {reason}"):
         read_scene(tmp_path)
 
 

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import shlex
 import subprocess
 from functools import partial
@@ -17,6 +18,7 @@ from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.turntable import TurntableSettings, import_turntables
 from completesplat.data.images.files import (
     FORMATS,
+    MOST_PIXELS,
     check_sums,
     opened,
     refused_as_bad,
@@ -132,16 +134,17 @@ def _photo_formats() -> tuple[str, ...]:
 
 def _split_video(video: Path, images: Path, frames: int) -> None:
     """Write the first frame of each of equal parts of a video, or all frames if there are fewer."""
-    from imageio_ffmpeg import count_frames_and_secs, get_ffmpeg_exe
+    from imageio_ffmpeg import get_ffmpeg_exe
 
-    try:
-        count, _ = count_frames_and_secs(str(video.absolute()))
-    except RuntimeError:
-        raise DataError("ffmpeg finds no video there", str(video)) from None
+    limit = "-max_pixels", str(MOST_PIXELS)  # else a small file could take gigabytes
+    start = [get_ffmpeg_exe(), "-nostdin", *limit, "-i", str(video.absolute())]
+    output = subprocess.run([*start, "-map", "0:v:0", "-f", "null", "-"], capture_output=True).stderr
+    count = int((re.findall(rb"frame= *(\d+)", output) or [b"0"])[-1])
+    if not count:
+        raise DataError(f"ffmpeg finds no video of at most {MOST_PIXELS:,} pixels there", str(video))
     part = f"{min(frames, count)}/{count}"
     options = ["-vf", f"select=gt(floor(n*{part})\\,floor((n-1)*{part}))", "-fps_mode", "passthrough", "-q:v", "2"]
-    command = [get_ffmpeg_exe(), "-nostdin", "-v", "error", "-i", str(video.absolute()), *options]
-    if subprocess.run([*command, "%05d.jpg"], cwd=images).returncode:
+    if subprocess.run([*start, "-v", "error", *options, "%05d.jpg"], cwd=images).returncode:
         raise DataError("ffmpeg cannot split it; the reason is above", str(video))
 
 

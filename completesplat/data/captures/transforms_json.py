@@ -159,10 +159,10 @@ def _read_frames(path: Path, content: Entry) -> list[CapturedFrame]:
         for number, entry in enumerate(entries):
             with at(frame=number):
                 name = field(entry, "file_path", str)
-                candidates = [inside(root, name + suffix) for suffix in SUFFIXES]
-                # `Path.is_file` raises if a name is too long.
-                image = next((candidate for candidate in candidates if isfile(candidate)), None)
-                if image is None:
+                # `inside` resolves links, which takes long for many missing images.
+                suffix = next((suffix for suffix in SUFFIXES if isfile(root / (name + suffix))), None)
+                image = inside(root, name + (suffix or ""))
+                if suffix is None:
                     missing.append(name)
                     continue
                 masked = entry.get("mask_path") is not None

@@ -9,9 +9,8 @@ object, and the object's coverage of the pixel. With paints for the back, `K_NNN
 import json
 import math
 import os
-import re
 import sys
-from importlib import import_module
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -19,138 +18,13 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-IMPORTERS = {
-    "glb": "import_scene.gltf",
-    "gltf": "import_scene.gltf",
-    "obj": "wm.obj_import",
-    "ply": "wm.ply_import",
-    "stl": "wm.stl_import",
-    "fbx": "import_scene.fbx",
-    **dict.fromkeys(USD := ("usd", "usda", "usdc", "usdz"), "wm.usd_import"),
-}
-# With these, an importer keeps vertices that are not finite, which it would otherwise move to the origin.
-AS_STORED = {"stl": {"use_mesh_validate": False}, **{kind: {"validate_meshes": False} for kind in ("obj", *USD)}}
+sys.path.append(str(Path(__file__).parent))  # Blender's Python does not look beside a script
+from _scene_meshes import RefusedMesh, baked_objects, find_factory, import_mesh, make_object, new_material, normalize
+
 SENSOR = 36.0  # its width; the unit cancels out
 BOUNCES = 4
 OPEN_GROUND = 30.0  # half size of a floor without walls
 TINY_FILTER = 0.01  # Blender's narrowest: the ray of a pixel with one sample goes through its centre
-
-
-class RefusedMesh(Exception):
-    """Mesh that cannot be rendered."""
-
-
-def import_mesh(path: Path) -> None:
-    """Import a file into the empty scene; refuse one that Blender cannot read or whose textures are missing."""
-    kind = path.suffix[1:].lower()
-    module, name = IMPORTERS[kind].split(".")
-    if kind == "obj":
-        with path.open("rb") as file:
-            names = [line[6:].strip().decode(errors="replace") for line in file if line.startswith(b"mtllib")]
-        require_files([path.parent / name for name in names], "material file")
-    try:
-        getattr(getattr(bpy.ops, module), name)(filepath=str(path), **AS_STORED.get(kind, {}))
-    except RuntimeError as error:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip() and "Location:" not in line]
-        reason = lines[-1] if "Traceback" in lines[0] else lines[0]
-        raise RefusedMesh(f"Blender cannot import it: {reason.removeprefix('Error: ')}") from None
-    images = [image for image in bpy.data.images if image.source == "FILE" and image.packed_file is None]
-    require_files([Path(bpy.path.abspath(image.filepath)) for image in images], "texture")
-
-
-def find_factory(name: str) -> Any:
-    """Return Infinigen's class of procedural objects; import only the package that names it, which saves seconds."""
-    try:
-        import infinigen.assets.objects as kinds
-    except ImportError as error:
-        raise RefusedMesh(f"Blender's Python lacks Infinigen ({error}): see completesplat data render --help") from None
-    packages = sorted(Path(kinds.__path__[0]).glob("*/__init__.py"))
-    named = [path.parent.name for path in packages if re.search(rf"\b{name}\b", path.read_text())]
-    if not named:
-        raise RefusedMesh(f"Infinigen has no {name}")
-    return getattr(import_module(f"{kinds.__name__}.{named[0]}"), name)
-
-
-def make_object(name: str, seed: int) -> None:
-    """Make a procedural object of Infinigen in the empty scene."""
-    factory_class = find_factory(name)
-    from infinigen.core.util.math import FixedSeed
-
-    with FixedSeed(seed):
-        factory = factory_class(seed)
-        factory.finalize_assets(factory.spawn_asset(0))
-
-
-def require_files(paths: list[Path], what: str) -> None:
-    for path in paths:
-        if not path.is_file():
-            raise RefusedMesh(f"its {what} {path.name} is missing")
-
-
-def baked_objects() -> list[Any]:
-    """Replace everything in the scene by static meshes, one for each visible instance, and return these."""
-    graph = bpy.context.evaluated_depsgraph_get()
-    meshes = []
-    for instance in graph.object_instances:
-        source = instance.object
-        if source.type == "MESH" and len(source.data.polygons) and not source.original.hide_render:
-            mesh = bpy.data.meshes.new_from_object(source, preserve_all_data_layers=True, depsgraph=graph)
-            mesh.transform(instance.matrix_world)
-            meshes.append(mesh)
-    for imported in list(bpy.data.objects):
-        bpy.data.objects.remove(imported)
-    if not meshes:
-        raise RefusedMesh("it has no faces")
-    objects = [bpy.data.objects.new("part", mesh) for mesh in meshes]
-    for part in objects:
-        bpy.context.scene.collection.objects.link(part)
-        part.pass_index = 1
-        materials = part.data.materials
-        if not materials:
-            materials.append(None)
-        for slot, material in enumerate(materials):
-            materials[slot] = material or colored_material(part.data.color_attributes)
-    return objects
-
-
-def colored_material(attributes: Any) -> Any:
-    """Return a material of the vertices' colours, or of Blender's default grey."""
-    material, shader = new_material()
-    if len(attributes):
-        attribute = material.node_tree.nodes.new("ShaderNodeVertexColor")
-        attribute.layer_name = attributes[0].name
-        material.node_tree.links.new(attribute.outputs["Color"], shader.inputs["Base Color"])
-    return material
-
-
-def new_material() -> tuple[Any, Any]:
-    material = bpy.data.materials.new("material")
-    material.use_nodes = True
-    return material, material.node_tree.nodes["Principled BSDF"]
-
-
-def normalize(objects: list[Any]) -> tuple[list[float], float, float]:
-    """Move the bounding box's centre to the origin and the farthest vertex to distance 1.
-
-    Returns:
-        The former centre, the factor of the scale, and the height of the object's lowest point.
-    """
-    coordinates = []
-    for part in objects:
-        flat = np.empty(3 * len(part.data.vertices), np.float32)
-        part.data.vertices.foreach_get("co", flat)
-        coordinates.append(flat.reshape(-1, 3).astype(np.float64))
-    points = np.concatenate(coordinates)
-    if not np.isfinite(points).all():
-        raise RefusedMesh("it has vertices that are not finite")
-    center = (points.min(0) + points.max(0)) / 2
-    radius = float(np.linalg.norm(points - center, axis=1).max())
-    if not radius > 1e-12:
-        raise RefusedMesh("all its vertices are in one place")
-    for part in objects:
-        part.data.validate()
-        part.data.transform(Matrix.Scale(1 / radius, 4) @ Matrix.Translation((-center).tolist()))
-    return center.tolist(), 1 / radius, float((points[:, 2].min() - center[2]) / radius)
 
 
 def paint_back(objects: list[Any], toward: list[float], least: float) -> Any:
@@ -330,7 +204,7 @@ def set_up_outputs(folder: Path) -> dict[str, Any]:
 
 def render(folder: Path, views: list[dict[str, Any]], samples: int, paint: Any, colors: list[list[float]]) -> None:
     """Render all views with every colour of the paint (`[]`: without), then geometry at the pixels' centres."""
-    scene, starter = bpy.context.scene, os.getppid()
+    scene = bpy.context.scene
     outputs = set_up_outputs(folder)
     further = [("", f"{index}_", color) for index, color in enumerate(colors) if index]
     for task, prefix, color in [("coverage", "", (*colors, None)[0]), *further, ("geometry", "", None)]:
@@ -344,8 +218,6 @@ def render(folder: Path, views: list[dict[str, Any]], samples: int, paint: Any, 
         if color:
             paint.default_value = (*color, 1.0)
         for number, view in enumerate(views):
-            if os.getppid() != starter:
-                sys.exit("the process that started this one has ended")
             set_camera(view)
             scene.frame_current, scene.cycles.seed = number, number
             scene.render.filepath = str(folder / f"{prefix}{number:04d}.png")
@@ -376,23 +248,30 @@ def run(job: dict[str, Any]) -> dict[str, Any]:
             find_factory(job["factory"])
             return {}
         if "mesh" in job:
-            import_mesh(Path(job["mesh"]))
+            import_mesh(Path(job["mesh"]), Path(job["root"]))
         else:
             make_object(job["factory"], job["seed"])
         objects = baked_objects()
-        center, scale, ground = normalize(objects)
+        place: dict[str, Any] = normalize(objects)
     except RefusedMesh as reason:
         return {"refused": str(reason)}
     set_up_renderer(objects)
     hidden = job["hidden"]
     paint = paint_back(objects, hidden["toward"], hidden["least"]) if hidden else None
-    add_surroundings(job, ground)
+    add_surroundings(job, place.pop("ground"))
     add_light(job["light"])
     render(Path(job["folder"]), job["views"], job["samples"], paint, hidden["colors"] if hidden else [])
-    return {"center": center, "scale": scale}
+    return place
+
+
+def end_with_starter() -> None:
+    """End this process when its standard input ends, which the process that started it holds open."""
+    os.read(0, 1)
+    os._exit(1)
 
 
 if __name__ == "__main__":
+    threading.Thread(target=end_with_starter, daemon=True).start()
     job_file = Path(sys.argv[-1])
     result = run(json.loads(job_file.read_text()))
     job_file.with_name("result.json").write_text(json.dumps(result))

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Event
@@ -79,26 +80,34 @@ def run_job(
     Args:
         folder: an existing folder for the job's files and Blender's messages.
         stopped: an event after which Blender is killed.
-        minutes: time after which Blender is killed.
+        minutes: time after which Blender is killed; the job's `memory` (bytes) limits it on Linux.
     """
     end = time.monotonic() + 60 * minutes
-    path, messages = folder / "job.json", folder / "messages.txt"
+    path, messages, memory = folder / "job.json", folder / "messages.txt", job.get("memory")
     path.write_text(json.dumps(job))
     separator = () if PYTHON_OPTIONS[0] in blender.command else ("--",)
     with messages.open("wb") as output:
         command = [*blender.command, str(SCRIPT), *separator, str(path)]
         env = {**os.environ, "TMPDIR": str(folder)}
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, env=env)
-        while process.poll() is None:
-            if stopped.is_set() or time.monotonic() > end:
-                process.kill()
-            time.sleep(SECONDS_BETWEEN_LOOKS)
+        # The script ends when its standard input does, that is, when this process has ended.
+        pipes: Any = {"stdin": subprocess.PIPE, "stdout": output, "stderr": subprocess.STDOUT}
+        with subprocess.Popen(command, env=env, **pipes) as process:
+            if sys.platform == "linux" and memory is not None:
+                import resource
+
+                with suppress(OSError, ValueError):  # a lower limit is in force
+                    resource.prlimit(process.pid, resource.RLIMIT_DATA, (memory, memory))
+            while process.poll() is None:
+                if stopped.is_set() or time.monotonic() > end:
+                    process.kill()
+                time.sleep(SECONDS_BETWEEN_LOOKS)
     result = folder / "result.json"
     if process.returncode == 0 and result.is_file():
         return dict(json.loads(result.read_text()))
     if time.monotonic() > end:
         return {"refused": f"took longer than max_minutes={minutes:g}"}
     if process.returncode < 0:
-        return {"refused": f"Blender ended by signal {-process.returncode} (a crash, or out of memory)"}
+        limit = "out" if memory is None else f"more than {memory / 1e9:.1f} GB"
+        return {"refused": f"Blender ended by signal {-process.returncode} (a crash, or {limit} of memory)"}
     last = (messages.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
     return {"refused": f"Blender failed: {last[:200]}"}

@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event
 from typing import Annotated, Any, NamedTuple, Unpack
+from urllib.parse import unquote
 
 import numpy as np
 import torch
@@ -47,6 +48,8 @@ SUFFIXES = ("glb", "gltf", "obj", "ply", "stl", "fbx", "usd", "usda", "usdc", "u
 MOST_POINTS = 20_000
 SKY = 1e9  # Cycles has 1e10 where no surface is
 MEGABYTE = 1_000_000
+LEAST_MEMORY, MEMORY_OF_BYTE = 4000 * MEGABYTE, 20  # of Blender for a mesh: bytes, and for each byte of its file
+MOST_OPTIONS = 30  # words before the name of a texture
 
 
 class Asset(NamedTuple):
@@ -78,6 +81,53 @@ def find_meshes(folder: Path) -> list[Asset]:
         raise MissingFile(f"no meshes there ({', '.join(SUFFIXES)})", str(folder))
     relative = [path.relative_to(folder).as_posix() for path in paths]
     return [Asset(*mesh) for mesh in zip(folder_names(relative), relative, paths, strict=True)]
+
+
+def check_named_files(mesh: Path, root: Path) -> None:
+    """Refuse files that an OBJ or glTF names and Blender would open, unless they are regular files below `root`.
+
+    Raises:
+        BrokenMesh: there is such a file, or an OBJ's material file is missing.
+    """
+    names = _uris(mesh) if mesh.suffix.lower() in (".gltf", ".glb") else []
+    for library in _lines(mesh, "mtllib") if mesh.suffix.lower() == ".obj" else ():
+        _check_named_file(mesh, library, root)
+        if not os.path.isfile(mesh.parent / library):
+            raise BrokenMesh(f"its material file {library} is missing")
+        for line in _lines(mesh.parent / library, "map_", "bump", "disp", "decal", "refl", "norm"):
+            words = line.split(maxsplit=MOST_OPTIONS)
+            names += [" ".join(words[start:]) for start in range(len(words))]  # options may precede the name
+    for name in names:
+        _check_named_file(mesh, name, root)
+
+
+def _check_named_file(mesh: Path, name: str, root: Path) -> None:
+    named = mesh.parent / name.replace("\\", "/")
+    for path in (named, mesh.parent / named.name):  # Blender looks beside the mesh, too
+        if not os.path.exists(path) or path.is_dir():
+            continue
+        if not path.resolve().is_relative_to(root):
+            raise BrokenMesh(f"{path.name} lies outside of the folder of meshes")
+        if not path.is_file():
+            raise BrokenMesh(f"{path.name} is no regular file")
+
+
+def _lines(path: Path, *starts: str) -> list[str]:
+    """Return what follows the first word of the lines that start so."""
+    with path.open(errors="replace") as lines:
+        return [(line.split(maxsplit=1)[1:] or [""])[0].strip() for line in lines if line.lstrip().startswith(starts)]
+
+
+def _uris(mesh: Path) -> list[str]:
+    """Return the files that a glTF names; of one that cannot be read none, because Blender says what is wrong."""
+    with mesh.open("rb") as file:
+        start = file.read(20)
+        content = file.read(int.from_bytes(start[12:16], "little") if start.startswith(b"glTF") else -1)
+    try:
+        description = json.loads(content if start.startswith(b"glTF") else start + content)
+        return [unquote(x["uri"]) for kind in ("buffers", "images") for x in description.get(kind, ()) if "uri" in x]
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return []
 
 
 def procedural_objects(program: Blender, factory: str, count: int) -> list[Asset]:
@@ -175,20 +225,27 @@ def _write_object(
 ) -> tuple[str, str]:
     """Render an object into its folder, whole or not at all; return its name, and why it is left out (or "")."""
     mesh, (most_bytes, minutes) = asset.mesh, most
-    if mesh is not None and (size := mesh.stat().st_size) > most_bytes:
-        return asset.name, f"{size // MEGABYTE:,} MB, more than max_megabytes={most_bytes // MEGABYTE}"
     try:
+        job, cameras = draw_scene(asset.key, settings)
+        job["factory"] = asset.factory
+        if mesh is not None:
+            if (size := mesh.stat().st_size) > most_bytes:
+                raise BrokenMesh(f"{size // MEGABYTE:,} MB, more than max_megabytes={most_bytes // MEGABYTE}")
+            root = mesh.parents[asset.key.count("/")].resolve()
+            check_named_files(mesh, root)
+            job |= {"mesh": str(mesh.absolute()), "root": str(root), "memory": LEAST_MEMORY + MEMORY_OF_BYTE * size}
         # Blender's importer would move such vertices to the origin.
         if mesh is not None and mesh.suffix.lower() == ".ply" and not np.isfinite(read_points(mesh)).all():
             raise BrokenMesh("it has vertices that are not finite")
         with atomic_folder(category / asset.name) as folder:
             files = folder / "blender"
             files.mkdir()
-            job, cameras = draw_scene(asset.key, settings)
-            job |= {"factory": asset.factory} if mesh is None else {"mesh": str(mesh.absolute())}
             result = run_job(program, job | {"folder": str(files.absolute())}, files, stopped, minutes)
             if "refused" in result:
                 raise BrokenMesh(result["refused"])
+            if result["left_out"]:
+                text = "%s: %d stray faces are left out, far from 99 %% of its surface"
+                logger.warning(text, asset.name, result["left_out"])
             modes = job["hidden"]["modes"] if job["hidden"] else []
             record = {"source": asset.key, **result, **_write_sequence(folder, asset.name, files, cameras)}
             record["hidden"] = (*modes, None)[0]

@@ -1,12 +1,16 @@
 """Finding Blender, and programs that are none, are too old, crash or fail: small scripts stand for them."""
 
 import errno
+import os
+import signal
 import stat
+import subprocess
 import sys
+from pathlib import Path
 
 import meshes
 import pytest
-from support import refused
+from support import refused, waited_for
 
 from completesplat import files
 from completesplat.data.rendered import blender
@@ -97,7 +101,7 @@ def test_programs_that_are_no_blender_are_refused(line, program, tmp_path):
 
 def test_a_blender_that_crashes_or_fails_leaves_meshes_out(into, program, tmp_path):
     for text, reason in {
-        "kill -SEGV $$": "Blender ended by signal 11 (a crash, or out of memory)",
+        "kill -SEGV $$": "Blender ended by signal 11 (a crash, or more than 4.0 GB of memory)",
         "echo; echo Error: no license; exit 1": "Blender failed: Error: no license",
         "exit 0": "Blender failed: no message",
     }.items():
@@ -110,6 +114,48 @@ def test_a_blender_that_hangs_leaves_its_mesh_out(into, program, tmp_path):
     hanging = program(VERSION.format("4.2.0") + "exec sleep 60")
     message = into(tmp_path / "data", hanging, max_minutes=0.01)
     assert message.endswith("none of 1 objects can be rendered: took longer than max_minutes=0.01")
+
+
+# Runs the script for Blender with modules that stand for Blender's; its first step writes a file and never ends.
+ENDLESS = """
+import runpy, sys, time
+from pathlib import Path
+from unittest.mock import MagicMock
+for name in ("bmesh", "bpy", "mathutils"):
+    sys.modules[name] = MagicMock()
+def begin(**_):
+    Path({begun!r}).write_text(str(__import__("os").getpid()))
+    time.sleep(1000)
+sys.modules["bpy"].ops.wm.read_factory_settings = begin
+sys.argv = sys.argv[sys.argv.index("--python") + 1 :]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.mark.processes
+def test_blender_ends_with_the_process_that_started_it_even_in_the_middle_of_a_view(line, program, tmp_path):
+    (tmp_path / "stand_in.py").write_text(ENDLESS.format(begun=str(begun := tmp_path / "begun")))
+    found = program(VERSION.format("4.2.0") + f'exec {sys.executable} {tmp_path / "stand_in.py"} "$@"')
+    command = ["data", "render", f"meshes={tmp_path / 'meshes'}", f"out={tmp_path / 'out'}", f"blender={found}", *QUICK]
+    process = subprocess.Popen([sys.executable, "-P", "-m", "completesplat", *command])
+    try:
+        assert waited_for(lambda: process.poll() is not None or (begun.is_file() and begun.read_text()))
+    finally:
+        process.kill()
+        process.wait()
+    child = Path(f"/proc/{begun.read_text()}")
+    ended = waited_for(lambda: not child.exists() or child.joinpath("stat").read_text().split()[2] == "Z", seconds=30)
+    if not ended:
+        os.kill(int(child.name), signal.SIGKILL)
+    assert ended
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the memory of another process")
+def test_a_mesh_gets_memory_by_the_size_of_its_file(into, program, tmp_path):
+    limited = program(VERSION.format("4.2.0") + "sleep 1; echo $(ulimit -d); exit 1")
+    size = (tmp_path / "meshes/cube.obj").stat().st_size
+    kilobytes = (4 * 10**9 + 20 * size) // 1024
+    assert into(tmp_path / "data", limited).endswith(f"Blender failed: {kilobytes}")
 
 
 def test_a_full_disk_is_no_reason_to_leave_meshes_out(line, program, tmp_path, monkeypatch):

@@ -1,0 +1,204 @@
+"""Meshes of strangers: textures that cannot be read, files outside of the folder, pipes, stray faces."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import meshes
+import numpy as np
+import pytest
+from PIL import Image
+from support import strict_json
+
+from completesplat.data.rendered.blender import find_blender
+from completesplat.data.rendered.drawing import textures_of
+from completesplat.data.rendered.rendering import render
+from completesplat.errors import CompleteSplatError, DataError
+from completesplat.ply_files import read_vertices
+
+QUICK = meshes.SETTINGS | {"views": 2, "size": 16, "samples": 1, "workers": 1, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def blender() -> None:
+    try:
+        find_blender()
+    except CompleteSplatError as reason:
+        pytest.skip(str(reason))
+
+
+@pytest.fixture
+def stand_in(tmp_path) -> str:
+    """Program that is no Blender, for meshes that are refused before it starts."""
+    program = tmp_path / "blender"
+    program.write_text('#!/bin/sh\n[ "$1" = --version ] && echo Blender 4.2.0 || echo has started; exit 1\n')
+    program.chmod(0o755)
+    return str(program)
+
+
+def png(path: Path) -> bytes:
+    Image.new("RGB", (8, 8), (200, 40, 40)).save(path)
+    return path.read_bytes()
+
+
+def with_texture(folder: Path, texture: bytes) -> None:
+    (folder / "t.png").write_bytes(texture)
+    meshes.write_gltf(folder / "a.gltf", "t.png")
+
+
+def damaged(folder: Path) -> None:
+    with_texture(folder, png(folder / "t.png").replace(b"IDAT", b"IDAX"))
+
+
+def cut(folder: Path) -> None:
+    with_texture(folder, png(folder / "t.png")[:60])
+
+
+def pointer(folder: Path) -> None:
+    with_texture(folder, b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 218\n")
+
+
+def ktx2(folder: Path) -> None:
+    meshes.write_gltf(folder / "a.gltf", "t.ktx2")
+    content = json.loads((folder / "a.gltf").read_text())
+    content["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
+    (folder / "a.gltf").write_text(json.dumps(content | {"extensionsUsed": ["KHR_texture_basisu"]}))
+    (folder / "t.ktx2").write_bytes(b"\xabKTX 20\xbb\r\n\x1a\n")
+
+
+@pytest.mark.blender
+@pytest.mark.parametrize(
+    ("write", "reason"),
+    [
+        (damaged, "its texture t.png cannot be read: damaged, or a pointer of Git LFS"),
+        (cut, "its texture t.png cannot be read: damaged, or a pointer of Git LFS"),
+        (pointer, "its texture t.png cannot be read: damaged, or a pointer of Git LFS"),
+        (ktx2, "it has a texture in a format that Blender does not read, such as KTX2"),
+    ],
+)
+@pytest.mark.usefixtures("blender")
+def test_a_texture_that_cannot_be_read_leaves_its_mesh_out(tmp_path, write: Callable[[Path], None], reason):
+    (tmp_path / "meshes").mkdir()
+    write(tmp_path / "meshes")
+    with pytest.raises(DataError, match=f"none of 1 objects can be rendered: {reason}$"):
+        render(str(tmp_path / "meshes"), out=tmp_path / "data", **QUICK)
+
+
+def named_by_obj(folder: Path, texture: str, library: str = "a.mtl") -> None:
+    (folder / "a.mtl").write_text(f"newmtl m\nmap_Kd -s 1 1 1 {texture}\n")
+    meshes.write_triangle(folder / "a.obj", vertices=f"mtllib {library}\nv 0 0 0\nv 1 0 0\nv 0 1 0\n")
+
+
+def named_by_glb(folder: Path, texture: str) -> None:
+    """Write a binary glTF that names its texture's file."""
+    text = meshes.write_gltf(folder / "a.gltf", texture).read_bytes()
+    (folder / "a.gltf").unlink()
+    text += b" " * (-len(text) % 4)
+    sizes = (2).to_bytes(4, "little") + (20 + len(text)).to_bytes(4, "little") + len(text).to_bytes(4, "little")
+    (folder / "a.glb").write_bytes(b"glTF" + sizes + b"JSON" + text)
+
+
+def stolen(folder: Path) -> None:
+    named_by_obj(folder, "../../outside/private.png")
+
+
+def stolen_library(folder: Path) -> None:
+    named_by_obj(folder, "t.png", "../../outside/private.mtl")
+
+
+def linked(folder: Path) -> None:
+    (folder / "t.png").symlink_to(folder / "../../outside/private.png")
+    meshes.write_gltf(folder / "a.gltf", "t.png")
+
+
+def stolen_by_glb(folder: Path) -> None:
+    named_by_glb(folder, "..%2F../outside/private.png")
+
+
+def piped(folder: Path) -> None:
+    os.mkfifo(folder / "t.png")
+    named_by_obj(folder, "t.png")
+
+
+def piped_for_gltf(folder: Path) -> None:
+    os.mkfifo(folder / "t.png")
+    meshes.write_gltf(folder / "a.gltf", "t.png")
+
+
+def elsewhere(folder: Path) -> None:
+    """Name a texture by its place on another machine; Blender takes the file of that name beside the mesh."""
+    os.mkfifo(folder / "t.png")
+    named_by_obj(folder, "C:\\work\\t.png")
+
+
+@pytest.mark.parametrize(
+    ("write", "reason"),
+    [
+        (stolen, "private.png lies outside of the folder of meshes"),
+        (stolen_library, "private.mtl lies outside of the folder of meshes"),
+        (linked, "t.png lies outside of the folder of meshes"),
+        (stolen_by_glb, "private.png lies outside of the folder of meshes"),
+        (piped, "t.png is no regular file"),
+        (piped_for_gltf, "t.png is no regular file"),
+        (elsewhere, "t.png is no regular file"),
+    ],
+)
+def test_files_outside_of_the_folder_and_pipes_are_refused_before_blender_starts(tmp_path, stand_in, write, reason):
+    (tmp_path / "outside").mkdir()
+    png(tmp_path / "outside/private.png")
+    (tmp_path / "outside/private.mtl").write_text("newmtl m\n")
+    (tmp_path / "meshes/sub").mkdir(parents=True)
+    write(tmp_path / "meshes/sub")
+    with pytest.raises(DataError, match=f": {reason}$"):
+        render(str(tmp_path / "meshes"), out=tmp_path / "data", blender=stand_in, **QUICK | {"max_minutes": 0.1})
+
+
+def test_files_anywhere_in_the_folder_of_meshes_are_taken(tmp_path, stand_in):
+    (tmp_path / "meshes/sub").mkdir(parents=True)
+    png(tmp_path / "meshes/t.png")
+    named_by_obj(tmp_path / "meshes/sub", "../t.png")
+    with pytest.raises(DataError, match=r"Blender failed: has started$"):
+        render(str(tmp_path / "meshes"), out=tmp_path / "data", blender=stand_in, **QUICK)
+
+
+def test_folders_and_long_words_in_a_material_are_no_files(tmp_path, stand_in):
+    (tmp_path / "meshes/1").mkdir(parents=True)
+    named_by_obj(tmp_path / "meshes", f". .. {'x' * 5000}")
+    with pytest.raises(DataError, match=r"Blender failed: has started$"):
+        render(str(tmp_path / "meshes"), out=tmp_path / "data", blender=stand_in, **QUICK)
+
+
+def test_a_pipe_among_the_textures_of_floors_is_left_out(tmp_path):
+    png(tmp_path / "a.png")
+    os.mkfifo(tmp_path / "b.png")
+    assert textures_of(tmp_path) == [str(tmp_path / "a.png")]
+
+
+@pytest.mark.blender
+@pytest.mark.usefixtures("blender")
+def test_a_speck_far_from_the_mesh_is_left_out_and_a_vertex_without_faces_has_no_effect(tmp_path, caplog):
+    cube = meshes.write_cube(tmp_path / "meshes/cube.obj", half=1)
+    render(str(tmp_path / "meshes"), out=tmp_path / "alone", **QUICK)
+    speck = "v 25 0 0\nv 25.001 0 0\nv 25 0.001 0\nf 9/1 10/2 11/3\nv 0 900 0\n"
+    cube.write_text(cube.read_text() + speck)
+    render(str(tmp_path / "meshes"), out=tmp_path / "both", **QUICK)
+    assert "cube.obj: 1 stray faces are left out, far from 99 % of its surface" in caplog.text
+    alone, both = (strict_json(tmp_path / name / "rendered/cube.obj/object.json") for name in ("alone", "both"))
+    assert (alone["left_out"], both["left_out"]) == (0, 1)
+    assert both["scale"] == pytest.approx(1 / np.sqrt(3))
+    clouds = [read_vertices(tmp_path / name / "rendered/cube.obj/pointcloud.ply", "xyz") for name in ("alone", "both")]
+    assert (clouds[0] == clouds[1]).all()
+
+
+@pytest.mark.blender
+@pytest.mark.usefixtures("blender")
+def test_a_thin_part_that_reaches_far_stays(tmp_path):
+    """A pole of 0.4 % of the surface that is twice as high as the cube."""
+    cube = meshes.write_cube(tmp_path / "meshes/cube.obj", half=1)
+    pole = "v 0 1 0\nv 0.02 1 0\nv 0.02 4 0\nv 0 4 0\nf 9/1 10/2 11/3 12/4\n"
+    cube.write_text(cube.read_text() + pole)
+    render(str(tmp_path / "meshes"), out=tmp_path / "data", **QUICK)
+    record = strict_json(tmp_path / "data/rendered/cube.obj/object.json")
+    assert record["left_out"] == 0
+    assert record["center"] == pytest.approx([0, 0, 1.5], abs=1e-6)

@@ -1,0 +1,200 @@
+"""Files of strangers: predictions' descriptions, and Gaussians of other programs, each with its right value."""
+
+import json
+import logging
+import struct
+from pathlib import Path
+
+import fake_converter
+import numpy as np
+import pytest
+import torch
+from splats_of_others import FILES, SCENE
+
+from completesplat.errors import CompleteSplatError
+from completesplat.export.formats import RECORD
+from completesplat.export.ply import read_ply, write_ply
+from completesplat.export.reading import read_gaussians
+from completesplat.geometry.cameras import Cameras
+from completesplat.viewer.sample import read_newest, read_scene
+
+CAMERA = {
+    "world_to_camera": np.eye(4).tolist(),
+    "intrinsics": [[50, 0, 16], [0, 50, 16], [0, 0, 1]],
+    "image_size": [32, 32],
+}
+DEEP = 100_000
+
+
+def prediction(folder: Path, **changes: object) -> Path:
+    """Write a sample and its description, with changes to its camera and its direction up."""
+    write_ply(folder / "sample_00.ply", SCENE)
+    settings = {"up": changes.pop("up", [0, -1, 0])}
+    (folder / "scene.json").write_text(json.dumps({"reference_camera": CAMERA | changes, "settings": settings}))
+    return folder
+
+
+def turned(**entries: float) -> list[list[float]]:
+    pose = np.eye(4)
+    for name, value in entries.items():
+        pose[int(name[1]), int(name[2])] = value
+    return pose.tolist()
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"image_size": [float("inf"), 32]}, "Infinity is no JSON"),
+        ({"image_size": [0, 32]}, r"image_size must be from 1 to 50,000,000 pixels, not \[0, 32\]"),
+        ({"image_size": [32, 1e300]}, "image_size must be from 1 to 50,000,000"),
+        ({"image_size": [32]}, "image_size must be 2 numbers"),
+        ({"intrinsics": np.zeros((3, 3)).tolist()}, "intrinsics of no camera"),
+        ({"intrinsics": [[1e-300, 0, 16], [0, 50, 16], [0, 0, 1]]}, "intrinsics of no camera"),
+        ({"intrinsics": [[50, 0, 1e200], [0, 50, 16], [0, 0, 1]]}, "intrinsics of no camera"),
+        ({"up": [float("nan")] * 3}, "NaN is no JSON"),
+        ({"up": [0, 0, 0]}, r"up must have a length, not \[0, 0, 0\]"),
+        ({"up": [0, -1e300, 0]}, "up must have a length"),
+        ({"up": "north"}, "up must be 3 numbers, not 'north'"),
+        ({"world_to_camera": turned(_03=float("nan"))}, "NaN is no JSON"),
+        ({"world_to_camera": turned(_00=0)}, "world_to_camera is not orthonormal"),
+        ({"world_to_camera": turned(_23=1e30)}, "world_to_camera is farther than 1e\\+18 from the origin"),
+    ],
+)
+def test_a_camera_of_no_prediction_is_refused_by_file_and_value(tmp_path, changes, reason):
+    with pytest.raises(CompleteSplatError, match=rf"scene\.json: .*{reason}"):
+        read_scene(prediction(tmp_path, **changes))
+
+
+def newest(folder: Path, camera: object, up: object = (0, -1, 0)) -> Path:
+    write_ply(folder / "a.ply", SCENE)
+    rows = [{"file": "a.ply", "scene": "a", "reference_camera": camera}]
+    (folder / "scenes.json").write_text(json.dumps({"step": 3, "up": up, "scenes": rows}))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("camera", "up", "reason"),
+    [
+        (CAMERA | {"intrinsics": np.zeros((3, 3)).tolist()}, [0, -1, 0], "intrinsics of no camera"),
+        (CAMERA, [0, float("inf"), 0], "Infinity is no JSON"),
+        (None, [0, -1, 0], "reference_camera must be of type dict, not None"),
+    ],
+)
+def test_the_scenes_of_a_run_are_checked_alike(tmp_path, camera, up, reason):
+    assert read_newest(newest(tmp_path, CAMERA))[0] == 3
+    with pytest.raises(CompleteSplatError, match=rf"scenes\.json: .*{reason}"):
+        read_newest(newest(tmp_path, camera, up))
+
+
+@pytest.mark.parametrize("read", [read_scene, read_newest])
+def test_deeply_nested_descriptions_are_refused(tmp_path, read):
+    prediction(tmp_path)
+    for name in ("scene.json", "scenes.json"):
+        (tmp_path / name).write_text("[" * DEEP + "]" * DEEP)
+    with pytest.raises(CompleteSplatError, match=r"scenes?\.json: not a JSON file"):
+        read(tmp_path)
+
+
+def test_a_scene_of_thousands_of_layers_is_shown_as_one(tmp_path):
+    samples, _ = read_scene(prediction(tmp_path, image_size=[1, 1]))
+    assert samples[0].layers == 3  # as many Gaussians as SCENE has
+    write_ply(tmp_path / "sample_00.ply", SCENE[torch.zeros(17).long()])
+    samples, _ = read_scene(tmp_path)
+    assert samples[0].layers == 1
+
+
+def spz(system: int) -> bytes:
+    """Return SCENE as version 4 with the extension that names the axes of the stored values."""
+    content = bytearray(FILES["v4.spz"])
+    content[14] |= 2
+    content[16:20] = (32 + 20 + 12).to_bytes(4, "little")
+    unknown = struct.pack("<II12s", 0xDEAD0001, 12, b"")
+    return bytes(content[:32] + unknown + struct.pack("<III", 0xADBE0003, 4, system) + content[32:])
+
+
+# Signs that turn stored axes to ours: +x right, +y down, +z forward.
+AXES = {0: (1, -1, -1), 1: (-1, 1, -1), 3: (-1, -1, -1), 4: (1, -1, -1), 6: (1, 1, 1), 7: (-1, -1, 1)}
+
+
+@pytest.mark.parametrize("system", AXES)
+def test_the_axes_that_an_spz_names_are_turned_to_ours(tmp_path, system):
+    (tmp_path / "a.spz").write_bytes(spz(system))
+    read, flip = read_gaussians(tmp_path / "a.spz"), torch.tensor(AXES[system]) * torch.tensor([1.0, -1, -1])
+    assert torch.allclose(read.means, SCENE.means * flip, atol=1 / 8192)
+    assert torch.allclose(read.covariances(), flip[:, None] * SCENE.covariances() * flip, atol=0.01)
+
+
+def test_other_axes_are_refused_and_lost_harmonics_named(tmp_path, caplog):
+    (tmp_path / "a.spz").write_bytes(spz(9))
+    with pytest.raises(CompleteSplatError, match=r"a\.spz: .*coordinate system 9"):
+        read_gaussians(tmp_path / "a.spz")
+    (tmp_path / "b.spz").write_bytes(FILES["harmonics.spz"])
+    assert read_gaussians(tmp_path / "b.spz").count == 3
+    assert caplog.messages == [
+        f"{tmp_path / 'b.spz'}: harmonics of degree 1 are left out: one colour for all directions"
+    ]
+
+
+COMPRESSED = b"ply\nformat binary_little_endian 1.0\nelement chunk 0\nproperty float min_x\nelement vertex 0\n"
+COMPRESSED += b"property uint packed_position\nend_header\n"
+PACKED = {
+    "a.sog": (b"PK\3\4", "SOG"),
+    "a.KSPLAT": (b"\0\1", "KSPLAT"),
+    "a.ply": (COMPRESSED, "SuperSplat's compressed PLY"),
+}
+
+
+@pytest.mark.parametrize("name", PACKED)
+def test_packed_formats_are_named_with_the_program_that_unpacks_them_or_read_through_it(tmp_path, monkeypatch, name):
+    content, kind = PACKED[name]
+    path = tmp_path / name
+    path.write_bytes(content)
+    monkeypatch.setenv("PATH", "/usr/bin:/bin")
+    reason = f"{name}: {kind}; `splat-transform {name} x.ply` unpacks it, or install splat-transform"
+    with pytest.raises(CompleteSplatError, match=reason):
+        read_gaussians(path)
+    write_ply(tmp_path / "truth.ply", SCENE)
+    script = f'for last; do :; done\ncp {tmp_path / "truth.ply"} "$last"\n'
+    fake_converter.install(tmp_path / "bin", "splat-transform", script)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:/usr/bin:/bin")
+    assert torch.equal(read_gaussians(path).means, SCENE.means)
+
+
+def test_read_ply_names_the_compressed_format(tmp_path):
+    (tmp_path / "a.ply").write_bytes(COMPRESSED)
+    with pytest.raises(
+        CompleteSplatError, match=r"a\.ply: SuperSplat's compressed PLY; `splat-transform FILE x\.ply` un"
+    ):
+        read_ply(tmp_path / "a.ply")
+
+
+def splat(path: Path, factor: float = 1.0, broken: int = 0) -> None:
+    """Write 50 Gaussians as `.splat`, the first of them not finite."""
+    records = np.zeros(50, RECORD)
+    records["means"], records["scales"], records["colors"] = np.random.default_rng(0).normal(size=(50, 3)), 0.1, 200
+    records["quaternions"] = 200
+    records["means"] *= factor
+    records["means"][:broken] = np.nan
+    path.write_bytes(records.tobytes())
+
+
+def test_gaussians_that_are_not_finite_are_left_out_and_counted(tmp_path, caplog):
+    caplog.set_level(logging.WARNING)
+    write_ply(tmp_path / "a.ply", SCENE)
+    content = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(content[:-4] + np.float32(np.nan).tobytes())
+    assert torch.equal(read_ply(tmp_path / "a.ply").means, SCENE.means[:2])
+    assert caplog.messages[-1].startswith(f"{tmp_path / 'a.ply'}: left out 1 of 3 Gaussians")
+    splat(tmp_path / "b.splat", broken=7)
+    assert read_gaussians(tmp_path / "b.splat").count == 43
+    assert caplog.messages[-1].startswith(f"{tmp_path / 'b.splat'}: left out 7 of 50 Gaussians")
+
+
+def test_gaussians_farther_than_renderers_can_square_are_refused(tmp_path):
+    splat(tmp_path / "a.splat", factor=1e17)
+    samples, _ = read_scene(tmp_path / "a.splat")
+    assert isinstance(samples[0].reference, Cameras)
+    assert samples[0].pivot().isfinite().all()
+    splat(tmp_path / "b.splat", factor=1e20)
+    with pytest.raises(CompleteSplatError, match=r"b\.splat: all 50 Gaussians are broken"):
+        read_scene(tmp_path / "b.splat")
