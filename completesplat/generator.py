@@ -243,6 +243,6 @@ def _checked(architecture: dict[str, Any], training: Mapping[str, object] | None
 def _loaded(architecture: dict[str, Any], tensors: Mapping[str, Tensor]) -> SceneModel:
     model = (OneAnswer if "network" in architecture else CompleteSplat)(**architecture)
     if (difference := mismatch(model.state_dict(), tensors)) is not None:
-        raise WeightsError(difference)
+        raise ValueError(difference)
     model.load_state_dict(tensors)
     return model

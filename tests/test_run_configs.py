@@ -155,7 +155,7 @@ def test_settings_of_the_working_folder_do_not_widen_what_a_run_may_name(run, tm
 
 
 def test_what_the_user_changes_may_name_anything_and_what_the_package_offers_needs_no_trust(run, elsewhere):
-    result = configuration(run, "model.loss=null", "model.rasterizer._target_=anything.At", "data.root=${oc.env:HOME}")
+    result = configuration(run, "model.rasterizer._target_=anything.At", "data.root=${oc.env:HOME}")
     assert result.model.rasterizer._target_ == "anything.At"
     assert result.data.root == os.environ["HOME"]
     name(run, {"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.1}, "model.optimizer")

@@ -42,7 +42,7 @@ class Trainer(TypedDict):
     gradient_clip_val: Annotated[float, Range(0)] | None
 
 
-class Evaluation(TypedDict):
+class EvaluationSettings(TypedDict):
     """Settings of a protocol."""
 
     precision: Precision
@@ -52,7 +52,7 @@ class Fit(TypedDict):
     """Settings of `completesplat fit`."""
 
     trainer: Trainer
-    evaluation: Evaluation
+    evaluation: EvaluationSettings
     seed: Annotated[int, Range(0, 2**32 - 1)]
     ckpt_path: str | None
     test: bool
@@ -127,7 +127,7 @@ class ModelSettings(RunSettings):
 class Test(ModelSettings):
     """Settings of `completesplat test`."""
 
-    evaluation: Evaluation
+    evaluation: EvaluationSettings
     scenes: str | None
     frame: Annotated[str, OneOf(("opencv", "opengl"))]
     align: Annotated[str, OneOf(("none", "scale"))]

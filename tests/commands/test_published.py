@@ -12,7 +12,7 @@ from completesplat.baselines.splatter_image.model import PublishedOneAnswer
 from completesplat.commands.trained import Trained
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
-from completesplat.gaussians import Gaussians
+from completesplat.gaussians import DirectionalGaussians
 from completesplat.generator import CompleteSplat
 
 
@@ -63,8 +63,9 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
     model = CompleteSplat.from_pretrained(weights)
     assert isinstance(model, PublishedOneAnswer)
     scene = model(image, color_fits=2)[0]
-    assert type(scene) is Gaussians  # which every rasterizer takes
-    torch.testing.assert_close(read_ply(folder / "sample_00.ply").colors, scene.colors, atol=1e-5, rtol=0)
+    stored, center = read_ply(folder / "sample_00.ply"), torch.zeros(3)
+    assert isinstance(stored, DirectionalGaussians)
+    torch.testing.assert_close(stored.seen_from(center).colors, scene.seen_from(center).colors, atol=1e-4, rtol=0)
     for settings, message in (
         (["fov=40"], "image as of 49 degrees"),
         (["sampler=dpm20"], "these weights draw no samples: leave out sampler"),

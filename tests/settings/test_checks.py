@@ -102,7 +102,7 @@ def test_a_wrong_value_is_reported_under_the_setting_that_the_user_gave():
             "fit -m loss=stge1,stage2",
             r"no loss 'stge1': there are perceptual, splats, stage1, stage2; did you mean stage1",
         ),
-        ("fit data=null", r"data=null: choose one of capture, co3d_category, "),
+        ("fit data=null", r"data=null: choose one of capture, captures, co3d_category, "),
         ("fit toy_var", r"toy_var: no setting, which are given as key=value; did you mean experiment=toy_var\?"),
         ("data chck", r"no task of completesplat data 'chck': there are check, .*; did you mean check\?"),
         ("predict sampels=1", r"no setting 'sampels' of completesplat predict; did you mean samples\?"),
