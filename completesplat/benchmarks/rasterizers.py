@@ -11,14 +11,7 @@ from hydra.utils import get_class, instantiate
 from rich.console import Console
 
 from completesplat.benchmarks.measuring import Row, report
-from completesplat.benchmarks.workloads import (
-    OPACITIES,
-    Backend,
-    counted_work,
-    machine_peaks,
-    rendering_milliseconds,
-    splatter_scene,
-)
+from completesplat.benchmarks.workloads import OPACITIES, Backend, rendering_milliseconds, splatter_scene
 from completesplat.commands import quieten
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
@@ -52,7 +45,7 @@ def run(
         working, absent = working_backends(backends, shared)
         quieten()
         tick = lambda text: status.update(f"timing {text}")  # noqa: E731
-        rows = speed_rows(working, sizes, views, repeats, shared, tick)
+        rows = speed_rows(working, sizes, views, repeats, tick)
     report(out / "rasterizers.json", {"not_measured": absent, "rows": rows}, {"Speed": rows})
 
 
@@ -79,15 +72,10 @@ def working_backends(names: Sequence[str], constants: RenderingConstants) -> tup
 
 
 def speed_rows(
-    backends: Sequence[Backend], sizes: Sequence[int], views: Sequence[int], repeats: int,
-    constants: RenderingConstants, tick: Tick,
-) -> list[Row]:  # fmt: skip
-    """Return a row for each backend and workload (size, number of views, kind of opacities).
-
-    `share_of_peak` is that of the limit that `tiled` is nearer to: the machine's arithmetic or its memory bandwidth.
-    """
+    backends: Sequence[Backend], sizes: Sequence[int], views: Sequence[int], repeats: int, tick: Tick
+) -> list[Row]:
+    """Return a row for each backend and workload (size, number of views, kind of opacities)."""
     rows: list[Row] = []
-    peaks = machine_peaks()
     for size, number, opacity in product(sizes, views, OPACITIES):
         tick(f"{size} x {size}, {number} views, {opacity}")
         gaussians, cameras = splatter_scene(size, number, opacity)
@@ -97,12 +85,6 @@ def speed_rows(
             rows.append({"backend": name} | workload | figures)
             if "tiled" in results:
                 rows[-1]["times_tiled"] = figures["forward_backward_ms"] / results["tiled"]["forward_backward_ms"]
-            if name == "tiled":
-                work = counted_work(gaussians, cameras, constants)
-                ms = figures["forward_backward_ms"]
-                shares = (amount / ms / peak for amount, peak in zip(work, peaks, strict=True))
-                share_of_peak, limit = max(zip(shares, ("compute", "memory"), strict=True))
-                rows[-1] |= {"share_of_peak": share_of_peak, "limit": limit}
     return rows
 
 

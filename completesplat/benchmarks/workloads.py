@@ -6,28 +6,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from completesplat.benchmarks.measuring import milliseconds
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unproject
-from completesplat.rasterizers import Rasterizer, RenderingConstants
-from completesplat.rasterizers.kernels.array_layout import BLOCK
-from completesplat.rasterizers.kernels.drawing import Drawing, Parameters
-from completesplat.rasterizers.tiled import pack_cameras
+from completesplat.rasterizers import Rasterizer
 from completesplat.training.stage import now
 from completesplat.training.steps import DISTANCE, FOV_DEGREES, orbit
 
 OPACITIES = ("trained", "initial")
 MOST_REFERENCE_PAIRS = 2**28  # of a Gaussian and a pixel; the reference takes a second for a tenth of them
-# Work of `tiled`'s kernels for both passes, counted in their sources. A sum, product, quotient or root is a FLOP.
-PIXEL_FLOPS = 26 + 50  # of a Gaussian at a pixel: forward and backward, in float32
-VISIBLE_FLOPS, REACHED_FLOPS = 2 * 136, 2 * 352  # projection and its gradient; in float64, which counts twice
-# Bytes of arrays over Gaussians, which exceed the caches if there are many; images stay in a cache. For each Gaussian:
-SCENE_BYTES = 2 * 56 + 68 + 32  # its parameters read and gradients written, `prepared` written, shape and opacity read
-VIEW_BYTES = 68  # `prepared` read
-BAND_BYTES = 4 + 4  # a place written and read
-VISIBLE_BYTES = 5 * 64 + 128  # its record written, moved and read twice; its depth sorted
-REACHED_BYTES = 2 * 64 + 4 + 48  # its row of gradients written and read, its place written, mean and root read
-PEAK_SIDE, PEAK_COPY = 1536, 2**25  # of a matrix, and floats
 
 
 class Backend(NamedTuple):
@@ -88,29 +74,6 @@ def rendering_milliseconds(rasterizer: Rasterizer, gaussians: Gaussians, cameras
     middle = now()
     torch.autograd.backward([rendering.color, rendering.depth, rendering.alpha], ones)
     return (middle - start) * 1e3, (now() - start) * 1e3
-
-
-def counted_work(gaussians: Gaussians, cameras: Cameras, constants: RenderingConstants) -> tuple[int, int]:
-    """Return the FLOPs and the bytes that `tiled` takes for both passes."""
-    parameters = Parameters(*(tensor.contiguous().numpy() for tensor in vars(gaussians).values()))
-    packed = pack_cameras(cameras, constants.frustum_margin)
-    drawing = Drawing(parameters, packed, cameras.image_size, constants, keep=True)
-    drawing.draw()
-    scenes, views = packed.shape[:2]
-    drawn, reached = (int(count) for count in drawing.counts.sum(0))
-    visible = int(drawing.visible_counts.sum())
-    flops = PIXEL_FLOPS * BLOCK**2 * drawn + VISIBLE_FLOPS * visible + REACHED_FLOPS * reached
-    one_view = VIEW_BYTES + BAND_BYTES * len(drawing.bands)
-    everywhere = scenes * gaussians.count * (SCENE_BYTES + views * one_view)
-    return flops, everywhere + VISIBLE_BYTES * visible + REACHED_BYTES * reached
-
-
-def machine_peaks() -> tuple[float, float]:
-    """Return the float32 FLOPs of a matrix product and the bytes of a copy (read and written) in a ms."""
-    matrix, floats = torch.ones(PEAK_SIDE, PEAK_SIDE), torch.ones(PEAK_COPY)
-    product, copy = torch.empty_like(matrix), torch.empty_like(floats)
-    flops = 2 * PEAK_SIDE**3 / min(milliseconds(lambda: torch.mm(matrix, matrix, out=product)) for _ in range(5))
-    return flops, 2 * 4 * PEAK_COPY / min(milliseconds(lambda: copy.copy_(floats)) for _ in range(5))
 
 
 def _ones(cameras: Cameras, channels: int) -> Tensor:

@@ -64,7 +64,6 @@ class Clock:
         self.turns: list[str] = []
         for module in (rasterizers, stage):
             monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: self.now))
-        monkeypatch.setattr(rasterizers, "machine_peaks", lambda: (1.0, 1.0))
 
     def backend(self, name: str, *seconds: float) -> Backend:
         """Return a backend that takes these times in turn, and then the last one each time."""
@@ -91,7 +90,7 @@ def test_there_is_one_row_for_each_backend_and_workload(clock: Clock, monkeypatc
     messages: list[str] = []
     milliseconds = {"tiled": 250, "other": 500, "reference": 750}
     backends = [clock.backend(name, time / 1000) for name, time in milliseconds.items()]
-    rows = speed_rows(backends, [8, 12], [1, 3], 2, RenderingConstants(), messages.append)
+    rows = speed_rows(backends, [8, 12], [1, 3], 2, messages.append)
     works = [(size, 2 * size**2, views, o) for size in (8, 12) for views in (1, 3) for o in ("trained", "initial")]
     keys = [tuple(row[key] for key in ("size", "gaussians", "views", "opacity", "backend")) for row in rows]
     assert keys == [
@@ -120,24 +119,13 @@ def test_backends_take_turns_and_the_time_is_the_median_without_the_first_run(cl
 
 def test_backends_are_compared_with_tiled_on_the_same_workload(clock: Clock) -> None:
     backends = [clock.backend(name, seconds) for name, seconds in {"reference": 0.5, "tiled": 0.25}.items()]
-    assert [row["times_tiled"] for row in speed_rows(backends, [4], [1], 1, RenderingConstants(), print)] == [
+    assert [row["times_tiled"] for row in speed_rows(backends, [4], [1], 1, print)] == [
         2,
         1,
         2,
         1,
     ]
-    assert not any("times_tiled" in row for row in speed_rows(backends[:1], [4], [1], 1, RenderingConstants(), print))
-
-
-def test_the_share_of_peak_is_that_of_the_nearer_limit(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only `tiled` has one, because its work is counted."""
-    backends = [clock.backend("reference", 0.5), clock.backend("tiled", 0.25)]
-    monkeypatch.setattr(rasterizers, "counted_work", lambda *_: (1000, 600))  # in 250 ms
-    for peaks, expected in (((8.0, 4.0), (0.6, "memory")), ((8.0, 8.0), (0.5, "compute"))):
-        monkeypatch.setattr(rasterizers, "machine_peaks", lambda peaks=peaks: peaks)
-        first, second, *_ = speed_rows(backends, [4], [1], 1, RenderingConstants(), print)
-        assert "share_of_peak" not in first
-        assert (second["share_of_peak"], second["limit"]) == (pytest.approx(expected[0]), expected[1])
+    assert not any("times_tiled" in row for row in speed_rows(backends[:1], [4], [1], 1, print))
 
 
 QUICK = ["bench", "rasterizers", "sizes=[16]", "views=[1]", "repeats=1"]

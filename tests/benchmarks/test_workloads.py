@@ -8,7 +8,6 @@ import pytest
 import torch
 from rasterizer_scenes import render_with_gradients
 
-from completesplat.benchmarks import workloads
 from completesplat.benchmarks.workloads import (
     OPACITIES,
     rendering_milliseconds,
@@ -16,7 +15,7 @@ from completesplat.benchmarks.workloads import (
 )
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
-from completesplat.rasterizers import Rendering, RenderingConstants
+from completesplat.rasterizers import Rendering
 from completesplat.rasterizers.kernels import drawing
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.training import stage, steps
@@ -92,35 +91,3 @@ def test_without_proc_the_work_is_done_and_its_memory_unknown(monkeypatch: pytes
     calls = []
     assert peak_megabytes(lambda: calls.append(1), CPU) is None
     assert calls == [1]
-
-
-def test_counted_work_is_that_of_a_count_by_hand() -> None:
-    """Of three large opaque Gaussians two use up the light; a small one is before them, one behind the camera."""
-    size, views = 8, 2  # four blocks, so two bands of block rows in each of two views
-
-    def rows(*values: float) -> torch.Tensor:
-        return torch.tensor([values])
-
-    gaussians = Gaussians(
-        means=torch.tensor([[[0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.0, 0.0, 4.0], [0.5, 0.5, 1.0], [0.0, 0.0, -1.0]]]),
-        quaternions=rows(1.0, 0, 0, 0).expand(1, 5, 4),
-        scales=rows(50.0, 50, 50, 0.001, 1)[..., None].expand(1, 5, 3),
-        opacities=rows(1.0, 1, 1, 0.5, 1),
-        colors=torch.full((1, 5, 3), 0.5),
-    )
-    intrinsics = torch.tensor([[4.0, 0, 4], [0, 4, 4], [0, 0, 1]]).expand(1, views, 3, 3)
-    cameras = Cameras(torch.eye(4).expand(1, views, 4, 4), intrinsics, (size, size))
-    flops, moved = workloads.counted_work(gaussians, cameras, RenderingConstants())
-    # In each view: one block with the small Gaussian, and four with each of the first two large ones. The third is
-    # visible but reaches no pixel. The large ones reach both bands.
-    drawn, visible, reached = views * (1 + 4 + 4), views * 4, views * (1 + 2 * 2)
-    assert flops == 16 * drawn * (26 + 50) + 2 * 136 * visible + 2 * 352 * reached
-    assert moved == 5 * (212 + views * (68 + 2 * 8)) + 448 * visible + 180 * reached
-
-
-def test_the_peaks_are_those_of_a_product_and_a_copy(monkeypatch: pytest.MonkeyPatch) -> None:
-    times = iter([4.0, 2.0, 3.0, 5.0, 6.0, 0.5, 0.25, 1.0, 2.0, 3.0])
-    monkeypatch.setattr(workloads, "milliseconds", lambda work: (work(), next(times))[1])
-    monkeypatch.setattr(workloads, "PEAK_SIDE", 10)
-    monkeypatch.setattr(workloads, "PEAK_COPY", 100)
-    assert workloads.machine_peaks() == (2000 / 2.0, 800 / 0.25)

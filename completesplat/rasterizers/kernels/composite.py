@@ -67,7 +67,7 @@ def composite(
     color: Array, depth: Array, alpha: Array,
     grad_color: Array | None, grad_depth: Array | None, grad_alpha: Array | None,
     gradients: Array | None, places: Array | None,
-) -> tuple[int, int]:  # fmt: skip
+) -> None:  # fmt: skip
     """Draw the block rows first_row..end_row - 1 of one view, or sum every Gaussian's gradients over them.
 
     numba compiles two versions, each without the code that only the other needs.
@@ -80,11 +80,8 @@ def composite(
         color, depth, alpha: the whole images [3 height width], [height width] twice; the band is written or read.
         grad_color, grad_depth, grad_alpha: gradients of the loss with respect to these images; None to draw.
         gradients, places: [gaussian + 1 16] and [lane], see `array_layout`.
-
-    Returns:
-        The number of times that a block was drawn to, and the number of Gaussians that reached one.
     """
-    drawn, written = 0, 0
+    written = 0
     height, width = alpha.shape
     columns = (width + BLOCK - 1) // BLOCK
     integers = records.view(np.int32)
@@ -123,7 +120,6 @@ def composite(
                 while mask != 0:
                     column = (word << WORD_SHIFT) + lowest_bit(mask)
                     mask &= mask - BIT
-                    drawn += 1
                     offset = ((row - first_row) * columns + column) * (STATE_VECTORS * LANES)
                     u = u_row + column_offset(records, j, column)
                     value, opacity = alpha_at(exponent_row - u * u, log2_min_alpha, max_alpha)
@@ -161,7 +157,6 @@ def composite(
             places[integers[j, layout.INDEX]] = written
     if gradients is None:
         write_images(first_row, end_row, columns, state, color, depth, alpha)
-    return drawn, written
 
 
 @helper

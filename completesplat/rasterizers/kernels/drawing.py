@@ -181,8 +181,6 @@ class Drawing:
         count = min(rows, -(-FEWEST_TASKS // max(1, self.scenes * self.views)))
         # First and end block row of each band of a view.
         self.bands = [(i * rows // count, (i + 1) * rows // count) for i in range(count)]
-        # For each band of a view: how often a block was drawn to, and the number of Gaussians that reached one.
-        self.counts = np.zeros((self.held * len(self.bands), 2), np.int64)
 
     def draw(self) -> Images:
         """Project and composite every view."""
@@ -225,7 +223,7 @@ class Drawing:
     def _composite(self, images: Images, start: int, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
         arrays = (*images.view(*divmod(start + slot, self.views)), None, None, None, None, None)
-        self.counts[task] = self._run(slot, band, arrays)
+        self._run(slot, band, arrays)
 
     def _composite_backward(self, images: Images, gradients: Images, sums: Sums, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
@@ -233,14 +231,14 @@ class Drawing:
         arrays = (*images.view(scene, view), *gradients.view(scene, view))
         self._run(slot, band, (*arrays, *(x[scene, view, band] for x in sums)))
 
-    def _run(self, slot: int, band: int, arrays: tuple[np.ndarray | None, ...]) -> tuple[int, int]:
+    def _run(self, slot: int, band: int, arrays: tuple[np.ndarray | None, ...]) -> None:
         first, end = self.bands[band]
         columns = -(-self.width // layout.BLOCK)
         state = empty(((end - first) * columns * STATE_VECTORS * LANES,))
         open_words = empty((end - first, -(-columns // WORD_BITS)), np.uint64)
         spans = empty((2 * (end - first + LANES),), np.int32)
         count = self.visible_counts[slot]
-        return composite(self.records[slot], count, first, end, *self.thresholds, state, open_words, spans, *arrays)
+        composite(self.records[slot], count, first, end, *self.thresholds, state, open_words, spans, *arrays)
 
     def _project_backward(self, result: Parameters, sums: Sums, task: int) -> None:
         scene, chunk = divmod(task, -(-self.count // CHUNK))
