@@ -195,9 +195,12 @@ class SceneModel(nn.Module):
         )
         if depth <= 0:
             raise CompleteSplatError("the cameras do not look at one place: where the scene lies cannot be told")
-        near, far = self.depth_range.tolist()
-        share = self.parameterization.first_depth
-        return cameras.scale_world(torch.tensor((near + share * (far - near)) / depth))
+        return cameras.scale_world(torch.tensor(self.middle_depth(self.depth_range) / depth))
+
+    def middle_depth(self, depth_range: Float[Tensor, "2"]) -> float:
+        """Return the depth in a range at which Gaussians start in training: for objects, that of their centre."""
+        near, far = depth_range.tolist()
+        return float(near + self.parameterization.first_depth * (far - near))
 
     def read(self, image: ImageLike, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
         """Read an image at the model's size (`read_photograph`); an unknown field of view is the training set's.

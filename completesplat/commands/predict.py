@@ -229,6 +229,8 @@ def _predict(
         recorded["background"] = REMOVE
     visible_image = photograph.image if visible is None else photograph.image * visible
     camera = model.camera(photograph)
+    if model.background is not None:  # images of objects, whose centre is in the middle of the depth range
+        wanted = replace(wanted, pivot_depth=model.middle_depth(model.depth_range_of(photograph)))
     write_prediction(folder, visible_image, scenes, camera, rasterizer, model.up, wanted, recorded, on_sample)
 
 

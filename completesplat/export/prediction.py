@@ -64,6 +64,7 @@ class Wanted:
         formats: scene formats, from `completesplat.export.formats.FORMATS`; some need the converter.
         videos: camera paths, from `completesplat.geometry.trajectories.PATHS`; each video has `frames` frames.
         background: grey value behind the scene.
+        pivot_depth: depth on the optical axis around which orbits turn; None: `seen_center` finds it.
         maps: whether to write depth, normals and opacity of the reference view (`write_maps`).
         screen_space_dilation: whether to store Gaussians `with_screen_space_dilation`.
     """
@@ -72,6 +73,7 @@ class Wanted:
     videos: Sequence[str] = ("orbit",)
     frames: int = 48
     background: float = 0.5
+    pivot_depth: float | None = None
     maps: bool = False
     converter: SplatTransform | None = None
     screen_space_dilation: bool = True
@@ -226,7 +228,7 @@ def write_scene(
     Returns:
         Views around the scene, the first view's depth, and file names by purpose.
     """
-    pivot = seen_center(rasterizer, scene, reference)
+    pivot = seen_center(rasterizer, scene, reference, wanted.pivot_depth)
     dilated = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
     stored, camera = units.stored(dilated, reference)
     view = PageView(camera, units.points(pivot), up, wanted.background)
@@ -241,18 +243,23 @@ def write_scene(
 
 
 @torch.no_grad()
-def seen_center(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras) -> Float[Tensor, "3"]:
+def seen_center(
+    rasterizer: Rasterizer, scene: Gaussians, reference: Cameras, known_depth: float | None = None
+) -> Float[Tensor, "3"]:
     """Return the pivot of orbits: the point on the optical axis at the median depth of the image's central ninth.
 
-    If nothing is seen in the central ninth, the median depth of all Gaussians is used.
+    If nothing is seen in the central ninth, the median depth of all Gaussians is used. A known depth replaces both.
     """
+    forward = reference.camera_to_world[:3, 2]
+    if known_depth is not None:
+        return reference.camera_to_world[:3, 3] + forward * known_depth
     depth = rasterizer(scene[None], reference[None][None]).expected_depth()[0, 0, 0]
     height, width = depth.shape
     center = depth[height // 3 : height - height // 3, width // 3 : width - width // 3]
     seen = center[center > 0]
     if len(seen) == 0:
         seen = transform_points(reference.world_to_camera, scene.means)[:, 2]
-    return reference.camera_to_world[:3, 3] + reference.camera_to_world[:3, 2] * seen.median()
+    return reference.camera_to_world[:3, 3] + forward * seen.median()
 
 
 def contact_sheet(
