@@ -1,6 +1,7 @@
 """Real spherical harmonics of degree 1 and 2, in the order and with the signs of 3D Gaussian Splatting.
 
-A colour seen along the unit vector d is 0.5 + C0 c_0 + sum_k Y_k(d) c_k (Kerbl et al. 2023, `utils/sh_utils.py`).
+Along the unit vector d, from the camera to the Gaussian, the colour 0.5 + C0 c_0 + sum_k Y_k(d) c_k is seen
+(Kerbl et al. 2023, `utils/sh_utils.py`).
 """
 
 import math
@@ -44,7 +45,8 @@ def rotated(
 ) -> Float[Tensor, "*batch gaussian coefficient 3"]:
     """Return the coefficients of the same colours after a rotation: seen along R d as they were along d before.
 
-    Harmonics of one degree turn among themselves, so the change of coefficients follows exactly from enough directions.
+    A rotation maps the harmonics of one degree to combinations of themselves, so a least-squares fit over enough
+    directions is exact.
     """
     degree = degree_of(values.shape[-2])
     directions, inverse = _fit(degree)

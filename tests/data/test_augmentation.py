@@ -232,7 +232,7 @@ def test_a_jittered_camera_sees_what_the_reference_image_shows_and_the_targets_s
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"), [({"zoom": (1.2, 0.8)}, "smallest"), ({"roll": -1.0}, "roll"), ({"shift": 0.7}, "shift")]
+    ("settings", "message"), [({"zoom": (1.2, 0.8)}, "smaller"), ({"roll": -1.0}, "roll"), ({"shift": 0.7}, "shift")]
 )
 def test_camera_jitter_refuses_impossible_ranges(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(CompleteSplatError, match=message):

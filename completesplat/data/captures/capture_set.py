@@ -63,8 +63,8 @@ def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
 class CaptureSetDataModule(ObjectDataModule):
     """Scenes of many captures; all frames of a capture belong to the same split, as all captures of an object do.
 
-    The captures are the folders below `root`, at any depth, that `read_capture` can read. A capture's name is its path
-    below `root`, and its object is the first folder of that path.
+    The captures are the folders below `root`, at any depth, that hold `transforms.json` or `sparse`. A capture's name
+    is its path below `root`, and its object is the first folder of that path.
 
     Args:
         root: folder of the captures, or prepared captures.

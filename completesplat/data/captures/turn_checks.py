@@ -32,9 +32,9 @@ class Turn(NamedTuple):
     """Cameras of one turn and findings about its photos.
 
     Attributes:
-        cameras: [photo], as they are if the surface in the middle of the photos moves left; `mirror` gives the others.
-        differences: mean absolute differences (0 to 255) of equally bright photos: the last and the first, neighbours,
-            and half a turn apart.
+        cameras: [photo], for a surface that moves left; if it moves right, `mirror` gives them.
+        differences: mean absolute differences (0 to 255) of photos with the same mean brightness: the last and the
+            first, neighbours, and half a turn apart.
         flow: 1 if the surface moves left, -1 if it moves right, 0 if that cannot be told.
         overlap: of the masks with their visual hull; see `hull_overlap`.
         tiles: some of the photos, grey outside of their masks.
@@ -96,7 +96,7 @@ def direction_of_flow(photos: Photos, masks: Masks, angles: Float[np.ndarray, " 
 def hull_overlap(masks: Masks, cameras: Cameras) -> float:
     """Return the mean overlap (intersection over union) of the masks with the silhouettes of their visual hull.
 
-    The hull is carved from a cube of voxels around the origin, which is as large as the images see there.
+    The hull is carved from a cube of voxels around the origin. The cube is as wide as the field of view there.
     """
     views = torch.arange(min(len(masks), MOST_VIEWS)) * len(masks) // min(len(masks), MOST_VIEWS)
     small = interpolate(masks[views], size=(HULL, HULL), mode="area")

@@ -1,6 +1,7 @@
 """Import of turntables: a folder of photos that are one turn of an object, or a data set of such folders.
 
-Cameras lie on a circle around the origin at one elevation, with z up and the turning axis in the images' middle.
+Cameras lie on a circle around the origin at one elevation, with z up and the turning axis in the images' middle. The
+object is 2 units high.
 """
 
 import json
@@ -52,8 +53,8 @@ logger = logging.getLogger(__name__)
 FEWEST_PHOTOS = 8
 MOST_SIDE = 512  # pixels; larger photos are reduced
 WHITE = 245  # least value of a white background's pixels, in every channel
-FULL = 0.98  # share of a photo from which on a mask fills it
-LEAST_FACTOR, LARGEST_FACTOR = 0.8, 1.25  # of the scale that undoes a crop
+FULL = 0.98  # a mask that covers more than this share of the photo is refused
+LEAST_FACTOR, LARGEST_FACTOR = 0.8, 1.25  # bounds of the scale that undoes a crop
 MARGIN = 1.1  # side of the images, in units of the object's largest side
 LOW_OVERLAP = 0.85  # of the masks with their visual hull; a turn with less is named
 
@@ -74,7 +75,7 @@ class TurntableSettings(TypedDict):
 
 
 def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> None:
-    """Write each turn below `folder` as a capture below `out`, all or none, with `splits.json` and `sheet.png`.
+    """Write each usable turn below `folder` as a capture below `out`, with `splits.json` and `sheet.png`.
 
     A turn has the name of its path below `folder`, or of `folder` itself if its photos are there. A turn that cannot be
     used is named and left out.
@@ -118,7 +119,7 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
 
 
 def _folders_of_photos(root: Path) -> dict[str, Path]:
-    """Return the folders at and below `root` that have photos, but not those within such a folder, by name."""
+    """Return, by name, the outermost folders at or below `root` that hold photos."""
     if not root.is_dir():
         raise MissingFile("no such folder", str(root))
     folders: dict[str, Path] = {}
@@ -228,7 +229,7 @@ def _squared(photos: Sequence[Photo], height: str | None) -> tuple[list[Photo], 
     factors = np.ones(len(boxes))
     if height == "ring":
         factors = (np.median(heights) / heights).clip(LEAST_FACTOR, LARGEST_FACTOR)
-    else:  # One box around all masks is symmetric about the axis of a full turn.
+    else:  # Over a full turn, the box around all masks is centred on the axis.
         boxes[:] = np.concatenate([boxes[:, :2].min(0), boxes[:, 2:].max(0)])
     sizes, centers = boxes[:, 2:] - boxes[:, :2], (boxes[:, :2] + boxes[:, 2:]) / 2
     side = math.ceil(MARGIN * (factors * sizes.max(1)).max())
@@ -256,7 +257,7 @@ def _write_transforms(folder: Path, cameras: Cameras) -> None:
 
 
 def _report(turns: Mapping[str, Turn]) -> int:
-    """Log a summary of all turns and the names of odd ones; return by how many more the flow goes left than right."""
+    """Log a summary of all turns and the names of odd ones; return how many more turns flow left than right."""
     left, right, unclear = ([name for name, turn in turns.items() if turn.flow == flow] for flow in (1, -1, 0))
     ends, neighbours, opposite = np.median([turn.differences for turn in turns.values()], axis=0)
     overlap = np.median([turn.overlap for turn in turns.values()])

@@ -149,10 +149,10 @@ class BoxMasks:
 
 @dataclass(frozen=True)
 class CameraJitter:
-    """Random turns, zooms and shifts of the reference image, with its camera, for photos that are not level.
+    """Random roll, focal length and principal point of the reference camera, for photos that are not level.
 
-    The image that a turned, zoomed and shifted camera would see is resampled from the reference image; colours at the
-    border continue outside. The targets stay as they are.
+    The image that such a camera would see is resampled from the reference image. Outside of it, the border
+    is repeated. The target images do not change.
 
     Args:
         roll: the angle about the optical axis is drawn from [-roll, roll] degrees.
@@ -170,10 +170,10 @@ class CameraJitter:
     def __post_init__(self) -> None:
         _check("data.camera_jitter", self)
         if self.zoom[0] > self.zoom[1]:
-            raise CompleteSplatError(f"data.camera_jitter.zoom={list(self.zoom)}: the first number is the smallest")
+            raise CompleteSplatError(f"data.camera_jitter.zoom={list(self.zoom)}: give the smaller number first")
 
     def __call__(self, scene: SceneBatch, rng: np.random.Generator) -> SceneBatch:
-        """Return the scene with another reference view, whose camera's frame is again the world frame."""
+        """Return the scene with the jittered reference view, whose camera's frame becomes the world frame."""
         angle = np.deg2rad(rng.uniform(-self.roll, self.roll))
         zoom = np.exp(rng.uniform(*np.log(self.zoom)))
         height, width = scene.reference.cameras.image_size
@@ -204,7 +204,7 @@ def augment(
     horizontal_flip: bool,
     camera_jitter: CameraJitter | None = None,
 ) -> SceneBatch:
-    """Augment one scene (without batch axis): jitter all views, flip with probability 0.5, draw boxes into `visible`.
+    """Augment one scene (without batch axis): jitter colours and camera, flip with probability 0.5, hide boxes.
 
     Jitter, flip, boxes and camera draw from four generators, spawned from `rng` in this order. So each is independent
     of whether the others are on, and of what was drawn from `rng` before. Nothing is drawn from `rng` itself.
