@@ -29,14 +29,15 @@ def test_they_are_small_and_complete():
         assert {"content", "picture_mean", "picture_std"} <= facts.keys()
 
 
-def test_couches_agree_with_the_photo_in_front_and_differ_behind():
-    """The couch in the package, which training never saw: four samples, from the front and from behind."""
-    model = CompleteSplat.from_pretrained(COUCHES)
-    photo = model.read(SHIPPED / COUCHES / "held_out.jpg")
+@pytest.mark.parametrize(("name", "background"), [(COUCHES, 0.5), (FRUITS, 1.0)])
+def test_samples_agree_with_the_photo_in_front_and_differ_behind(name, background):
+    """A couch and an apple that training never saw: four samples, from the front and from behind."""
+    model = CompleteSplat.from_pretrained(name)
+    photo = model.read(SHIPPED / name / "held_out.jpg")
     camera, scenes = model.camera(photo), stack(model(photo, samples=4, steps=8))
-    depth = (model.depth_range[0] + 1) * torch.tensor([0.0, 0.0, 1.0])  # the centre of the couch
-    around = orbit(camera, depth, model.up, 2)
-    images = TiledRasterizer()(scenes, around.map(lambda tensor: tensor.expand(4, *tensor.shape))).over(0.5).clamp(0, 1)
+    around = orbit(camera, model.middle_depth(model.depth_range) * torch.tensor([0.0, 0.0, 1.0]), model.up, 2)
+    cameras = around.map(lambda tensor: tensor.expand(4, *tensor.shape))
+    images = TiledRasterizer()(scenes, cameras).over(background).clamp(0, 1)
     front, behind = images[:, 0], images[:, 1]
     assert psnr(front, photo.image.expand(4, -1, -1, -1)).min() > 24
     assert behind.std(0).mean() > 1.5 * front.std(0).mean()
