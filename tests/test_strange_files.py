@@ -46,18 +46,18 @@ def turned(**entries: float) -> list[list[float]]:
     [
         ({"image_size": [float("inf"), 32]}, "Infinity is no JSON"),
         ({"image_size": [0, 32]}, r"image_size must be from 1 to 50,000,000 pixels, not \[0, 32\]"),
-        ({"image_size": [32, 1e300]}, "image_size must be from 1 to 50,000,000"),
+        ({"image_size": [32, 1e300]}, "image_size is not finite in float32"),
         ({"image_size": [32]}, "image_size must be 2 numbers"),
         ({"intrinsics": np.zeros((3, 3)).tolist()}, "intrinsics of no camera"),
         ({"intrinsics": [[1e-300, 0, 16], [0, 50, 16], [0, 0, 1]]}, "intrinsics of no camera"),
-        ({"intrinsics": [[50, 0, 1e200], [0, 50, 16], [0, 0, 1]]}, "intrinsics of no camera"),
+        ({"intrinsics": [[50, 0, 1e200], [0, 50, 16], [0, 0, 1]]}, "intrinsics is not finite in float32"),
         ({"up": [float("nan")] * 3}, "NaN is no JSON"),
         ({"up": [0, 0, 0]}, r"up must have a length, not \[0, 0, 0\]"),
-        ({"up": [0, -1e300, 0]}, "up must have a length"),
+        ({"up": [0, -1e300, 0]}, "up is not finite in float32"),
         ({"up": "north"}, "up must be 3 numbers, not 'north'"),
         ({"world_to_camera": turned(_03=float("nan"))}, "NaN is no JSON"),
         ({"world_to_camera": turned(_00=0)}, "world_to_camera is not orthonormal"),
-        ({"world_to_camera": turned(_23=1e30)}, "world_to_camera is farther than 1e\\+18 from the origin"),
+        ({"world_to_camera": turned(_23=1e30)}, "world_to_camera is not finite in float32"),
     ],
 )
 def test_a_camera_of_no_prediction_is_refused_by_file_and_value(tmp_path, changes, reason):

@@ -42,7 +42,7 @@ def test_the_wheel_has_the_package_its_settings_and_weights_and_no_link_that_lea
     commands = [line for line in readme.splitlines() if line.startswith(("completesplat", "##"))]
     assert [line for line in description.splitlines() if line.startswith(("completesplat", "##"))] == commands
     assert "![" not in description
-    assert "*A rendered couch" not in description
+    assert "*A photograph of an apple" not in description
 
 
 def test_the_installed_wheel_predicts_sweeps_and_writes_tables_from_an_empty_folder(installed, toy_root, tmp_path):

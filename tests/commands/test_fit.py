@@ -107,6 +107,7 @@ def test_a_checkpoint_that_is_missing_or_cut_off_is_refused_before_data_are_made
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left_out", ["~callbacks.progress", "~callbacks", "~logger"])
 def test_a_run_without_callbacks_or_loggers_is_trained_and_scored(command, toy_root, tmp_path, left_out):
     given = [setting for setting in SMALL if not setting.startswith(("callbacks", "trainer.max_steps"))]
@@ -119,5 +120,6 @@ def test_a_run_without_callbacks_or_loggers_is_trained_and_scored(command, toy_r
     assert (tmp_path / "run/metrics.csv").is_file() == (left_out != "~logger")
 
 
+@pytest.mark.slow
 def test_a_training_without_callbacks_is_planned(command):
     assert command("plan", "experiment=toy_var", "~callbacks", "data.image_size=32").status == 0

@@ -10,6 +10,7 @@ from completesplat.settings.options import choices_of_verb
 SMALL = ["experiment=toy_diffusion", "data.image_size=32", *NETWORKS]
 
 
+@pytest.mark.slow
 def test_a_plan_is_printed_and_written_and_a_sweep_ends_in_a_total(command, tmp_path):
     mine = "+gpus.mine={bfloat16: 1e-3, float32: 1, memory: 0.01, bandwidth: 1}"
     swept = command("plan", "-m", *SMALL, "gpu=a100,mine", mine, f"out={tmp_path}")

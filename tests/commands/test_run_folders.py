@@ -169,6 +169,7 @@ def content(folder):
     return {path.relative_to(folder): path.read_bytes() for path in files}
 
 
+@pytest.mark.slow
 def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tmp_path, monkeypatch):
     root, run = tmp_path / "data", tmp_path / "run"
     write_objects(root, scenes=4, frames=4, size=32, seed=0, workers=1, progress=False)

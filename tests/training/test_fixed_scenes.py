@@ -142,10 +142,10 @@ def test_the_newest_scenes_take_the_place_of_older_ones_and_read_back_with_their
 
 
 def test_newest_scenes_that_are_not_there_are_refused(tmp_path):
-    with pytest.raises(CompleteSplatError, match="not the newest scenes"):
+    with pytest.raises(CompleteSplatError, match="no such file"):
         read_newest(tmp_path)
     (tmp_path / "scenes.json").write_text('{"step": 1, "scenes": [{"file": "../a.ply"}]}')
-    with pytest.raises(CompleteSplatError, match="not the newest scenes"):
+    with pytest.raises(CompleteSplatError, match="no reference_camera"):
         read_newest(tmp_path)
 
 

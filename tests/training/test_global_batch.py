@@ -156,6 +156,7 @@ def test_an_epoch_of_accumulated_batches_trains_as_whole_batches(toy_root, tmp_p
     torch.testing.assert_close(*trained, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["power", "binsearch"])
 def test_lightnings_search_for_a_batch_size_ends_at_the_scenes_of_an_epoch(toy_root, tmp_path, mode):
     given = [*SMALL, "experiment=toy_var", f"data.root={toy_root}", "data.references_per_sequence=5"]
