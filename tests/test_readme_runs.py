@@ -69,6 +69,10 @@ NEEDS_MORE = (
     "FOX",
     "MOUSE",
     "CUP",
+    "FRUITS",
+    "FRUIT_TURNS",
+    "ETH80_FRUIT",
+    "RUN7",
 )
 TAKES_MINUTES = ("completesplat bench",)
 
