@@ -5,6 +5,7 @@ import os
 import re
 import shlex
 import subprocess
+from collections.abc import Sequence
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -96,9 +97,28 @@ def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> 
 def _copy_photos(folder: Path, images: Path) -> None:
     """Write upright photos, with the rest of their EXIF records, which has the focal length.
 
-    If there are none in the folder itself, those in folders below it are taken, each the photos of one camera.
+    Photos of folders below are written into folders, each the photos of one camera.
     """
     formats = _photo_formats()
+    photos = _photos_in(folder, formats)
+    # COLMAP lists pairs with a space between.
+    folders = sorted({photo.parent for photo in photos})
+    names = dict(zip(folders, folder_names("_".join(path.name.split()) for path in folders), strict=True))
+    stems = folder_names("_".join(path.stem.split()) for path in photos)
+    for photo, stem in track(list(zip(photos, stems, strict=True)), "photos"):
+        with refused_to(leave_out), refused_as_bad(str(photo)):
+            with opened(photo, formats) as image:
+                check_sums(image, photo)
+                upright = ImageOps.exif_transpose(image)
+            options = {"quality": 95, "subsampling": 0, "exif": upright.info.get("exif", b"")}
+            place = images if photo.parent == folder else images / names[photo.parent]
+            place.mkdir(exist_ok=True)
+            suffix = ".jpg" if image.format == "HEIF" else photo.suffix.lower()
+            save_image(upright, place / f"{stem}{suffix}", **options)
+
+
+def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
+    """Return the photos in a folder or, if there are none, in the folders below it; name files of other formats."""
     suffixes = {suffix for suffix, kind in Image.registered_extensions().items() if kind in formats}
     levels = [sorted(filter(Path.is_file, folder.glob(level))) for level in ("[!.]*", "[!.]*/[!.]*")]
     photos = [[path for path in files if path.suffix.lower() in suffixes] for files in levels]
@@ -106,20 +126,7 @@ def _copy_photos(folder: Path, images: Path) -> None:
     if others := sorted({path.name for path in levels[level]} - {path.name for path in photos[level]}):
         advice = "" if "HEIF" in formats else '; HEIC needs: pip install "completesplat[heic]"'
         logger.warning("left out: %d files of other formats: %s%s", len(others), shortened(others), advice)
-    # COLMAP lists pairs with a space between.
-    folders = sorted({photo.parent for photo in photos[level]})
-    names = dict(zip(folders, folder_names("_".join(path.name.split()) for path in folders), strict=True))
-    stems = folder_names("_".join(path.stem.split()) for path in photos[level])
-    for photo, stem in track(list(zip(photos[level], stems, strict=True)), "photos"):
-        with refused_to(leave_out), refused_as_bad(str(photo)):
-            with opened(photo, formats) as image:
-                check_sums(image, photo)
-                upright = ImageOps.exif_transpose(image)
-            options = {"quality": 95, "subsampling": 0, "exif": upright.info.get("exif", b"")}
-            place = images / names[photo.parent] if level else images
-            place.mkdir(exist_ok=True)
-            suffix = ".jpg" if image.format == "HEIF" else photo.suffix.lower()
-            save_image(upright, place / f"{stem}{suffix}", **options)
+    return photos[level]
 
 
 def _photo_formats() -> tuple[str, ...]:

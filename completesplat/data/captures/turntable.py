@@ -103,19 +103,24 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
                 raise refused[0]
             for error in refused:
                 logger.warning("left out: %s", error)
-            most = 1 if _report(turns) >= 0 else -1
+            _write_cameras(turns, unfinished, settings["direction"])
             write_sheet(turns, out / "sheet.png")
             if splits:
                 usable = {split: [name for name in names if name in turns] for split, names in splits.items()}
                 (out / SPLITS_FILE).write_text(json.dumps(usable, indent=1) + "\n")
-            for name, turn in turns.items():
-                moves_right = (settings["direction"] or turn.flow or most) == -1
-                _write_transforms(unfinished / name, mirror(turn.cameras) if moves_right else turn.cameras)
             for name in turns:
                 (out / name).parent.mkdir(parents=True, exist_ok=True)
                 (unfinished / name).rename(out / name)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def _write_cameras(turns: Mapping[str, Turn], folder: Path, direction: int | None) -> None:
+    """Report on the turns, and write the cameras of each; an unclear turn goes as most do."""
+    most = 1 if _report(turns) >= 0 else -1
+    for name, turn in turns.items():
+        moves_right = (direction or turn.flow or most) == -1
+        _write_transforms(folder / name, mirror(turn.cameras) if moves_right else turn.cameras)
 
 
 def _folders_of_photos(root: Path) -> dict[str, Path]:
