@@ -400,3 +400,10 @@ def test_a_model_without_images_is_refused_and_takes_none_from_outside(tmp_path)
     move("a/images", "images")(tmp_path)
     with pytest.raises(MissingFile, match=r"a/images, a: no such folder"):
         sequence(tmp_path / "a")
+
+
+@pytest.mark.parametrize("content", ["null", "[]", "7", '"frames"'])
+def test_a_transforms_json_that_is_no_object_is_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "transforms.json").write_text(content)
+    with pytest.raises(BadAnnotation, match="no frames in"):
+        read_transforms(tmp_path / "transforms.json")

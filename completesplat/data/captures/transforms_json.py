@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os.path import isfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -151,7 +152,7 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
     return cameras
 
 
-def _read_frames(path: Path, content: Entry) -> list[CapturedFrame]:
+def _read_frames(path: Path, content: Any) -> list[CapturedFrame]:
     """Return all frames of a file's content that have images."""
     root, frames, missing = path.parent, [], []
     with at(path):
