@@ -5,6 +5,8 @@ scenes = model("photo.jpg", samples=4, seed=0)
 completesplat.write_ply("scene.ply", scenes[0])
 """
 
+import os
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -15,6 +17,12 @@ if TYPE_CHECKING:
     from completesplat.generator import CompleteSplat as CompleteSplat
 
 __version__ = "0.1.0"
+
+# Threads of torch's GNU OpenMP spin by default while they wait for the next of hundreds of small parallel regions. Beside
+# another busy process they take turns with those that they wait for: a sample then takes many times as long. What a
+# user has set (also GOMP_SPINCOUNT, which libgomp prefers) stays. torch reads it when it is loaded.
+if "torch" not in sys.modules:
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _PLACES = {"CompleteSplat": "generator", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
 _PLACES |= {"compose": "settings.composition", "instantiate": "commands.fit"}

@@ -45,9 +45,6 @@ def _run() -> None:
 
         sys.exit(_refuse(f"no verb {arguments[0]!r}: there are {', '.join(VERBS)}{did_you_mean(arguments[0], VERBS)}"))
 
-    # This must be set before torch is loaded. By default, idle threads of its GNU OpenMP spin for milliseconds,
-    # which keeps the rasterizer's threads and other processes off the cores.
-    os.environ.setdefault("GOMP_SPINCOUNT", "3000")
     from completesplat.commands import exit_status, launch, refusal
 
     try:

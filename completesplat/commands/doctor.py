@@ -106,6 +106,8 @@ def check_device() -> Iterator[Finding]:
     from completesplat.results.machine import machine
 
     yield Finding("CPU", "yes", f"{machine()['processor']}, {os.cpu_count()} cores")
+    waits = [f"{name}={os.environ[name]}" for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT") if name in os.environ]
+    yield Finding("threads", "yes", f"{torch.get_num_threads()} of torch's; {', '.join(waits)}")
     for index in range(torch.cuda.device_count()):
         free, total = map(decimal, torch.cuda.mem_get_info(index))
         yield Finding(f"GPU {index}", "yes", f"{torch.cuda.get_device_name(index)}, {free} of {total} free")
