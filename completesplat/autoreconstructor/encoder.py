@@ -96,7 +96,8 @@ class Encoder(nn.Module):
         """Return the features of the first levels as `encode` does, without computing anything after them."""
         network: Any = self.network
         run = recompute if self.gradient_checkpointing else nn.Module.__call__
-        hidden, features = network.conv_in(values), list[Tensor]()
+        features: Features = []
+        hidden = network.conv_in(values)
         for level, block in enumerate(network.down_blocks[:levels]):
             for downsampler in network.down_blocks[level - 1].downsamplers if level else ():
                 hidden = run(downsampler, hidden)
