@@ -1,17 +1,28 @@
-"""Scenes with known hidden parts: all alternatives for what the reference image hides, with their probabilities."""
+"""Scenes with known hidden parts: all alternatives for what the reference image hides, with their probabilities.
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+The data are in CO3D's layout. Beside its `images`, a sequence has a folder with the same images in each mode, named
+after the mode.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from completesplat.data.co3d.source import CO3DSource
+from completesplat.data.loading.scenes import Choice, SceneStore, with_true_depths
 from completesplat.data.loading.view_selection import evaluation_views
+from completesplat.data.sequences import PosedSequence
+from completesplat.data.validation import BadAnnotation, at, field, finite_array, read_json
 from completesplat.errors import DataError
+from completesplat.geometry.surfaces import hidden_from
 from completesplat.scene import SceneBatch
-from completesplat.tensors import TensorDataclass
+from completesplat.tensors import TensorDataclass, stack
 
 # A pixel is of the region if a channel differs between two modes by more than this; blurred edges differ less.
 DIFFERENCE = 0.1
@@ -45,22 +56,93 @@ class HiddenModes(TensorDataclass):
     true_mode: int
 
 
-@runtime_checkable
-class HiddenModeScenes(Protocol):
-    """Sequence of scenes, each made when it is indexed."""
+def in_mode(image: Path, mode: str) -> Path:
+    """Return the path of an image in a mode, given that of the image in `images`."""
+    return image.parent.parent / mode / image.name
 
-    def __len__(self) -> int: ...
+
+class HiddenModeScenes:
+    """Sequence of scenes in all their modes, each read when it is indexed; see `SceneDataModule.hidden_modes`.
+
+    Args:
+        record: JSON file of a sequence: its true mode (`hidden`), and the modes' `chances` if they are its own.
+        chances: probabilities of the modes by name.
+        choose: returns a reference and targets, of which only the reference is used.
+
+    Raises:
+        DataError: `store` reads prepared data.
+    """
+
+    def __init__(
+        self,
+        store: SceneStore,
+        record: Callable[[str], Path],
+        chances: Mapping[str, float],
+        choose: Callable[[PosedSequence], Choice],
+        views: int,
+        spread: int,
+    ) -> None:
+        if not isinstance(store.source, CO3DSource):
+            raise DataError("hidden modes need data as they were made, not prepared")
+        self.store, self.record, self.chances, self.choose = store, record, chances, choose
+        self.views, self.spread = views, spread
+        self.modes = [replace(store, source=store.source.with_images(partial(in_mode, mode=mode))) for mode in chances]
+
+    def __len__(self) -> int:
+        return len(self.store.names)
 
     def __getitem__(self, index: int) -> HiddenModes:
         """Return one scene.
 
         Raises:
             DataError: it is unreadable, its reference view distinguishes the modes, or no view shows them well.
-            CompleteSplatError: the files were not made by the data set.
         """
+        name, sequence, reference = self._read(index)
+        candidates = [view for view in range(len(sequence.frames)) if view != reference]
+        truths = {view: self._truths(name, view) for view in candidates}
+        extent = {view: (images.amax(0) - images.amin(0)).sum().item() for view, images in truths.items()}
+        candidates.sort(key=extent.__getitem__, reverse=True)
+        shown = views_of_modes(candidates, truths.__getitem__, self.views, name)
+        targets = sorted({*shown.views, *spread_views(len(sequence.frames), reference, self.spread)})
+        scene = with_true_depths(self.store.scene(sequence, reference, targets), sequence, reference, targets)
+        front, others = scene.reference, scene.targets
+        assert front.depths is not None
+        assert others.depths is not None
+        unseen, _ = hidden_from(front.cameras, front.depths, others.cameras, others.depths)
+        views, modes = tuple(map(targets.index, shown.views)), tuple(self.chances)
+        true_mode, probabilities = self._modes_of(name)
+        return HiddenModes(
+            stack([scene]), views, shown.truths, shown.region, probabilities, unseen, modes, true_mode
+        )
 
     def versions(self, index: int) -> SceneBatch:
         """Return one scene in every mode [mode], with evenly spread targets; raise the errors of `__getitem__`."""
+        name, sequence, reference = self._read(index)
+        spread = spread_views(len(sequence.frames), reference, self.spread)
+        return stack([store.scene(store.source.read(name), reference, spread) for store in self.modes])
+
+    def _read(self, index: int) -> tuple[str, PosedSequence, int]:
+        """Return the name of a scene, its sequence, and the index of its reference view."""
+        name = self.store.names[index]
+        sequence = self.store.source.read(name)
+        reference, _ = self.choose(sequence)
+        if differ(self._truths(name, reference), LEAK).any():
+            raise DataError("the reference view tells the mode", sequence=name)
+        return name, sequence, reference
+
+    def _modes_of(self, name: str) -> tuple[int, Float[Tensor, " mode"]]:
+        """Return the index of a scene's true mode, and the probabilities of all modes."""
+        record, modes = self.record(name), list(self.chances)
+        with at(record):
+            content = read_json(record)
+            hidden = field(content, "hidden", str)
+            if hidden not in modes:
+                raise BadAnnotation(f"hidden must be one of {', '.join(modes)}")
+            chances = finite_array(content.get("chances", list(self.chances.values())), (len(modes),), "chances")
+        return modes.index(hidden), torch.from_numpy(chances).float()
+
+    def _truths(self, name: str, view: int) -> Float[Tensor, "mode 3 size size"]:
+        return torch.stack([store.image(store.source.read(name), view).float() / 255 for store in self.modes])
 
 
 class Shown(NamedTuple):

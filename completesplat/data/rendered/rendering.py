@@ -30,6 +30,7 @@ from completesplat.data.co3d.writing import (
     write_frame,
     write_points,
 )
+from completesplat.data.hidden_modes import in_mode
 from completesplat.data.images.files import save_jpeg, to_bytes
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
 from completesplat.data.rendered.drawing import RenderSettings, check_surroundings, draw_scene
@@ -289,11 +290,6 @@ def _write_modes(folder: Path, modes: Sequence[str], files: Path) -> None:
         prefix = f"{index}_" if index else ""
         for number, image in enumerate(sorted((folder / "images").iterdir())):
             save_jpeg(_pixels(files / f"{prefix}{number:04d}.png"), in_mode(image, mode))
-
-
-def in_mode(image: Path, mode: str) -> Path:
-    """Return the path of an image with another paint of the back."""
-    return image.parent.parent / mode / image.name
 
 
 def _pixels(path: Path) -> Float[np.ndarray, "height width 3"]:

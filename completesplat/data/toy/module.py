@@ -1,15 +1,16 @@
 """Data modules of toy objects and rooms, which write their own data."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
-from completesplat.data.toy.modes import ToyHiddenModes
-from completesplat.data.toy.writing import ROOMS, SUBSET, write
-from completesplat.data.validation import MissingFile
+from completesplat.data.toy.object_scene import PATCH_COLORS
+from completesplat.data.toy.writing import DESCRIPTION, FORMAT_VERSION, ROOMS, SUBSET, write
+from completesplat.data.validation import MissingFile, at, field, read_json
+from completesplat.errors import DataError
 from completesplat.settings.schema import Natural, Positive, Side
 
 OWN_PLACE = Path("outputs/data")
@@ -21,7 +22,7 @@ def _provide(kind: str, root: Path, make: bool, numbers: tuple[int, int, int, in
 
     Without `make`, refuse folders outside of `OWN_PLACE`, because their name may be a typing error.
     """
-    if is_packed(root) or (root / f"toy_{kind}" / "toy.json").is_file():
+    if is_packed(root) or (root / f"toy_{kind}" / DESCRIPTION).is_file():
         return
     if not make and not root.is_relative_to(OWN_PLACE):
         message = "no toy data: data.make=true makes them there, and so does completesplat data toy"
@@ -60,11 +61,19 @@ class ToyObjectsDataModule(CO3DDataModule):
         """Write the scenes if there are none."""
         _provide(self.category.removeprefix("toy_"), self.root, self.make, self.making)
 
-    def hidden_modes(self, views: int, spread_views: int) -> ToyHiddenModes:
-        """Return the test scenes with all possible colours of the patch on the back; see `ToyHiddenModes`."""
-        store = self.store("test")
-        choose = partial(self.evaluation_views, split="test")
-        return ToyHiddenModes(self.root / self.category, store, choose, self.image_size, views, spread_views)
+    def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
+        """Return the test scenes with all possible colours of the patch on the back.
+
+        Raises:
+            DataError: the toy objects are of another version, or prepared data.
+        """
+        description = self.root / self.category / DESCRIPTION
+        if not description.is_file():
+            raise DataError(f"no {DESCRIPTION}: hidden modes need toy objects as they were written", str(description))
+        with at(description):
+            if field(read_json(description), "format", int) != FORMAT_VERSION:
+                raise DataError("of another version: write the toy objects again into another folder")
+        return self.written_modes(DESCRIPTION, dict.fromkeys(PATCH_COLORS, 1 / len(PATCH_COLORS)), views, spread_views)
 
 
 class ToyRoomsDataModule(RE10KDataModule):

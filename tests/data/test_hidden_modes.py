@@ -1,17 +1,22 @@
+"""Hidden modes of toy objects, as they are written and read."""
+
 import json
 import shutil
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from completesplat.data.hidden_modes import DIFFERENCE
-from completesplat.data.toy.modes import SAME_IMAGE, frame_camera, unseen
 from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModule
-from completesplat.data.toy.object_scene import PATCH_COLORS, draw_scene, render_frame
+from completesplat.data.toy.object_scene import PATCH_COLORS, render_frame
+from completesplat.data.toy.raytracing import trace
+from completesplat.data.toy.writing import draw
+from completesplat.data.validation import BadAnnotation
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.geometry.cameras import pixel_centers, project, unproject
+from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
 
 
 def scenes_of(root, views=2, image_size=32):
@@ -32,7 +37,8 @@ def test_the_true_colour_and_no_other_is_what_the_data_module_yields(toy_root, i
     scene, batch = scenes[0], next(iter(module.test_dataloader()))
     name, views = scene.scene.names[0], list(scene.views)
     told = json.loads((toy_root / "toy_objects" / name / "toy.json").read_text())
-    assert scene.modes[scene.true_mode] == told["patch_color"]
+    assert scene.modes == tuple(PATCH_COLORS)
+    assert scene.modes[scene.true_mode] == told["hidden"]
     assert batch.names == (name,)
     assert torch.equal(batch.reference.images, scene.scene.reference.images)
     stored = scene.scene.targets.images[0, views]
@@ -40,9 +46,9 @@ def test_the_true_colour_and_no_other_is_what_the_data_module_yields(toy_root, i
     same = (batch.targets.images[0, :, None] == stored).flatten(2).all(2)
     assert same.any(0).all()
     errors = (scene.truths - stored).square().mean((1, 2, 3, 4)).sqrt()
-    assert errors[scene.true_mode] < 0.015  # JPEG's
+    assert errors[scene.true_mode] == 0
     others = [mode for mode in range(len(PATCH_COLORS)) if mode != scene.true_mode]
-    assert errors[others].min() > SAME_IMAGE
+    assert errors[others].min() > 0.025
 
 
 def test_modes_differ_in_the_patch_and_nowhere_else_and_the_reference_does_not_show_it(scene):
@@ -51,8 +57,8 @@ def test_modes_differ_in_the_patch_and_nowhere_else_and_the_reference_does_not_s
     differences = torch.stack([(one - other).abs().amax(1) for one, other in combinations(scene.truths, 2)])
     assert (differences[:, ~scene.region] <= DIFFERENCE).all()
     assert (differences.amax(0)[scene.region] > DIFFERENCE).all()
-    # But for the middles of pixels at its edge.
-    assert scene.unseen[list(scene.views)][scene.region].float().mean() > 0.95
+    # But for the middles of pixels at its edge, which are many at this size.
+    assert scene.unseen[list(scene.views)][scene.region].float().mean() > 0.75
 
 
 def test_versions_share_the_reference_and_show_the_stored_images_in_the_true_mode(toy_root, scene):
@@ -66,7 +72,7 @@ def test_versions_share_the_reference_and_show_the_stored_images_in_the_true_mod
     assert len(places) == 3
     errors = (versions.targets.images - scene.scene.targets.images[:, places]).square().mean((1, 2, 3, 4)).sqrt()
     assert errors.argmin() == scene.true_mode
-    assert errors[scene.true_mode] < 0.015  # JPEG's
+    assert errors[scene.true_mode] == 0
 
 
 def test_views_look_at_the_back_and_a_front_that_tells_the_colour_is_refused(toy_root):
@@ -77,7 +83,7 @@ def test_views_look_at_the_back_and_a_front_that_tells_the_colour_is_refused(toy
     assert len(axes) == 3
     assert axes[view, 2] == axes[:, 2].min() < -0.3
     scenes.choose = lambda sequence: (len(sequence.frames) // 2, [0])  # the reference looks at the back
-    with pytest.raises(DataError, match="tells the patch's colour"):
+    with pytest.raises(DataError, match="reference view tells the mode"):
         scenes[0]
 
 
@@ -85,14 +91,20 @@ def test_other_data_are_refused(toy_root, tmp_path):
     with pytest.raises(CompleteSplatError, match="needs data whose hidden parts are known: toy objects"):
         ToyRoomsDataModule(str(tmp_path)).hidden_modes(1, 1)
     copy = shutil.copytree(toy_root, tmp_path / "copy")
-    path = copy / "toy_objects/toy.json"
-    numbers = json.loads(path.read_text())
-    path.write_text(json.dumps(numbers | {"seed": 6}))
-    scenes, _ = scenes_of(copy)
-    with pytest.raises(CompleteSplatError, match=r"not the scene that toy\.json describes") as refusal:
+    scenes, module = scenes_of(copy)
+    folder = copy / "toy_objects" / module.store("test").names[0]
+    record = json.loads((folder / "toy.json").read_text())
+    (folder / "toy.json").write_text(json.dumps(record | {"hidden": "pink"}))
+    with pytest.raises(BadAnnotation, match=r"toy\.json: hidden must be one of red, green, blue, yellow"):
         scenes[0]
-    assert not isinstance(refusal.value, DataError)  # which would be skipped
-    path.write_text(json.dumps(numbers | {"format": 0}))
+    (folder / "toy.json").write_text(json.dumps(record | {"chances": [1, 0]}))
+    with pytest.raises(BadAnnotation, match="chances must be 4 numbers"):
+        scenes[0]
+    shutil.rmtree(folder / "red")
+    with pytest.raises(DataError, match=r"red/frame000001\.jpg"):
+        scenes_of(copy)[0][0]
+    path = copy / "toy_objects/toy.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 0}))
     with pytest.raises(DataError, match="another version"):
         scenes_of(copy)
     path.unlink()
@@ -100,25 +112,31 @@ def test_other_data_are_refused(toy_root, tmp_path):
         scenes_of(copy)
 
 
-SIZE, FRAMES = 48, 8
-SCENE = draw_scene(np.random.default_rng([5, 4]), FRAMES)
+def traced_unseen(toy, reference: int, frame: int, size: int) -> torch.Tensor:
+    """Mark the pixels of `frame` whose centre shows what the reference image does not, by rays from its camera."""
+    poses = torch.from_numpy(toy.camera_to_world[[frame, reference]])
+    camera, other = (Cameras(invert_rigid(p), pinhole(toy.fov_degrees, size).double(), (size, size)) for p in poses)
+    depth = torch.from_numpy(render_frame(toy, frame, size)[2]).flatten()
+    points = unproject(camera, pixel_centers(size, size, dtype=torch.float64).flatten(0, 1), depth)
+    pixels, ahead = project(other, points)
+    within = (ahead > 0) & (pixels > 0).all(-1) & (pixels < size).all(-1)
+    offsets = points - other.centers
+    distances = offsets.norm(dim=-1)
+    rays = ((offsets / distances[:, None]) @ other.world_to_camera[:3, :3].mT).numpy()[:, None].copy()
+    met = trace(toy.shapes, toy.light, (toy.dome, toy.patch), toy.camera_to_world[reference], rays)[2]
+    return ~(within & (torch.from_numpy(met) > 0.999 * distances)).view(size, size)
 
 
-@pytest.mark.parametrize("frame", [1, 2])
-def test_what_is_seen_looks_the_same_in_both_frames_and_agrees_with_their_depth_maps(frame):
-    assert not unseen(SCENE, frame, frame, SIZE).any()
-    colors, _, depth = (torch.from_numpy(part) for part in render_frame(SCENE, frame, SIZE))
-    pixels = pixel_centers(SIZE, SIZE, dtype=torch.float64).flatten(0, 1)
-    points = unproject(frame_camera(SCENE, frame, SIZE), pixels, depth.flatten())
-    pixels, ahead = project(frame_camera(SCENE, 0, SIZE), points)
-    within = (ahead > 0) & (pixels >= 0).all(-1) & (pixels < SIZE).all(-1)
-    columns, rows = pixels.clamp(0, SIZE - 1e-6).floor().long().unbind(-1)
-    reference, _, nearest = (torch.from_numpy(part) for part in render_frame(SCENE, 0, SIZE))
-    hidden = unseen(SCENE, 0, frame, SIZE).flatten()
-    by_depth = ~(within & (ahead < 1.05 * nearest[rows, columns]))
-    assert (by_depth == hidden).float().mean() > 0.95  # save at edges
-    if frame == 1:
-        differences = (reference[rows, columns] - colors.flatten(0, 1)).abs().amax(-1)
-        assert 0.1 < hidden.float().mean() < 0.9
-        assert differences[~hidden].median() < 0.02
-        assert differences[hidden].median() > 0.05
+def test_what_the_reference_hides_is_what_no_ray_from_its_camera_meets(toy_root: Path) -> None:
+    (scenes, module), described = scenes_of(toy_root), json.loads((toy_root / "toy_objects/toy.json").read_text())
+    scene, name = scenes[0], module.store("test").names[0]
+    toy = draw("toy_objects", described["seed"], int(name.split("_")[0]), described["frames"], np.ones(3))
+    sequence = module.source("test").read(name)
+    views = [
+        view
+        for view in range(len(sequence.frames))
+        if any(torch.equal(sequence.read(view).image.float() / 255, image) for image in scene.scene.targets.images[0])
+    ]
+    rays = torch.stack([traced_unseen(toy, sequence.frames[0], sequence.frames[view], 32) for view in views])
+    assert 0.1 < rays.float().mean() < 0.9
+    assert (rays == scene.unseen).float().mean() > 0.9
