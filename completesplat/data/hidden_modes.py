@@ -111,9 +111,7 @@ class HiddenModeScenes:
         unseen, _ = hidden_from(front.cameras, front.depths, others.cameras, others.depths)
         views, modes = tuple(map(targets.index, shown.views)), tuple(self.chances)
         true_mode, probabilities = self._modes_of(name)
-        return HiddenModes(
-            stack([scene]), views, shown.truths, shown.region, probabilities, unseen, modes, true_mode
-        )
+        return HiddenModes(stack([scene]), views, shown.truths, shown.region, probabilities, unseen, modes, true_mode)
 
     def versions(self, index: int) -> SceneBatch:
         """Return one scene in every mode [mode], with evenly spread targets; raise the errors of `__getitem__`."""

@@ -1,6 +1,5 @@
 """Data module of rendered meshes."""
 
-from functools import partial
 from typing import Any
 
 from completesplat.data.co3d.module import CO3DDataModule
