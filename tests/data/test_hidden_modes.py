@@ -75,16 +75,18 @@ def test_versions_share_the_reference_and_show_the_stored_images_in_the_true_mod
     assert errors[scene.true_mode] == 0
 
 
-def test_views_look_at_the_back_and_a_front_that_tells_the_colour_is_refused(toy_root):
+def test_views_look_at_the_back_and_a_front_that_tells_the_colour_is_refused(toy_root, tmp_path):
     scenes, _ = scenes_of(toy_root, views=1)
     (view,) = scenes[0].views
     # In the frame of the reference, which looks along z.
     axes = scenes[0].scene.targets.cameras.world_to_camera[0, :, 2, :3]
     assert len(axes) == 3
     assert axes[view, 2] == axes[:, 2].min() < -0.3
-    scenes.choose = lambda sequence: (len(sequence.frames) // 2, [0])  # the reference looks at the back
+    copy = shutil.copytree(toy_root, tmp_path / "copy")
+    first, second = sorted(next(copy.glob("*/*/red")).iterdir())[:2]
+    shutil.copy(second, first)
     with pytest.raises(DataError, match="reference view tells the mode"):
-        scenes[0]
+        scenes_of(copy)[0][0]
 
 
 def test_other_data_are_refused(toy_root, tmp_path):

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Mapping
-from functools import partial
 from typing import Annotated, Any
 
 from completesplat.data.co3d.source import CO3DSource
@@ -102,8 +101,5 @@ class CO3DDataModule(ObjectDataModule):
         Args:
             record: name of the record in a sequence's folder.
         """
-        choose = partial(self.evaluation_views, split="test")
         folder = self.root / self.category
-        return HiddenModeScenes(
-            self.store("test"), lambda name: folder / name / record, chances, choose, views, spread_views
-        )
+        return HiddenModeScenes(self.store("test"), lambda name: folder / name / record, chances, views, spread_views)
