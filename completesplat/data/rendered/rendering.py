@@ -151,7 +151,6 @@ def render(
     max_minutes: Annotated[float, Range(0)],
     blender: str | None = None,
     workers: Positive | None = None,
-    progress: bool = True,
     **settings: Unpack[RenderSettings],
 ) -> Path:
     """Render objects into `out`/rendered, and return this folder.
@@ -187,7 +186,7 @@ def render(
             (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
     waiting = [asset for asset in objects if not (category / asset.name).exists()]
     write_one = partial(_write_object, category, program, settings, (MEGABYTE * max_megabytes, max_minutes))
-    results = track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting), disable=not progress)
+    results = track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting))
     broken = {name: reason for name, reason in sorted(results) if reason}
     _write_lists(category, broken)
     return category

@@ -8,7 +8,7 @@ from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS
-from completesplat.data.toy.writing import DESCRIPTION, FORMAT_VERSION, ROOMS, SUBSET, write
+from completesplat.data.toy.writing import DESCRIPTION, FORMAT_VERSION, ROOMS, SUBSET, Numbers, write
 from completesplat.data.validation import MissingFile, at, field, read_json
 from completesplat.errors import DataError
 from completesplat.settings.schema import Natural, Positive, Side
@@ -17,7 +17,7 @@ OWN_PLACE = Path("outputs/data")
 """Folder below which toy data are written without `make`; `data.root` of `conf/data/toy_*.yaml` lies there."""
 
 
-def _provide(kind: str, root: Path, make: bool, numbers: tuple[int, int, int, int]) -> None:
+def _provide(kind: str, root: Path, make: bool, numbers: Numbers) -> None:
     """Write data of a kind unless there are complete data (with `toy.json`) or prepared ones.
 
     Without `make`, refuse folders outside of `OWN_PLACE`, because their name may be a typing error.
@@ -27,7 +27,7 @@ def _provide(kind: str, root: Path, make: bool, numbers: tuple[int, int, int, in
     if not make and not root.is_relative_to(OWN_PLACE):
         message = "no toy data: data.make=true makes them there, and so does completesplat data toy"
         raise MissingFile(message, str(root))
-    write(kind, root, *numbers)
+    write(kind, root, **numbers)
 
 
 class ToyObjectsDataModule(CO3DDataModule):
@@ -52,7 +52,8 @@ class ToyObjectsDataModule(CO3DDataModule):
         **reading: Any,
     ) -> None:
         super().__init__(root, category, subset, depth_before=depth_before, **reading)
-        self.make, self.making = make, (scenes, frames, self.image_size, data_seed)
+        self.make = make
+        self.making = Numbers(scenes=scenes, frames=frames, size=self.image_size, seed=data_seed)
 
     def describe(self) -> dict[str, str | None]:
         return super().describe() | {"data_set": self.category}
@@ -95,7 +96,8 @@ class ToyRoomsDataModule(RE10KDataModule):
     ) -> None:
         home = Path(root)
         super().__init__(str(home if is_packed(home) else home / ROOMS / "text"), **reading)
-        self.home, self.make, self.making = home, make, (scenes, frames, height, data_seed)
+        self.home, self.make = home, make
+        self.making = Numbers(scenes=scenes, frames=frames, size=height, seed=data_seed)
 
     def describe(self) -> dict[str, str]:
         return super().describe() | {"data_set": ROOMS}

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypedDict, Unpack
 
 import numpy as np
 from rich.console import Console
@@ -49,6 +49,17 @@ DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
 """Functions that draw a scene, by category: (random generator, number of frames) -> scene."""
 
 KINDS = [*(category.removeprefix("toy_") for category in DRAW), "rooms"]
+
+
+class Numbers(TypedDict):
+    """Number of scenes, of frames of each, side or height of the images in pixels, and seed of all scenes."""
+
+    scenes: int
+    frames: int
+    size: Side
+    seed: Natural
+
+
 Factors = Annotated[Sequence[Annotated[float, Range(0)]], Entries(3, 3)]
 Written = tuple[str, list[Annotation], Annotation]
 """Split of a sequence, and annotations of its frames and of itself."""
@@ -149,19 +160,15 @@ def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed
 def write(
     kind: str,
     out: Path,
-    scenes: int,
-    frames: int,
-    size: Side,
-    seed: Natural,
     workers: Positive | None = None,
     light: Factors = WHITE,
     progress: bool = True,
+    **numbers: Unpack[Numbers],
 ) -> Path:
     """Write scenes of a kind (one of `KINDS`) and return their folder, `out`/toy_<kind>, with a `toy.json`.
 
-    The files depend only on the number of scenes (at least 1, for rooms 2), the number of frames of each, the height
-    `size` of the images in pixels, the seed, and the light's colour. `workers` are processes (None: one for each core).
-    A folder that was made with the same settings remains unchanged.
+    The files depend only on the numbers (at least 1 scene, 2 rooms) and the light's colour. `workers` are processes
+    (None: one for each core). A folder that was made with the same settings remains unchanged.
 
     Raises:
         DataError: the kind is unknown, a number is out of its range, or the folder holds something else.
@@ -170,10 +177,12 @@ def write(
     if kind not in KINDS:
         raise DataError(f"no toy data of kind {kind!r}; there are: {', '.join(KINDS)}")
     folder, rooms = out / f"toy_{kind}", kind == "rooms"
-    numbers = {"scenes": scenes, "frames": frames, "size": size, "seed": seed}
-    for name, rule in {"scenes": Range(1 + rooms), "frames": Range(2, MOST_FRAMES), "size": Range(8)}.items():
-        if (reason := rule.refusal(numbers[name])) is not None:
-            raise DataError(f"{folder.name}: {name}={numbers[name]}: {reason}")
+    scenes, frames, size, seed = numbers["scenes"], numbers["frames"], numbers["size"], numbers["seed"]
+    rules = ("scenes", scenes, Range(1 + rooms)), ("frames", frames, Range(2, MOST_FRAMES)), ("size", size, Range(8))
+    for name, number, rule in rules:
+        reason = rule.refusal(number)
+        if reason is not None:
+            raise DataError(f"{folder.name}: {name}={number}: {reason}")
     parameters = {"format": FORMAT_VERSION, **numbers} | ({} if tuple(light) == WHITE else {"light": list(light)})
     if is_written(folder / DESCRIPTION, parameters):
         if progress:
