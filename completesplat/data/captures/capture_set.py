@@ -42,18 +42,21 @@ def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
         SharedSequences: two splits have captures of one object.
     """
     content, splits = read_json(path), dict[str, list[str]]()
+    owners: dict[str, str] = {}
     with at(path):
         for split in SPLITS:
-            listed = field(content, split, list) if split in content else []
-            for entry in listed:
-                if not any(name == entry or name.startswith(f"{entry}/") for name in names):
+            entries = field(content, split, list) if split in content else []
+            members = set[str]()
+            for entry in entries:
+                named = [name for name in names if name == entry or name.startswith(f"{entry}/")]
+                if not named:
                     raise BadAnnotation(f"{split} names {repr(entry)[:80]}, which is no capture nor a folder of them")
-            splits[split] = [name for name in names if name in listed or any(name.startswith(f"{x}/") for x in listed)]
-        owners: dict[str, str] = {}
-        for split in SPLITS:
+                members.update(named)
+            splits[split] = [name for name in names if name in members]
             for name in splits[split]:
-                if owners.setdefault(object_of(name), split) != split:
-                    raise SharedSequences(f"{object_of(name)} is in both {owners[object_of(name)]} and {split}")
+                owner = owners.setdefault(object_of(name), split)
+                if owner != split:
+                    raise SharedSequences(f"{object_of(name)} is in both {owner} and {split}")
     return splits
 
 
