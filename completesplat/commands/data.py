@@ -47,7 +47,7 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
 
 
 def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path) -> None:
-    """Write `show.png`: images and cameras of some sequences, evenly spread over a split."""
+    """Write `show.png`: images of some sequences, evenly spread over a split."""
     from completesplat.studies.contact_sheet import show as draw
 
     source = _sources(data, [split])[split]

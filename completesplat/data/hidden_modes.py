@@ -1,17 +1,27 @@
-"""Scenes with known hidden parts: all alternatives for what the reference image hides, with their probabilities."""
+"""Scenes with known hidden parts: all alternatives for what the reference image hides, with their probabilities.
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+The data are in CO3D's layout. Beside its `images`, a sequence has a folder with the same images in each mode, named
+after the mode.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from completesplat.data.co3d.source import CO3DSource
+from completesplat.data.loading.scenes import SceneStore, with_true_depths
 from completesplat.data.loading.view_selection import evaluation_views
+from completesplat.data.sequences import PosedSequence
+from completesplat.data.validation import BadAnnotation, at, field, finite_array, read_json
 from completesplat.errors import DataError
+from completesplat.geometry.surfaces import hidden_from
 from completesplat.scene import SceneBatch
-from completesplat.tensors import TensorDataclass
+from completesplat.tensors import TensorDataclass, stack
 
 # A pixel is of the region if a channel differs between two modes by more than this; blurred edges differ less.
 DIFFERENCE = 0.1
@@ -45,60 +55,96 @@ class HiddenModes(TensorDataclass):
     true_mode: int
 
 
-@runtime_checkable
-class HiddenModeScenes(Protocol):
-    """Sequence of scenes, each made when it is indexed."""
+def in_mode(image: Path, mode: str) -> Path:
+    """Return the path of an image in a mode, given that of the image in `images`."""
+    return image.parent.parent / mode / image.name
 
-    def __len__(self) -> int: ...
+
+class HiddenModeScenes:
+    """Sequence of scenes in all their modes, each read when it is indexed; see `SceneDataModule.hidden_modes`.
+
+    The reference is a sequence's first frame, as in any test.
+
+    Args:
+        record: name -> JSON file of a sequence: its true mode (`hidden`), and the modes' `chances` if they are its own.
+        chances: probabilities of the modes by name.
+        views: largest number of views that show the modes.
+        spread: number of further, evenly spread views.
+
+    Raises:
+        DataError: `store` reads prepared data.
+    """
+
+    def __init__(
+        self, store: SceneStore, record: Callable[[str], Path], chances: Mapping[str, float], views: int, spread: int
+    ) -> None:
+        if not isinstance(store.source, CO3DSource):
+            raise DataError("hidden modes need data as they were made, not prepared")
+        self.store, self.record, self.chances, self.views, self.spread = store, record, chances, views, spread
+        self.modes = [replace(store, source=store.source.with_images(partial(in_mode, mode=mode))) for mode in chances]
+
+    def __len__(self) -> int:
+        return len(self.store.names)
 
     def __getitem__(self, index: int) -> HiddenModes:
         """Return one scene.
 
         Raises:
             DataError: it is unreadable, its reference view distinguishes the modes, or no view shows them well.
-            CompleteSplatError: the files were not made by the data set.
         """
+        name, sequence, spread = self._read(index)
+        truths = self._truths(name, range(len(sequence.frames)))
+        differences = truths.amax(0) - truths.amin(0)
+        regions = (differences > DIFFERENCE).any(1)
+        best_first = differences.sum((1, 2, 3)).argsort(descending=True, stable=True).tolist()
+        large = [view for view in best_first if view and regions[view].float().mean() >= SMALLEST_REGION]
+        shown = large[: self.views]
+        if not shown:
+            raise DataError("no view shows enough of what the reference image hides", sequence=name)
+        targets = sorted({*shown, *spread})
+        scene = with_true_depths(self.store.scene(sequence, 0, targets), sequence, 0, targets)
+        front, others = scene.reference, scene.targets
+        assert front.depths is not None
+        assert others.depths is not None
+        unseen, _ = hidden_from(front.cameras, front.depths, others.cameras, others.depths)
+        true_mode, probabilities = self._modes_of(name)
+        return HiddenModes(
+            scene=stack([scene]),
+            views=tuple(map(targets.index, shown)),
+            truths=truths[:, shown],
+            region=regions[shown],
+            probabilities=probabilities,
+            unseen=unseen,
+            modes=tuple(self.chances),
+            true_mode=true_mode,
+        )
 
     def versions(self, index: int) -> SceneBatch:
         """Return one scene in every mode [mode], with evenly spread targets; raise the errors of `__getitem__`."""
+        name, _, spread = self._read(index)
+        return stack([store.scene(store.source.read(name), 0, spread) for store in self.modes])
 
+    def _read(self, index: int) -> tuple[str, PosedSequence, list[int]]:
+        """Return the name of a scene, its sequence, and evenly spread views."""
+        name = self.store.names[index]
+        sequence, reference = self.store.source.read(name), self._truths(name, [0])
+        if (reference.amax(0) - reference.amin(0) > LEAK).any():
+            raise DataError("the reference view tells the mode", sequence=name)
+        return name, sequence, evaluation_views(len(sequence.frames), self.spread)[1]
 
-class Shown(NamedTuple):
-    """Views that show the modes: their indices, their images in every mode, and the pixels that differ."""
+    def _modes_of(self, name: str) -> tuple[int, Float[Tensor, " mode"]]:
+        """Return the index of a scene's true mode, and the probabilities of all modes."""
+        record, modes = self.record(name), list(self.chances)
+        with at(record):
+            content = read_json(record)
+            hidden = field(content, "hidden", str)
+            if hidden not in modes:
+                raise BadAnnotation(f"hidden must be one of {', '.join(modes)}")
+            chances = finite_array(content.get("chances", list(self.chances.values())), (len(modes),), "chances")
+        return modes.index(hidden), torch.from_numpy(chances).float()
 
-    views: list[int]
-    truths: Float[Tensor, "mode view 3 height width"]
-    region: Bool[Tensor, "view height width"]
-
-
-def differ(truths: Float[Tensor, "mode 3 height width"], by: float) -> Bool[Tensor, "height width"]:
-    """Return the pixels in which two modes of one view differ by more than `by`."""
-    return ((truths.amax(0) - truths.amin(0)) > by).any(0)
-
-
-def views_of_modes(
-    candidates: Iterable[int], truths_of: Callable[[int], Float[Tensor, "mode 3 height width"]], most: int, name: str
-) -> Shown:
-    """Select the first `most` views, of the best first, in which enough pixels differ between the modes.
-
-    Raises:
-        DataError: no view of the sequence `name` shows enough.
-    """
-    chosen = list[tuple[int, Tensor, Tensor]]()
-    for view in candidates:
-        truths = truths_of(view)
-        region = differ(truths, DIFFERENCE)
-        if region.float().mean() >= SMALLEST_REGION:
-            chosen.append((view, truths, region))
-        if len(chosen) == most:
-            break
-    if not chosen:
-        raise DataError("no view shows enough of what the reference image hides", sequence=name)
-    views, images, regions = zip(*chosen, strict=True)
-    return Shown(list(views), torch.stack(images, dim=1), torch.stack(regions))
-
-
-def spread_views(frames: int, reference: int, count: int) -> list[int]:
-    """Return the indices of `count` evenly spread views other than the reference."""
-    others = [view for view in range(frames) if view != reference]
-    return [others[place - 1] for place in evaluation_views(frames, count)[1]]
+    def _truths(self, name: str, views: Iterable[int]) -> Float[Tensor, "mode view 3 size size"]:
+        """Return the images of some views in every mode."""
+        sequences = [(store, store.source.read(name)) for store in self.modes]
+        images = [[store.image(sequence, view) for store, sequence in sequences] for view in views]
+        return torch.stack([torch.stack(modes) for modes in images], dim=1).float() / 255

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from completesplat.files import atomic_path, write_text
 from completesplat.metrics import PSNR_LIMIT
-from completesplat.results.runs import MODEL, UPPER_BOUND, Protocol, flat
+from completesplat.results.runs import MODEL, UPPER_BOUND, Protocol, Scores, flat
 
 if TYPE_CHECKING:
     from rich.table import Table as PrintedTable
@@ -197,11 +197,7 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = M
         model: the label of the predictor that is the model.
     """
     records = [flat(entry) for entry in results.values()]
-    names = [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]
-    pairs = [(name, name.replace("object", "full")) for name in EVALUATED]
-    masked = any(record.get(name) != record.get(whole) for record in records for name, whole in pairs)
-    # Without masks, every pixel is the object's; with them, sharpness is the object's.
-    names = [name for name in names if not name.startswith("full_novel_sharpness" if masked else "object")]
+    names = _reported(records)
     headings = [Heading("predictor", figures=False)]
     for name in names:
         region, view, kind = name.split("_")
@@ -214,6 +210,16 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = M
         rows.append(TableRow("", [Cell(label + bound), *(score_cell(name, scores.get(name)) for name in names)]))
     title = f"{records[0]['scenes']:.0f} scenes, {records[0]['views']:.0f} novel views"
     return Table(title, title, headings, rows, [*fitted, SSIM_NOTE, SHARPNESS_NOTE])
+
+
+def _reported(records: Sequence[Scores]) -> list[str]:
+    """Return the names of the scores in the table: object pixels only if there are masks."""
+    names = [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]
+    pairs = [(name, name.replace("object", "full")) for name in EVALUATED]
+    masked = any(record.get(name) != record.get(whole) for record in records for name, whole in pairs)
+    # Without masks, every pixel is the object's; with them, sharpness is the object's.
+    unreported = "full_novel_sharpness" if masked else "object"
+    return [name for name in names if not name.startswith(unreported)]
 
 
 def show(*tables: Table, width: int = 120) -> None:

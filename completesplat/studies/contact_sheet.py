@@ -1,18 +1,13 @@
-"""Contact sheet of several sequences and their cameras, on which a wrong convention is obvious."""
+"""Contact sheet of several sequences with one marked point each, on which a wrong convention is obvious."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
@@ -20,15 +15,13 @@ from completesplat.data.loading.training_statistics import world_up
 from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.errors import DataError
 from completesplat.export.images import INK, MARGIN, PAPER, SheetCell, image_sheet, write_png
-from completesplat.geometry.cameras import Cameras, nearest_to_axes, project, transform_points, unproject
+from completesplat.geometry.cameras import Cameras, nearest_to_axes, project, transform_points
 
-Points = Float[Tensor, "_ 3"]
-CELL = 216
+CELL, FEWEST_CELLS = 216, 3  # pixels of an image; the title needs the width of three
 GREY, MASK = (190, 190, 190), (255, 220, 0)
-LEGEND = """Images: a cross marks one point of each scene and must stay at it in all frames;
-red: to the first camera's right, green: up, blue: ahead; yellow: mask.
-Cameras: the first is black, later ones go from dark blue to orange; a tick marks the image's upper edge;
-grey bar: depth range of the first (no end tick: cut off); right, up and ahead are the first camera's."""
+CROSS_COLORS = ((220, 30, 30), (20, 150, 20), (40, 80, 255))
+LEGEND = """A cross marks one point of each scene and must stay at it in all frames;
+red: to the first camera's right, green: up, blue: ahead; yellow: mask."""
 
 # Length of an arm as the first camera sees it, in units of half its image's width.
 ARM = 0.3
@@ -106,83 +99,13 @@ def _common_point(cameras: Cameras) -> Float[Tensor, "3"] | None:
     return point if met else None
 
 
-FRUSTUM = 0.14
-# The depth range is drawn up to this multiple of the extent of everything else.
-REACH = 2.5
-MOST_FRUSTA = 25
-CROSS_COLORS = ((220, 30, 30), (20, 150, 20), (40, 80, 255))
-EDGES = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (5, 6)]
-VIEWS = {"from above": (0, 2), "from the side": (2, 1)}
-"""Axes (of right, up and ahead) to the right and to the top of each drawing."""
-
-
-def frusta(cameras: Cameras, depth: float) -> Float[Tensor, "view 7 3"]:
-    """Return apex, corners of the image at this depth, and a tick upwards from the middle of its upper edge."""
-    height, width = cameras.image_size
-    pixels = [(0, 0), (width, 0), (width, height), (0, height), (width / 2, 0), (width / 2, -height / 5)]
-    places, depths = (torch.tensor(values).to(cameras.intrinsics) for values in (pixels, [depth] * 6))
-    return torch.cat([cameras.centers[:, None], unproject(cameras, places, depths)], dim=1)
-
-
-def drawn_range(sequence: PosedSequence, cross: Cross) -> tuple[Float[Tensor, "2 3"], bool]:
-    """Return the ends of the first camera's depth range as drawn, and whether the far end is cut off."""
-    cameras, centers = sequence.cameras, sequence.cameras.centers
-    near, far = sequence.depth_ranges[0].tolist()
-    reach = REACH * max(near, _extent(centers), (cross.center - centers[0]).norm().item())
-    depths = torch.tensor([near, min(far, reach)]).to(centers)
-    return centers[0] + depths[:, None] * cameras.world_to_camera[0, 2, :3], far > reach
-
-
-def drawings(sequence: PosedSequence, cross: Cross, side: int) -> dict[str, UInt8[np.ndarray, "side side 3"]]:
-    """Draw cameras, depth range and cross in the units of the scene, as seen in each of `VIEWS`.
-
-    The axes are those of `level_axes`. The cameras' colours show their order in time.
-    """
-    axes, centers = level_axes(sequence.cameras), sequence.cameras.centers
-    depth_range, cut = drawn_range(sequence, cross)
-    content = torch.cat([centers, depth_range, cross.ends().flatten(0, 1)])
-    pyramids = frusta(sequence.cameras, FRUSTUM * _extent(content))
-    count = len(centers)
-    chosen = [*range(count - 1, 0, -max(1, math.ceil(count / MOST_FRUSTA))), 0]
-    images = {}
-    for view, plane in VIEWS.items():
-        figure = Figure(figsize=(side / 100, side / 100), dpi=100, layout="constrained")
-        panel = figure.subplots()
-        line = partial(_line, panel, axes[list(plane)])
-        line(centers, "0.8", 1)
-        for index in chosen:
-            color = colormaps["plasma"](0.85 * index / (count - 1)) if index else "k"
-            for edge in EDGES:
-                line(pyramids[index, list(edge)], color, 1)
-            line(centers[[index]], color, 1, "." if index else "o")
-        line(depth_range, "0.67", 3, "" if cut else "|")
-        for arm, color in zip(cross.ends(), CROSS_COLORS, strict=True):
-            line(arm, [value / 255 for value in color], 2)
-        panel.set_aspect("equal", adjustable="datalim")
-        panel.tick_params(labelsize=6)
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()  # type: ignore[no-untyped-call]
-        images[view] = np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
-    return images
-
-
-def _line(
-    panel: Axes, plane: Tensor, points: Points, color: str | Sequence[float], width: float, marker: str = ""
-) -> None:
-    panel.plot(*(plane @ points.mT).cpu(), color=color, linewidth=width, marker=marker)
-
-
-def _extent(points: Points) -> float:
-    return float((points.amax(dim=0) - points.amin(dim=0)).max())
-
-
 def show(sequences: Sequence[PosedSequence], path: Path, images: int, title: str) -> None:
-    """Write a PNG with a row for each sequence: some images, and its cameras from above and from the side.
+    """Write a PNG with a row of images for each sequence.
 
     The images are evenly spaced from first to last frame. An unreadable image is a grey cell with the error's kind.
     """
     rows = [_row(sequence, images) for sequence in sequences]
-    header = Image.new("RGB", (rows[0].width, MARGIN + 100), PAPER)
+    header = Image.new("RGB", (rows[0].width, MARGIN + 60), PAPER)
     ImageDraw.Draw(header).text((MARGIN, MARGIN), f"{title}\n{LEGEND}", INK, ImageFont.load_default(size=13))
     write_png(path, Image.fromarray(np.concatenate([np.asarray(part) for part in (header, *rows)])))
 
@@ -191,12 +114,12 @@ def _row(sequence: PosedSequence, images: int) -> Image.Image:
     cross = place_cross(sequence.cameras, sequence.depth_ranges[0])
     chosen = np.unique(np.linspace(0, len(sequence.frames) - 1, images).round().astype(int)).tolist()
     cells: list[SheetCell | None] = [_image_cell(sequence, index, cross) for index in chosen]
-    cells += [None] * (images - len(chosen))
-    cells += [SheetCell(_tensor(image), view) for view, image in drawings(sequence, cross, CELL).items()]
+    width = max(images, FEWEST_CELLS)
+    cells += [None] * (width - len(chosen))
     (near, far), (focal, *_) = sequence.depth_ranges[0].tolist(), sequence.cameras.intrinsics[0, 0].tolist()
     fov = math.degrees(2 * math.atan(sequence.cameras.image_size[1] / 2 / focal))
     numbers = f"{len(sequence.frames)} cameras, field of view {fov:.1f}°, near {near:.3g}, far {far:.3g}"
-    return image_sheet([f"{sequence.name}: {numbers}", *[""] * (images + 1)], [cells])
+    return image_sheet([f"{sequence.name}: {numbers}", *[""] * (width - 1)], [cells])
 
 
 def _image_cell(sequence: PosedSequence, index: int, cross: Cross) -> SheetCell:

@@ -5,8 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from completesplat.data.captures.capture import Capture
-from completesplat.data.captures.module import CaptureSource, read_capture
+from completesplat.data.captures.module import CaptureSource, read_captures
 from completesplat.data.co3d.splits import SeededSplit, split_by_seed
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
@@ -18,10 +17,8 @@ from completesplat.data.validation import (
     at,
     field,
     read_json,
-    refused_to,
     require_file,
 )
-from completesplat.errors import DataError
 from completesplat.settings.schema import Natural, Share
 
 SPLITS_FILE = "splits.json"
@@ -45,18 +42,21 @@ def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
         SharedSequences: two splits have captures of one object.
     """
     content, splits = read_json(path), dict[str, list[str]]()
+    owners: dict[str, str] = {}
     with at(path):
         for split in SPLITS:
-            listed = field(content, split, list) if split in content else []
-            for entry in listed:
-                if not any(name == entry or name.startswith(f"{entry}/") for name in names):
+            entries = field(content, split, list) if split in content else []
+            members = set[str]()
+            for entry in entries:
+                named = [name for name in names if name == entry or name.startswith(f"{entry}/")]
+                if not named:
                     raise BadAnnotation(f"{split} names {repr(entry)[:80]}, which is no capture nor a folder of them")
-            splits[split] = [name for name in names if name in listed or any(name.startswith(f"{x}/") for x in listed)]
-        owners: dict[str, str] = {}
-        for split in SPLITS:
+                members.update(named)
+            splits[split] = [name for name in names if name in members]
             for name in splits[split]:
-                if owners.setdefault(object_of(name), split) != split:
-                    raise SharedSequences(f"{object_of(name)} is in both {owners[object_of(name)]} and {split}")
+                owner = owners.setdefault(object_of(name), split)
+                if owner != split:
+                    raise SharedSequences(f"{object_of(name)} is in both {owner} and {split}")
     return splits
 
 
@@ -103,15 +103,10 @@ class CaptureSetDataModule(ObjectDataModule):
 
     def open(self, split: str) -> Mapping[str, CaptureSource]:
         """Read the cameras of all captures; one that cannot be read is only refused, unless all are."""
-        captures: dict[str, Capture] = {}
-        refused: list[DataError] = []
         if not self.root.is_dir():
             raise MissingFile("no such folder", str(self.root))
-        for folder in _capture_folders(self.root):
-            name = folder.relative_to(self.root).as_posix()
-            with refused_to(refused.append), at(sequence=name):
-                if (capture := read_capture(folder)) is not None:
-                    captures[name] = capture
+        folders = {folder.relative_to(self.root).as_posix(): folder for folder in _capture_folders(self.root)}
+        captures, refused = read_captures(folders)
         if not captures:
             raise refused[0] if refused else MissingFile("no folders with transforms.json or sparse/0", str(self.root))
         members = self._members(list(captures))

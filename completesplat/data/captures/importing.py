@@ -11,7 +11,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Literal, Unpack
 
-from PIL import Image, ImageOps
+from PIL import ImageOps
 from rich.progress import Progress, track
 
 from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
@@ -21,6 +21,7 @@ from completesplat.data.images.files import (
     FORMATS,
     MOST_PIXELS,
     check_sums,
+    image_files,
     opened,
     refused_as_bad,
     save_image,
@@ -119,14 +120,16 @@ def _copy_photos(folder: Path, images: Path) -> None:
 
 def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
     """Return the photos in a folder or, if there are none, in the folders below it; name files of other formats."""
-    suffixes = {suffix for suffix, kind in Image.registered_extensions().items() if kind in formats}
-    levels = [sorted(filter(Path.is_file, folder.glob(level))) for level in ("[!.]*", "[!.]*/[!.]*")]
-    photos = [[path for path in files if path.suffix.lower() in suffixes] for files in levels]
-    level = int(not photos[0] and bool(photos[1] or not levels[0]))
-    if others := sorted({path.name for path in levels[level]} - {path.name for path in photos[level]}):
+    folders, below = [folder], sorted(folder.glob("[!.]*/"))
+    photos = image_files(folder, formats)
+    if not photos:
+        photos = [photo for path in below for photo in image_files(path, formats)]
+        folders = below if photos else [folder, *below]
+    files = {path for searched in folders for path in searched.glob("[!.]*") if path.is_file()}
+    if others := sorted({path.name for path in files.difference(photos)}):
         advice = "" if "HEIF" in formats else '; HEIC needs: pip install "completesplat[heic]"'
         logger.warning("left out: %d files of other formats: %s%s", len(others), shortened(others), advice)
-    return photos[level]
+    return photos
 
 
 def _photo_formats() -> tuple[str, ...]:

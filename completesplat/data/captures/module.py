@@ -61,21 +61,42 @@ def read_capture(folder: Path) -> Capture | None:
     Returns:
         The capture, or None if the folder has none.
     """
-    for transforms in (folder / name for name in TRANSFORMS) if folder.suffix != ".json" else (folder,):
-        if transforms.is_file():
-            return read_transforms(transforms)
-    if (folder / "keyframes/cameras").is_dir() or (folder / "keyframes/corrected_cameras").is_dir():
+    files = [folder] if folder.suffix == ".json" else [folder / name for name in TRANSFORMS]
+    for transforms in filter(Path.is_file, files):
+        return read_transforms(transforms)
+    if any((folder / "keyframes" / cameras).is_dir() for cameras in ("cameras", "corrected_cameras")):
         return read_polycam(folder / "keyframes")
-    groups = ([path for path in sorted(folder.glob(pattern)) if is_model(path)] for pattern in MODELS)
-    if not (found := [models for models in groups if models]):
+    model = _largest_model(folder)
+    if model is None:
         return None
-    models = next((models for models in found if _images(models[0], folder).is_dir()), found[0])
-    model = max(models, key=image_count) if len(models) > 1 else models[0]
-    if len(models) > 1:
-        logger.warning("%s: the largest of %d models, with %d images", model, len(models), image_count(model))
     images = _images(model, folder)
     masks = images.with_name("masks")
     return read_colmap(model, images, masks if masks.is_dir() else None)
+
+
+def _largest_model(folder: Path) -> Path | None:
+    """Return the largest model of the first of `MODELS` whose images are there, else of the first that has models."""
+    groups = [[path for path in sorted(folder.glob(pattern)) if is_model(path)] for pattern in MODELS]
+    groups = [models for models in groups if models]
+    if not groups:
+        return None
+    models = next((models for models in groups if _images(models[0], folder).is_dir()), groups[0])
+    if len(models) == 1:
+        return models[0]
+    model = max(models, key=image_count)
+    logger.warning("%s: the largest of %d models, with %d images", model, len(models), image_count(model))
+    return model
+
+
+def read_captures(folders: Mapping[str, Path]) -> tuple[dict[str, Capture], list[DataError]]:
+    """Read the captures in some of the folders, by name; return also the errors of those that cannot be read."""
+    captures, refused = dict[str, Capture](), list[DataError]()
+    for name, folder in folders.items():
+        with refused_to(refused.append), at(sequence=name):
+            capture = read_capture(folder)
+            if capture is not None:
+                captures[name] = capture
+    return captures, refused
 
 
 def _images(model: Path, folder: Path) -> Path:
@@ -197,16 +218,10 @@ class CaptureDataModule(ObjectDataModule):
                 logger.warning("%s: left by an import that was interrupted: start it again", left)
         if not self.root.exists():
             raise MissingFile("no such file or folder", str(self.root))
-        captures: dict[str, Capture] = {}
-        refused: list[DataError] = []
-        folders = [self.root, *sorted(path for path in self.root.glob("[!.]*/") if path.is_dir())]
-        for folder in folders:
-            name = folder.resolve().name or "capture"
-            with refused_to(refused.append), at(sequence=name):
-                if (capture := read_capture(folder)) is not None:
-                    captures[name] = capture
-            if folder == self.root and (captures or refused):
-                break
+        captures, refused = read_captures({self.root.resolve().name or "capture": self.root})
+        if not captures and not refused:
+            folders = sorted(path for path in self.root.glob("[!.]*/") if path.is_dir())
+            captures, refused = read_captures({folder.resolve().name: folder for folder in folders})
         if not captures:
             command = shlex.join(["completesplat", "data", "import", str(self.root), "cameras=colmap"])
             message = "no cameras there: neither transforms.json nor sparse/0, nor folders that have one; photos or a "

@@ -85,24 +85,14 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
     """
     folders = _folders_of_photos(folder)
     splits = {} if settings["splits"] is None else read_splits(Path(settings["splits"]), list(folders))
-    count = settings["photos_of_a_turn"]
-    counts = read_json(Path(count)) if isinstance(count, str) else dict.fromkeys(folders, count)
     for name in folders:
         if (out / name).exists():
             raise DataError("exists already: choose another out=DIR", str(out / name))
-    unfinished, refused = out / ".turntable.unfinished", list[DataError]()
+    unfinished = out / ".turntable.unfinished"
     shutil.rmtree(unfinished, ignore_errors=True)
-    turns: dict[str, Turn] = {}
     try:
         with writing(out, temporary=unfinished):
-            for name, photos in track(folders.items(), "turns"):
-                with refused_to(refused.append), at(sequence=name):
-                    known = None if count is None else field(counts, name, int)
-                    turns[name] = _write_turn(photos, known, unfinished / name, settings)
-            if not turns:
-                raise refused[0]
-            for error in refused:
-                logger.warning("left out: %s", error)
+            turns = _write_turns(folders, unfinished, settings)
             _write_cameras(turns, unfinished, settings["direction"])
             write_sheet(turns, out / "sheet.png")
             if splits:
@@ -113,6 +103,22 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
                 (unfinished / name).rename(out / name)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def _write_turns(folders: Mapping[str, Path], out: Path, settings: TurntableSettings) -> dict[str, Turn]:
+    """Write images and masks of all turns that can be used, and return their findings; name the others."""
+    count = settings["photos_of_a_turn"]
+    counts = read_json(Path(count)) if isinstance(count, str) else dict.fromkeys(folders, count)
+    turns, refused = dict[str, Turn](), list[DataError]()
+    for name, photos in track(folders.items(), "turns"):
+        with refused_to(refused.append), at(sequence=name):
+            known = None if count is None else field(counts, name, int)
+            turns[name] = _write_turn(photos, known, out / name, settings)
+    if not turns:
+        raise refused[0]
+    for error in refused:
+        logger.warning("left out: %s", error)
+    return turns
 
 
 def _write_cameras(turns: Mapping[str, Turn], folder: Path, direction: int | None) -> None:

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from completesplat.data.co3d.source import CO3DSource
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
+from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.errors import DataError
@@ -91,3 +92,14 @@ class CO3DDataModule(ObjectDataModule):
             raise DataError(f"{counted}; data.max_bad_fraction=1 uses the others", str(self.root / self.category))
         splits = {split: members.without(absent, "not downloaded") for split, members in splits.items()}
         return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}
+
+    def written_modes(
+        self, record: str, chances: Mapping[str, float], views: int, spread_views: int
+    ) -> HiddenModeScenes:
+        """Return the test scenes with the modes that were written beside their images; see `HiddenModeScenes`.
+
+        Args:
+            record: name of the record in a sequence's folder.
+        """
+        folder = self.root / self.category
+        return HiddenModeScenes(self.store("test"), lambda name: folder / name / record, chances, views, spread_views)

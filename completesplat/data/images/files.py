@@ -2,7 +2,7 @@
 
 import io
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
@@ -87,10 +87,11 @@ def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height w
     return torch.from_numpy(depth * np.float32(scale_adjustment))[None]
 
 
-def image_files(folder: Path) -> list[Path]:
-    """Return the files in a folder whose suffix is that of an image, `r_2` before `r_10`."""
-    suffixes = {suffix for suffix, kind in Image.registered_extensions().items() if kind in FORMATS}
-    return sorted((path for path in folder.iterdir() if path.suffix.lower() in suffixes), key=by_numbers)
+def image_files(folder: Path, formats: Sequence[str] = FORMATS) -> list[Path]:
+    """Return the files in a folder whose suffix is that of an image, `r_2` before `r_10`, without hidden ones."""
+    suffixes = {suffix for suffix, kind in Image.registered_extensions().items() if kind in formats}
+    images = (path for path in folder.glob("[!.]*") if path.suffix.lower() in suffixes and path.is_file())
+    return sorted(images, key=by_numbers)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from PIL import Image, ImageCms
 from torch import Tensor
 
-from completesplat.data.images.exif import ORIENTATION, crop_fov, read_exif
+from completesplat.data.images.exif import ORIENTATION, Tags, crop_fov, read_exif
 from completesplat.data.images.files import (
     EIGHT_BIT_MODES,
     SIXTEEN_BIT_MODES,
@@ -105,26 +105,7 @@ def _square(
     source: ImageLike, size: int, remove_background: bool, background: float, object_share: float | None
 ) -> tuple[Float[Tensor, "3 size size"], float | None]:
     """Return the resized central or object square, and the central square's EXIF field of view in degrees, if any."""
-    if isinstance(source, (np.ndarray, Tensor)):
-        source = _pixels(source)
-    if not isinstance(source, str | Path | Image.Image):
-        raise ImageError(f"{type(source).__name__}: give a file name, a PIL image, an array or a tensor")
-    if not isinstance(source, Image.Image):
-        try:
-            exists = Path(source).is_file()
-        except OSError as error:  # such as a name that is too long
-            raise ImageError(str(error.strerror)) from error
-        if not exists:
-            raise ImageError("no such file")
-        if not os.path.getsize(source):
-            raise ImageError("the file is empty")
-    with nullcontext(source) if isinstance(source, Image.Image) else opened(source, FORMATS) as file:
-        if min(file.size) < SMALLEST_SIDE:
-            raise ImageError(f"{file.size} pixels; at least {SMALLEST_SIDE} on a side are needed")
-        if not isinstance(source, Image.Image):
-            check_sums(file, source)
-        file.load()
-        exif = read_exif(file)
+    file, exif = _loaded(source)
     seen = upright(file, exif.get(ORIENTATION))
     if object_share is None:
         seen = seen.crop(_central_square(*seen.size))
@@ -135,6 +116,35 @@ def _square(
     if object_share is not None:
         seen = _around_object(seen, object_share) or seen.crop(_central_square(*seen.size))
     return _to_tensor(seen, file, size, background), crop_fov(exif, file.size)
+
+
+def _loaded(source: ImageLike) -> tuple[Image.Image, Tags]:
+    """Return an image with its pixels, as it is stored, and its EXIF tags."""
+    if isinstance(source, np.ndarray | Tensor):
+        source = _pixels(source)
+    if isinstance(source, str | Path):
+        _require_content(Path(source))
+    elif not isinstance(source, Image.Image):
+        raise ImageError(f"{type(source).__name__}: give a file name, a PIL image, an array or a tensor")
+    with nullcontext(source) if isinstance(source, Image.Image) else opened(source, FORMATS) as file:
+        if min(file.size) < SMALLEST_SIDE:
+            raise ImageError(f"{file.size} pixels; at least {SMALLEST_SIDE} on a side are needed")
+        if not isinstance(source, Image.Image):
+            check_sums(file, source)
+        file.load()
+        return file, read_exif(file)
+
+
+def _require_content(path: Path) -> None:
+    """Refuse a file that does not exist or is empty."""
+    try:
+        exists = path.is_file()
+    except OSError as error:  # such as a name that is too long
+        raise ImageError(str(error.strerror)) from error
+    if not exists:
+        raise ImageError("no such file")
+    if not os.path.getsize(path):
+        raise ImageError("the file is empty")
 
 
 def _around_object(image: Image.Image, share: float) -> Image.Image | None:

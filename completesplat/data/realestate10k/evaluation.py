@@ -1,7 +1,7 @@
 """Test clips and test views of RealEstate10K, from the lists that were published with other works."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -94,28 +94,43 @@ def choose_clips(source: SequenceSource, index: EvaluationIndex | None, listed: 
 
     Log the number of tests and the clips that are left out, as a warning if some of them are missing in the data.
     """
-    keys, known, left_out = source.names, set(source.names), dict[str, list[str]]()
+    keys, tests = source.names, dict[str, list[Choice]]() if index is None else index.views
+    left_out, absent = dict[str, list[str]](), set[str]()
     if index is not None:
-        left_out["null in the index"] = [key for key, tests in index.views.items() if not tests]
-        left_out["in the index, not in the data"] = [k for k, tests in index.views.items() if tests and k not in known]
-        left_out["not in the index"] = [key for key in keys if key not in index.views]
-        keys = [key for key in keys if index.views.get(key)]
-    if listed is not None:
-        left_out["in the list, not in the data"] = [key for key in dict.fromkeys(listed) if key not in known]
-        left_out["not in the list"] = [key for key in keys if key not in set(listed)]
-        keys = [key for key in keys if key in set(listed)]
-    clips, views = {key: key for key in keys} if index is None else {}, dict[str, Choice]()
-    for key in keys:
-        choices = [] if index is None else index.views[key]
-        for number, choice in enumerate(choices, 1):
-            name = f"{key}#{number}" if len(choices) > 1 else key
-            clips[name], views[name] = key, choice
-    parts = [f"{len(them)} {why}" + (f" ({shortened(them)})" if them else "") for why, them in left_out.items()]
-    absent = {key for reason, them in left_out.items() if reason.endswith("not in the data") for key in them}
-    tests = f"{len(clips)} scenes of {len(keys)} clips" if len(keys) < len(clips) else f"{len(keys)} clips"
-    reasons = f"; left out: {', '.join(parts)}" if parts else ""
-    logger.log(logging.WARNING if absent else logging.INFO, "%s to test%s", tests, reasons)
+        left_out["null in the index"] = [key for key in tests if not tests[key]]
+        keys = [key for key in keys if tests.get(key) != []]
+    wanted = {"index": None if index is None else [key for key in tests if tests[key]], "list": listed}
+    for what, names in wanted.items():
+        if names is not None:
+            selected, known = set(names), set(source.names)
+            missing = [name for name in dict.fromkeys(names) if name not in known]
+            left_out[f"in the {what}, not in the data"] = missing
+            left_out[f"not in the {what}"] = [key for key in keys if key not in selected]
+            keys = [key for key in keys if key in selected]
+            absent.update(missing)
+    clips, views = _named_tests(keys, tests)
+    _report(len(clips), len(keys), left_out, logging.WARNING if absent else logging.INFO)
     return ChosenSource(source, clips, views, len(clips) + len(absent))
+
+
+def _named_tests(keys: Sequence[str], tests: Mapping[str, list[Choice]]) -> tuple[dict[str, str], dict[str, Choice]]:
+    """Return clips and views by the name of their test; clips without an index are their own tests."""
+    clips, views = dict[str, str](), dict[str, Choice]()
+    for key in keys:
+        choices = tests.get(key, [])
+        names = [key] if len(choices) < 2 else [f"{key}#{number}" for number in range(1, len(choices) + 1)]
+        clips |= dict.fromkeys(names, key)
+        views |= dict(zip(names, choices, strict=False))  # without an index there are no choices
+    return clips, views
+
+
+def _report(scenes: int, clips: int, left_out: Mapping[str, list[str]], level: int) -> None:
+    """Log the number of tests, and the clips that are left out by reason."""
+    parts = [
+        f"{len(names)} {reason}" + (f" ({shortened(names)})" if names else "") for reason, names in left_out.items()
+    ]
+    counted = f"{scenes} scenes of {clips} clips" if clips < scenes else f"{clips} clips"
+    logger.log(level, "%s to test%s", counted, f"; left out: {', '.join(parts)}" if parts else "")
 
 
 def _from_table(content: object) -> EvaluationIndex:

@@ -30,6 +30,7 @@ from completesplat.data.co3d.writing import (
     write_frame,
     write_points,
 )
+from completesplat.data.hidden_modes import in_mode
 from completesplat.data.images.files import save_jpeg, to_bytes
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
 from completesplat.data.rendered.drawing import RenderSettings, check_surroundings, draw_scene
@@ -150,7 +151,6 @@ def render(
     max_minutes: Annotated[float, Range(0)],
     blender: str | None = None,
     workers: Positive | None = None,
-    progress: bool = True,
     **settings: Unpack[RenderSettings],
 ) -> Path:
     """Render objects into `out`/rendered, and return this folder.
@@ -186,7 +186,7 @@ def render(
             (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
     waiting = [asset for asset in objects if not (category / asset.name).exists()]
     write_one = partial(_write_object, category, program, settings, (MEGABYTE * max_megabytes, max_minutes))
-    results = track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting), disable=not progress)
+    results = track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting))
     broken = {name: reason for name, reason in sorted(results) if reason}
     _write_lists(category, broken)
     return category
@@ -289,11 +289,6 @@ def _write_modes(folder: Path, modes: Sequence[str], files: Path) -> None:
         prefix = f"{index}_" if index else ""
         for number, image in enumerate(sorted((folder / "images").iterdir())):
             save_jpeg(_pixels(files / f"{prefix}{number:04d}.png"), in_mode(image, mode))
-
-
-def in_mode(image: Path, mode: str) -> Path:
-    """Return the path of an image with another paint of the back."""
-    return image.parent.parent / mode / image.name
 
 
 def _pixels(path: Path) -> Float[np.ndarray, "height width 3"]:

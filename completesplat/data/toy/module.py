@@ -1,32 +1,33 @@
 """Data modules of toy objects and rooms, which write their own data."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
-from completesplat.data.toy.modes import ToyHiddenModes
-from completesplat.data.toy.writing import ROOMS, SUBSET, write
-from completesplat.data.validation import MissingFile
+from completesplat.data.toy.object_scene import PATCH_COLORS
+from completesplat.data.toy.writing import DESCRIPTION, FORMAT_VERSION, ROOMS, SUBSET, Numbers, write
+from completesplat.data.validation import MissingFile, at, field, read_json
+from completesplat.errors import DataError
 from completesplat.settings.schema import Natural, Positive, Side
 
 OWN_PLACE = Path("outputs/data")
 """Folder below which toy data are written without `make`; `data.root` of `conf/data/toy_*.yaml` lies there."""
 
 
-def _provide(kind: str, root: Path, make: bool, numbers: tuple[int, int, int, int]) -> None:
+def _provide(kind: str, root: Path, make: bool, numbers: Numbers) -> None:
     """Write data of a kind unless there are complete data (with `toy.json`) or prepared ones.
 
     Without `make`, refuse folders outside of `OWN_PLACE`, because their name may be a typing error.
     """
-    if is_packed(root) or (root / f"toy_{kind}" / "toy.json").is_file():
+    if is_packed(root) or (root / f"toy_{kind}" / DESCRIPTION).is_file():
         return
     if not make and not root.is_relative_to(OWN_PLACE):
         message = "no toy data: data.make=true makes them there, and so does completesplat data toy"
         raise MissingFile(message, str(root))
-    write(kind, root, *numbers)
+    write(kind, root, **numbers)
 
 
 class ToyObjectsDataModule(CO3DDataModule):
@@ -51,7 +52,8 @@ class ToyObjectsDataModule(CO3DDataModule):
         **reading: Any,
     ) -> None:
         super().__init__(root, category, subset, depth_before=depth_before, **reading)
-        self.make, self.making = make, (scenes, frames, self.image_size, data_seed)
+        self.make = make
+        self.making = Numbers(scenes=scenes, frames=frames, size=self.image_size, seed=data_seed)
 
     def describe(self) -> dict[str, str | None]:
         return super().describe() | {"data_set": self.category}
@@ -60,11 +62,19 @@ class ToyObjectsDataModule(CO3DDataModule):
         """Write the scenes if there are none."""
         _provide(self.category.removeprefix("toy_"), self.root, self.make, self.making)
 
-    def hidden_modes(self, views: int, spread_views: int) -> ToyHiddenModes:
-        """Return the test scenes with all possible colours of the patch on the back; see `ToyHiddenModes`."""
-        store = self.store("test")
-        choose = partial(self.evaluation_views, split="test")
-        return ToyHiddenModes(self.root / self.category, store, choose, self.image_size, views, spread_views)
+    def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
+        """Return the test scenes with all possible colours of the patch on the back.
+
+        Raises:
+            DataError: the toy objects are of another version, or prepared data.
+        """
+        description = self.root / self.category / DESCRIPTION
+        if not description.is_file():
+            raise DataError(f"no {DESCRIPTION}: hidden modes need toy objects as they were written", str(description))
+        with at(description):
+            if field(read_json(description), "format", int) != FORMAT_VERSION:
+                raise DataError("of another version: write the toy objects again into another folder")
+        return self.written_modes(DESCRIPTION, dict.fromkeys(PATCH_COLORS, 1 / len(PATCH_COLORS)), views, spread_views)
 
 
 class ToyRoomsDataModule(RE10KDataModule):
@@ -86,7 +96,8 @@ class ToyRoomsDataModule(RE10KDataModule):
     ) -> None:
         home = Path(root)
         super().__init__(str(home if is_packed(home) else home / ROOMS / "text"), **reading)
-        self.home, self.make, self.making = home, make, (scenes, frames, height, data_seed)
+        self.home, self.make = home, make
+        self.making = Numbers(scenes=scenes, frames=frames, size=height, seed=data_seed)
 
     def describe(self) -> dict[str, str]:
         return super().describe() | {"data_set": ROOMS}

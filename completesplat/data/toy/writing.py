@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypedDict, Unpack
 
 import numpy as np
 from rich.console import Console
@@ -22,8 +22,9 @@ from completesplat.data.co3d.writing import (
     write_points,
     write_set_list,
 )
+from completesplat.data.hidden_modes import in_mode
 from completesplat.data.images.files import save_jpeg, to_bytes
-from completesplat.data.toy.object_scene import ToyScene, draw_mini, draw_scene, render_frame
+from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_mini, draw_scene, render_frame
 from completesplat.data.toy.raytracing import WHITE
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
 from completesplat.data.toy.shapes import Array
@@ -32,7 +33,8 @@ from completesplat.errors import DataError
 from completesplat.files import atomic_folder
 from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
+DESCRIPTION = "toy.json"
 MOST_FRAMES = 1000
 ROOM_FRAMES_PER_SECOND = 30
 MICROSECONDS = 1_000_000
@@ -47,6 +49,17 @@ DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
 """Functions that draw a scene, by category: (random generator, number of frames) -> scene."""
 
 KINDS = [*(category.removeprefix("toy_") for category in DRAW), "rooms"]
+
+
+class Numbers(TypedDict):
+    """Number of scenes, of frames of each, side or height of the images in pixels, and seed of all scenes."""
+
+    scenes: int
+    frames: int
+    size: Side
+    seed: Natural
+
+
 Factors = Annotated[Sequence[Annotated[float, Range(0)]], Entries(3, 3)]
 Written = tuple[str, list[Annotation], Annotation]
 """Split of a sequence, and annotations of its frames and of itself."""
@@ -82,7 +95,10 @@ def draw(category: str, seed: int, index: int, frames: int, light: Array) -> Toy
 def _write_scene(
     root: Path, place: tuple[int, str], category: str, frames: int, size: int, seed: int, light: Array
 ) -> Written:
-    """Write one sequence and return its split and annotations; its `toy.json` reveals the colour of the patch."""
+    """Write one sequence and return its split and annotations; its `toy.json` reveals the colour of the patch.
+
+    A test scene has its images with every colour of the patch, too, for `test evaluation=hidden_modes`.
+    """
     index, split = place
     scene = draw(category, seed, index, frames, light)
     name = f"{index:05d}_{scene.family}"
@@ -91,9 +107,20 @@ def _write_scene(
     annotations = [_write_frame(root, (category, name, frame), scene, size, split) for frame in range(frames)]
     points = scene.unit * scene.points + scene.origin
     write_points(root / name / "pointcloud.ply", points, to_bytes(scene.point_colors))
-    hidden = {"family": scene.family, "patch_color": scene.patch_color}
-    (root / name / "toy.json").write_text(json.dumps(hidden) + "\n")
+    if split == "test":
+        _write_modes(root / name, scene, size)
+    record = {"family": scene.family, "hidden": scene.patch_color, "chances": scene.chances.tolist()}
+    (root / name / DESCRIPTION).write_text(json.dumps(record) + "\n")
     return split, annotations, sequence_annotation(category, name, len(points))
+
+
+def _write_modes(folder: Path, scene: ToyScene, size: int) -> None:
+    """Write the images with each colour of the patch into a folder of its name."""
+    for mode, color in PATCH_COLORS.items():
+        (folder / mode).mkdir()
+        painted = replace(scene, patch=scene.patch._replace(color=np.array(color)))
+        for frame, image in enumerate(sorted((folder / "images").iterdir())):
+            save_jpeg(render_frame(painted, frame, size)[0], in_mode(image, mode))
 
 
 def _write_lists(category: Path, written: list[Written]) -> None:
@@ -133,19 +160,15 @@ def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed
 def write(
     kind: str,
     out: Path,
-    scenes: int,
-    frames: int,
-    size: Side,
-    seed: Natural,
     workers: Positive | None = None,
     light: Factors = WHITE,
     progress: bool = True,
+    **numbers: Unpack[Numbers],
 ) -> Path:
     """Write scenes of a kind (one of `KINDS`) and return their folder, `out`/toy_<kind>, with a `toy.json`.
 
-    The files depend only on the number of scenes (at least 1, for rooms 2), the number of frames of each, the height
-    `size` of the images in pixels, the seed, and the light's colour. `workers` are processes (None: one for each core).
-    A folder that was made with the same settings remains unchanged.
+    The files depend only on the numbers (at least 1 scene, 2 rooms) and the light's colour. `workers` are processes
+    (None: one for each core). A folder that was made with the same settings remains unchanged.
 
     Raises:
         DataError: the kind is unknown, a number is out of its range, or the folder holds something else.
@@ -154,12 +177,14 @@ def write(
     if kind not in KINDS:
         raise DataError(f"no toy data of kind {kind!r}; there are: {', '.join(KINDS)}")
     folder, rooms = out / f"toy_{kind}", kind == "rooms"
-    numbers = {"scenes": scenes, "frames": frames, "size": size, "seed": seed}
-    for name, rule in {"scenes": Range(1 + rooms), "frames": Range(2, MOST_FRAMES), "size": Range(8)}.items():
-        if (reason := rule.refusal(numbers[name])) is not None:
-            raise DataError(f"{folder.name}: {name}={numbers[name]}: {reason}")
+    scenes, frames, size, seed = numbers["scenes"], numbers["frames"], numbers["size"], numbers["seed"]
+    rules = ("scenes", scenes, Range(1 + rooms)), ("frames", frames, Range(2, MOST_FRAMES)), ("size", size, Range(8))
+    for name, number, rule in rules:
+        reason = rule.refusal(number)
+        if reason is not None:
+            raise DataError(f"{folder.name}: {name}={number}: {reason}")
     parameters = {"format": FORMAT_VERSION, **numbers} | ({} if tuple(light) == WHITE else {"light": list(light)})
-    if is_written(folder / "toy.json", parameters):
+    if is_written(folder / DESCRIPTION, parameters):
         if progress:
             Console().print(f"{folder} already holds these scenes")
         return folder
@@ -170,7 +195,7 @@ def write(
         results = list(track(written, f"Rendering {folder.name}", scenes, disable=not progress))
         if not rooms:
             _write_lists(unfinished, results)
-        (unfinished / "toy.json").write_text(json.dumps(parameters, indent=1) + "\n")
+        (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1) + "\n")
     return folder
 
 

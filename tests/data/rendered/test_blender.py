@@ -60,7 +60,7 @@ def into(line, tmp_path):
     def run(out, program, **settings):
         given = meshes.SETTINGS | {"views": 2, "size": 8, "samples": 1, "blender": program} | settings
         with pytest.raises(DataError) as caught:
-            render(str(tmp_path / "meshes"), out=out, workers=1, progress=False, **given)
+            render(str(tmp_path / "meshes"), out=out, workers=1, **given)
         return str(caught.value)
 
     return run
@@ -163,7 +163,7 @@ def test_a_full_disk_is_no_reason_to_leave_meshes_out(line, program, tmp_path, m
     given["blender"] = program(VERSION.format("4.2.0") + "echo cannot write; exit 1")
     monkeypatch.setattr(files, "_asked", lambda path: OSError(errno.ENOSPC, "No space left on device"))
     with pytest.raises(DiskError, match="No space left on device"):
-        render(str(tmp_path / "meshes"), out=tmp_path / "data", workers=1, progress=False, **given)
+        render(str(tmp_path / "meshes"), out=tmp_path / "data", workers=1, **given)
     assert not (tmp_path / "data/rendered/broken.json").exists()
 
 

@@ -27,7 +27,7 @@ from completesplat.files import folder_names
 from completesplat.geometry.cameras import Cameras, look_at, pixel_rays, project
 
 pytestmark = pytest.mark.blender
-QUICK = meshes.SETTINGS | {"views": 3, "size": 32, "samples": 4, "workers": 1, "progress": False}
+QUICK = meshes.SETTINGS | {"views": 3, "size": 32, "samples": 4, "workers": 1}
 HALF = 1 / np.sqrt(3)
 """Half edge of the cube after scaling: its corners are at distance 1."""
 
@@ -188,7 +188,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_renders_that_were_killed_continue_without_half_written_scenes(cubes, tmp_path, number):
-    given = [f"{key}={QUICK[key]}" for key in QUICK.keys() - {"progress", "factory", "front"}]
+    given = [f"{key}={QUICK[key]}" for key in QUICK.keys() - {"factory", "front"}]
     command = ["data", "render", f"meshes={cubes / 'meshes'}", f"out={tmp_path}", *given]
     process = subprocess.Popen([sys.executable, "-P", "-m", "completesplat", *command], start_new_session=True)
     category = tmp_path / "rendered"

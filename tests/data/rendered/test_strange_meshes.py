@@ -17,7 +17,7 @@ from completesplat.data.rendered.rendering import render
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.ply_files import read_vertices
 
-QUICK = meshes.SETTINGS | {"views": 2, "size": 16, "samples": 1, "workers": 1, "progress": False}
+QUICK = meshes.SETTINGS | {"views": 2, "size": 16, "samples": 1, "workers": 1}
 
 
 @pytest.fixture(scope="module")

@@ -1,20 +1,11 @@
-"""The cross that stands at one place of a scene, and the drawings of its cameras."""
+"""The cross that stands at one place of a scene."""
 
 import math
 
-import numpy as np
 import torch
 
 from completesplat.geometry.cameras import Cameras, pinhole, project
-from completesplat.studies.contact_sheet import (
-    CROSS_COLORS,
-    drawings,
-    drawn_range,
-    frusta,
-    level_axes,
-    place_cross,
-    visible_segments,
-)
+from completesplat.studies.contact_sheet import level_axes, place_cross, visible_segments
 
 
 def close(first, second, tolerance=1e-9):
@@ -72,43 +63,3 @@ def test_segments_are_cut_off_before_the_camera():
     assert close(result[0], [[12.5, 5], [10, 5]], 1e-5)
     assert close(result[1], [[10, 5], [12.5, 5]], 1e-5)
     assert close(result[3], [[5, 7.5], [7.5, 7.5]], 1e-5)
-
-
-def test_frusta_end_in_the_corners_of_the_images_and_the_tick_is_above_them(orbit):
-    cameras = orbit(5, height=1.0, fov=70.0).cameras
-    pixels, depth = project(cameras, frusta(cameras, 0.5)[:, 1:])
-    corners = torch.tensor([[0, 0], [24, 0], [24, 24], [0, 24], [12, 0], [12, -4.8]]).double()
-    assert torch.allclose(pixels, corners.expand(5, 6, 2), atol=1e-6)
-    assert torch.allclose(depth, torch.tensor(0.5).double())
-
-
-def test_the_depth_range_is_drawn_along_the_first_axis_unless_it_makes_the_cameras_small(orbit):
-    def drawn(depths):
-        sequence = orbit(24, radius=2.0, depth_range=depths)  # the first camera is at +z
-        return drawn_range(sequence, crossed(sequence))
-
-    ends, cut = drawn((1.0, 3.0))
-    assert not cut
-    assert np.allclose(ends, [[0, 0, 1], [0, 0, -1]], atol=1e-6)
-    ends, cut = drawn((1.0, 1000.0))
-    assert cut
-    assert (ends[1] - ends[0]).norm() < 12
-    assert not drawn((90.0, 110.0))[1]  # another scale
-
-
-def middle(image, color):
-    """Mean (row, column) of the pixels of a colour."""
-    return np.argwhere((image == color).all(-1)).mean(0)
-
-
-def test_drawings_show_the_cross_from_above_and_from_the_side(walk):
-    sequence = walk((0.0, 0.0, 0.0), (1.0, -1.0, 2.0), depth_range=(0.5, 3.0))
-    images = drawings(sequence, crossed(sequence), 200)
-    for view, right_of, above in (("from above", 0, 2), ("from the side", 2, 1)):
-        image = images[view]
-        assert image.shape == (200, 200, 3)
-        (row, column), (other_row, other_column) = (middle(image, CROSS_COLORS[arm]) for arm in (right_of, above))
-        assert column > other_column + 1
-        assert row > other_row + 1
-    alone = drawings(walk((0.0, 0.0, 0.0)), crossed(sequence), 100)
-    assert alone["from above"].shape == (100, 100, 3)
