@@ -14,7 +14,6 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
-from torch.utils._pytree import tree_leaves
 
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import DivergenceError, WeightsError
@@ -42,8 +41,7 @@ class CheckpointFiles(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: object = None
     ) -> None:
         """Replace the file at this path; if the disk refuses, raise DiskError and keep the old file."""
-        size = sum(leaf.nbytes for leaf in tree_leaves(checkpoint) if isinstance(leaf, Tensor))
-        with _replaced(Path(path), size) as unfinished:
+        with _replaced(Path(path)) as unfinished:
             torch.save(checkpoint, unfinished)
 
     def load_checkpoint(self, path: str | os.PathLike[str], *options: object, **more: object) -> dict[str, Any]:
@@ -178,9 +176,9 @@ def link(source: Path, target: Path) -> None:
             shutil.copyfile(source, unfinished)
 
 
-def _replaced(path: Path, size: int = 0) -> AbstractContextManager[Path]:
+def _replaced(path: Path) -> AbstractContextManager[Path]:
     """Write a file atomically; its unfinished file has a fixed name, so that repeated kills leave one at most."""
-    return atomic_path(path, f".{path.name}.unfinished", size)
+    return atomic_path(path, f".{path.name}.unfinished")
 
 
 def newest_whole(last: Path) -> Path | None:

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from completesplat.errors import TensorFileError, WeightsError
-from completesplat.settings.schema import shown
+from completesplat.files import SHORT, printable
 
 ZIP = b"PK\3\4"
 DIRECTORY = 0x10  # attribute of a record
@@ -108,7 +108,7 @@ class _DryRun(pickle._Unpickler):
     def find_class(self, module: str, name: str) -> Callable[..., _Made]:
         """Return the stand-in for a function or class."""
         if PLAIN.fullmatch(f"{module} {name}") is None:
-            raise TensorFileError(f"made of {shown(f'{module} {name}')}, not of tensors alone")
+            raise TensorFileError(f"made of {printable(f'{module} {name}', SHORT)}, not of tensors alone")
         return partial(self._call, name)
 
     def persistent_load(self, pid: Any) -> _Made:
@@ -116,7 +116,7 @@ class _DryRun(pickle._Unpickler):
         _, _, key, _, length = pid
         # The archive's reader ignores case, so keys with letters could name one record many times.
         if re.fullmatch("[0-9]+", key) is None or type(length) is not int:
-            raise TensorFileError(f"made of storage {shown(key)}, not of tensors alone")
+            raise TensorFileError(f"made of storage {printable(key, SHORT)}, not of tensors alone")
         return _Made()
 
     def load_build(self) -> None:

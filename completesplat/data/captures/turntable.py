@@ -94,7 +94,7 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
     shutil.rmtree(unfinished, ignore_errors=True)
     turns: dict[str, Turn] = {}
     try:
-        with writing(out, temporary=unfinished):
+        with writing(out, unfinished):
             for name, photos in track(folders.items(), "turns"):
                 with refused_to(refused.append), at(sequence=name):
                     known = None if count is None else field(counts, name, int)

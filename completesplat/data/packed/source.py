@@ -64,7 +64,7 @@ def _fetch(address: str, shard: Shard, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(path.with_name(f".{path.name}.lock")):
         if not path.is_file():
-            with atomic_path(path, size=shard.bytes) as temporary:
+            with atomic_path(path) as temporary:
                 _get(address, shard.file, temporary)
                 if sha256_of(temporary) != shard.sha256:
                     raise ChangedFile("its checksum is not that of the manifest", f"{address}/{shard.file}")
