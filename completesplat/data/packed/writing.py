@@ -27,7 +27,7 @@ from completesplat.data.packed.manifest import (
     is_packed,
     parsed,
 )
-from completesplat.data.packed.rows import CODECS, encode_image, schema, to_row
+from completesplat.data.packed.rows import CODECS, SCHEMA, encode_image, to_row
 from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource
 from completesplat.data.validation import TooFewFrames, at, field, read_json, refused_to
 from completesplat.data.validation.processes import map_in_processes
@@ -84,7 +84,7 @@ class ShardWriter:
         names, frames = [], 0
         # One record batch for each sequence, so that memory holds only one sequence.
         with atomic_path(path, f"{path.name}{UNFINISHED}") as unfinished:
-            with unfinished.open("wb") as stream, pa.ipc.new_stream(stream, schema()) as writer:
+            with unfinished.open("wb") as stream, pa.ipc.new_stream(stream, SCHEMA) as writer:
                 for name in plan.names:
                     with refused_to(partial(self._refuse, refused)), at(sequence=name):
                         row = self._encode(self.sources[plan.split].read(name), refused)
