@@ -1,12 +1,14 @@
 """Files and folders that are written whole or not at all, and file names that are safe to print and to write."""
 
 import errno
+import json
+import math
 import os
 import re
 import shutil
 import unicodedata
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,19 +18,18 @@ NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 UNUSABLE = {errno.EIO, errno.EROFS, errno.EACCES, errno.ESTALE, errno.ENODEV}
 BAD_NAME = {errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM}
 PROBE_BYTES = 2**16
-BLOCK_BYTES = 512  # unit of `st_blocks`
 LONGEST = 100  # bytes of UTF-8
-MOST_SHOWN = 500  # characters
+MOST_SHOWN, SHORT = 500, 120  # characters of a message, and of a value in it
 UNNAMED = "unnamed"
 SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")  # files of Gaussians that are read
-# Control characters, line breaks, and the surrogates that stand for bytes that are not UTF-8.
-UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+# Control characters, line breaks, changes of direction, and the surrogates that stand for bytes that are not UTF-8.
+UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}(\.\w+)?")  # names of temporary files
 SEPARATORS = re.compile(r"[/\\]")
 
 
 @contextmanager
-def atomic_path(path: str | Path, name: str | None = None, size: int = 0) -> Iterator[Path]:
+def atomic_path(path: str | Path, name: str | None = None) -> Iterator[Path]:
     """Yield a temporary path beside `path` that replaces it when the block ends without an exception.
 
     The folder must exist, because a folder that is removed during a run must not come back without its other files.
@@ -36,7 +37,6 @@ def atomic_path(path: str | Path, name: str | None = None, size: int = 0) -> Ite
 
     Args:
         name: name of the temporary file; by default a unique one with the suffix of `path`.
-        size: bytes that the file needs at least, if known beforehand.
 
     Raises:
         DiskError: the file cannot be written. A test write finds the reason if the writing library hides it.
@@ -44,7 +44,7 @@ def atomic_path(path: str | Path, name: str | None = None, size: int = 0) -> Ite
     path = Path(path)
     temporary = path.with_name(name or f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
     try:
-        with writing(path, size, temporary):
+        with writing(path, temporary):
             temporary.unlink(missing_ok=True)
             yield temporary
             with temporary.open("rb+") as file:
@@ -67,7 +67,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     unfinished = folder.with_name(f".{folder.name}.unfinished")
     shutil.rmtree(unfinished, ignore_errors=True)
     try:
-        with writing(folder, temporary=unfinished):
+        with writing(folder, unfinished):
             unfinished.mkdir()
             yield unfinished
             unfinished.rename(folder)
@@ -76,8 +76,8 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def writing(path: Path, size: int = 0, temporary: Path | None = None) -> Iterator[None]:
-    """Raise DiskError if the operating system refuses to let the block write `path`, of at least `size` bytes.
+def writing(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Raise DiskError if the operating system refuses to let the block write `path`.
 
     `temporary` is the file or folder that will become `path`. If an exception gives no reason, a test write to
     `temporary` finds it.
@@ -88,20 +88,42 @@ def writing(path: Path, size: int = 0, temporary: Path | None = None) -> Iterato
         raise
     except Exception as error:
         cause = error if isinstance(error, OSError) and error.errno is not None else _asked(temporary)
-        if cause is None or (refusal := _disk_error(cause, path, size, temporary)) is None:
+        if cause is None or (refusal := _disk_error(cause, path)) is None:
             raise
         raise refusal from error
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
     """Write a file whole or not at all, with the errors of `atomic_path`."""
-    with atomic_path(path, size=len(content)) as temporary:
+    with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file in UTF-8, as `write_bytes` does."""
     write_bytes(path, text.encode())
+
+
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Write a JSON file whole or not at all, with the errors of `atomic_path`.
+
+    JSON has no NaN and no infinities: they become null, and the entry `not_finite` lists their values.
+    """
+    not_finite: list[str] = []
+    finite = {key: _finite(value, key, not_finite) for key, value in content.items()}
+    finite |= {"not_finite": not_finite} if not_finite else {}
+    write_text(path, json.dumps(finite, indent=2, allow_nan=False) + "\n")
+
+
+def _finite(value: object, place: str, not_finite: list[str]) -> object:
+    if isinstance(value, Mapping):
+        return {key: _finite(part, f"{place}.{key}", not_finite) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(part, f"{place}.{index}", not_finite) for index, part in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        not_finite.append(f"{place}: {value}")
+        return None
+    return value
 
 
 def make_folder(folder: Path) -> None:
@@ -136,26 +158,20 @@ def _asked(path: Path | None) -> OSError | None:
     return None
 
 
-def _disk_error(error: OSError, path: Path, size: int = 0, temporary: Path | None = None) -> DiskError | None:
-    """Return the error to show, None if it is not the disk's; `temporary` will be removed, so its space is free."""
-    from rich.filesize import decimal
-
+def _disk_error(error: OSError, path: Path) -> DiskError | None:
+    """Return the error to show, in the operating system's words; None if it is not the disk's."""
     if not path.parent.is_dir():
         return DiskError(f"{path}: cannot be written, {path.parent} is not there any more")
-    if error.errno in NO_SPACE:
-        files = [] if temporary is None else [temporary, *temporary.rglob("*")]
-        taken = [file.stat() for file in files if file.is_file()]
-        size = max(size, sum(file.st_size for file in taken))
-        needed = f"{decimal(size)} or more are needed" if size else "more is needed"
-        free = shutil.disk_usage(path.parent).free + sum(file.st_blocks for file in taken) * BLOCK_BYTES
-        return DiskError(f"{path}: {error.strerror}: {needed}, {decimal(free)} are free on this disk")
-    return DiskError(f"{path}: cannot be written: {error.strerror}") if error.errno in UNUSABLE else None
+    return DiskError(f"{path}: cannot be written: {error.strerror}") if error.errno in NO_SPACE | UNUSABLE else None
 
 
-def printable(text: str) -> str:
-    """Return one line to print: escape unprintable characters as in Python (`\\n`), omit the middle of a long text."""
-    line = UNPRINTABLE.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
-    return line if len(line) <= MOST_SHOWN else f"{line[: MOST_SHOWN // 2 - 5]} ... {line[-MOST_SHOWN // 2 :]}"
+def printable(value: object, most: int = MOST_SHOWN) -> str:
+    """Return one line of at most `most` characters to print, without control characters.
+
+    Unprintable characters are escaped as in Python (`\\n`), and the middle of a long text is omitted.
+    """
+    line = UNPRINTABLE.sub(lambda match: match[0].encode("unicode_escape").decode(), str(value))
+    return line if len(line) <= most else f"{line[: most // 2 - 5]} ... {line[-most // 2 :]}"
 
 
 def safe_name(text: str, ending: str = "") -> str:

@@ -33,11 +33,7 @@ from completesplat.training.reconstruction import ReconstructionModule
 
 pytestmark = pytest.mark.processes
 OFFSETS = 5
-AMOUNT = r"[\d.,]+ (bytes?|[kMGT]B)"
-# How large a video would be is not known before there is something of it.
-SAID = (
-    rf"(File too large|No space left on device): ({AMOUNT} or more are|more is) needed, {AMOUNT} are free on this disk"
-)
+SAID = "cannot be written: (File too large|No space left on device)"
 
 
 NOISE = torch.rand(4, 3, 64, 64, generator=torch.Generator().manual_seed(0))  # of one size, whenever it is written
@@ -225,7 +221,6 @@ def test_a_folder_that_cannot_be_made_is_named_whoever_makes_it(tmp_path, number
     assert message.startswith(f"{tmp_path}/new: ")
     assert os.strerror(number) in message
     assert exit_status(error) == 1
-    assert (re.search(rf"{AMOUNT} are free on this disk", message) is None) == (number == errno.EROFS)
     # What is not there, or may not be read, is a fault of its own; and a file without a name is better shown with all.
     assert refusal(FileNotFoundError(errno.ENOENT, "no such file", "x")) is None
     assert refusal(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))) is None

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from completesplat.commands.protocol import write_json
+from completesplat.files import write_json
 from completesplat.results.machine import machine
 from completesplat.results.tables import records_table, show
 from completesplat.training.stage import now

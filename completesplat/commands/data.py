@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from completesplat.commands.protocol import write_json
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
+from completesplat.files import write_json
 from completesplat.settings.schema import Entries, Positive, Range
 
 logger = logging.getLogger(__name__)

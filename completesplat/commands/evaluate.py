@@ -15,11 +15,12 @@ from rich.progress import track
 
 from completesplat.commands import quieten
 from completesplat.commands.jobs import CONFIG, METRICS
-from completesplat.commands.protocol import drawing, protocol, provenance, write_json
+from completesplat.commands.protocol import drawing, protocol, provenance
 from completesplat.commands.trained import Trained
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
+from completesplat.files import write_json
 from completesplat.results.runs import MODEL
 from completesplat.results.tables import Column, evaluation_table, show, table
 from completesplat.settings.schema import Natural, Positive, Range

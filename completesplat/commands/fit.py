@@ -17,10 +17,11 @@ from omegaconf import DictConfig, OmegaConf
 from completesplat.commands import quieten
 from completesplat.commands.evaluate import scored_data, set_scoring
 from completesplat.commands.jobs import LAST, METRICS
-from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
+from completesplat.commands.protocol import checkpoint_facts, protocol
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.files import write_json
 from completesplat.results.runs import PLAN, read_record
 from completesplat.results.tables import evaluation_table, show
 from completesplat.settings.checks import check_image_size, check_optimizer, check_verb

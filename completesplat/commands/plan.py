@@ -19,9 +19,9 @@ from lightning.pytorch.callbacks import WeightAveraging
 from omegaconf import DictConfig, OmegaConf
 
 from completesplat.commands.fit import OTHER_WEIGHTS
-from completesplat.commands.protocol import write_json
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
+from completesplat.files import write_json
 from completesplat.results.tables import Table, records_table, show
 from completesplat.scene import Batch, SceneBatch
 from completesplat.settings.checks import check_image_size, check_optimizer

@@ -1,41 +1,16 @@
 """Protocol of a measurement: what was measured, with which program, and how."""
 
-import json
-import math
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from completesplat import __version__
-from completesplat.files import write_text
 from completesplat.results.machine import machine
 from completesplat.results.runs import read_record, typed
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
-
-
-def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write results in one step, so that an existing file is whole.
-
-    JSON has no NaN and no infinities: they become null, and the entry `not_finite` lists their values.
-    """
-    not_finite: list[str] = []
-    finite = {key: _finite(value, key, not_finite) for key, value in content.items()}
-    finite |= {"not_finite": not_finite} if not_finite else {}
-    write_text(path, json.dumps(finite, indent=2, allow_nan=False) + "\n")
-
-
-def _finite(value: object, place: str, not_finite: list[str]) -> object:
-    if isinstance(value, Mapping):
-        return {key: _finite(part, f"{place}.{key}", not_finite) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(part, f"{place}.{index}", not_finite) for index, part in enumerate(value)]
-    if isinstance(value, float) and not math.isfinite(value):
-        not_finite.append(f"{place}: {value}")
-        return None
-    return value
 
 
 def git_commit() -> str | None:

@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.progress import track
 
 from completesplat.commands import quieten
-from completesplat.commands.protocol import write_json
 from completesplat.commands.trained import Trained, diffusion_of
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import CompleteSplatError
 from completesplat.export.images import image_sheet, write_png
+from completesplat.files import write_json
 from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
 from completesplat.settings.checks import ModelSettings

@@ -22,11 +22,12 @@ from yaml import YAMLError
 
 from completesplat.baselines.splatter_image.files import find, is_published
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.files import SHORT, printable
 from completesplat.opening.parts import check_architecture, check_sizes, read_architecture, untrained
 from completesplat.scene_model import camera_tensors
 from completesplat.settings.checks import check_image_size, check_optimizer, check_parts
 from completesplat.settings.options import conf_folder
-from completesplat.settings.schema import check_value, shown
+from completesplat.settings.schema import check_value
 from completesplat.weights import (
     CAMERA,
     CONFIG_FILE,
@@ -143,10 +144,10 @@ def architecture_of_run(checkpoint: Path) -> tuple[dict[str, Any], str]:
     plain = _plain(config)
     model, target = plain["model"], str(plain["model"].get("_target_"))
     if target not in STAGES:
-        reason = f"a run of {shown(target).rpartition('.')[2]} makes no scene of a photograph"
+        reason = f"a run of {printable(target, SHORT).rpartition('.')[2]} makes no scene of a photograph"
         fitted = path.parent / SCENES
         advice = f"; those that it fitted are in {fitted}" if fitted.is_dir() else ""
-        raise WeightsError(f"{path} names {shown(target)}: {reason}{advice}")
+        raise WeightsError(f"{path} names {printable(target, SHORT)}: {reason}{advice}")
     part = model.get(STAGES[target])
     if STAGES[target] == "model":
         architecture = {"network": untrained(part), "image_size": plain["data"].get("image_size")}
@@ -225,11 +226,11 @@ def check_names(config: object, source: Path, run: Path, trust: bool) -> None:
     for name, value in _strings(config):
         # `fit` writes resolved values. References are refused because a resolver can read the environment and more.
         if "${" in value:
-            refusal = f"{source}: {shown(value)} refers to something else"
+            refusal = f"{source}: {printable(value, SHORT)} refers to something else"
             raise WeightsError(f"{refusal}, which a run's configuration does not")
         if name != "_target_" or value in _known_names() or OPTIMIZER.fullmatch(value):
             continue
-        refusal = f"{source} names {shown(value)}, which is no part of models or data in this package"
+        refusal = f"{source} names {printable(value, SHORT)}, which is no part of models or data in this package"
         if not trust and not _belongs_to_user(source, run):
             raise WeightsError(f"{refusal}; if it is a module of your own, and you trust who made the run: trust=true")
         if not _is_users_module(value):

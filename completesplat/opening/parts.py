@@ -29,7 +29,8 @@ from completesplat.diffusion.conditioning import LearnedConditioning, StableDiff
 from completesplat.diffusion.denoiser import Denoiser, TextlessStableDiffusion
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import WeightsError
-from completesplat.settings.schema import Entries, Range, Share, hints_of, refused, shown
+from completesplat.files import SHORT, printable
+from completesplat.settings.schema import Entries, Range, Share, hints_of, refused
 from completesplat.splatter_image import Parameterization
 from completesplat.weights import read_small
 
@@ -156,14 +157,14 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
     for name, value in settings.items():
         key = f"{place}.{name}".lstrip(".")
         if name not in hints:
-            raise WeightsError(f"{shown(key)}: there is no such setting, but {', '.join(hints)}")
+            raise WeightsError(f"{printable(key, SHORT)}: there is no such setting, but {', '.join(hints)}")
         hint = hints[name]
         if name in PARTS and (value is not None or name != "view_encoder"):
             _check_part(key, value, PARTS[name])
         elif isinstance(hint, type) and is_typeddict(hint) and isinstance(value, Mapping):
             _check_settings(key, hints_of(hint), value)
         elif name not in PARTS and (refusals := refused(hint, value)):
-            raise WeightsError(f"{key}={shown(value)}: {refusals[0].reason}")
+            raise WeightsError(f"{key}={printable(value, SHORT)}: {refusals[0].reason}")
 
 
 def _check_part(place: str, part: object, allowed: Sequence[type]) -> None:
@@ -171,7 +172,9 @@ def _check_part(place: str, part: object, allowed: Sequence[type]) -> None:
     kinds = [kind for kind in allowed if name_of(kind) == target]
     if not kinds or not isinstance(part, Mapping):
         names = ", ".join(map(name_of, allowed))
-        raise WeightsError(f"{place} names {shown(target)}, which is no part of a model; allowed are {names}")
+        raise WeightsError(
+            f"{place} names {printable(target, SHORT)}, which is no part of a model; allowed are {names}"
+        )
     settings = {name: value for name, value in part.items() if name != "_target_"}
     _check_settings(place, settings_of(kinds[0]), settings)
 

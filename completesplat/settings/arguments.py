@@ -10,7 +10,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
 from completesplat.errors import CompleteSplatError
-from completesplat.files import printable
+from completesplat.files import SHORT, printable
 from completesplat.settings.options import TASKS, did_you_mean, groups, options
 
 EXPORT = "--export"
@@ -24,7 +24,6 @@ DASHES = (
 SWEEP = ("-m", "--multirun")
 WORDS = {"predict": ("image",), "view": ("path",), "new": ("kind", "name"), "data import": ("folder",)}
 """By verb, or verb and task, the settings whose values are given as words without `=`."""
-MOST_SHOWN = 120  # characters of a value
 
 
 def quoted(text: str) -> str:
@@ -62,7 +61,7 @@ def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
         elif name == EXPORT:
             others.append(f"export={quoted(value)}")
         elif (choices := FLAGS[name].choices) and value not in choices:  # -i, say, which means an image elsewhere
-            raise CompleteSplatError(f"{name} {_short(value)}: {DASHES}")
+            raise CompleteSplatError(f"{name} {printable(value, SHORT)}: {DASHES}")
         else:
             flags.append(f"{name}={value}")
     return flags, others
@@ -96,12 +95,12 @@ def _with_words(verb: str, arguments: Sequence[str]) -> list[str]:
     settings = [argument for argument in arguments if argument not in words]
     keys = WORDS[verb]
     if twice := [key for key in keys if words and any(setting.startswith(f"{key}=") for setting in settings)]:
-        raise CompleteSplatError(f"give files by their names or as {twice[0]}=, not both: {_short(words[0])}")
+        raise CompleteSplatError(f"give files by their names or as {twice[0]}=, not both: {printable(words[0], SHORT)}")
     if verb == "predict" and len(words) > 1:
         return [f"image=[{','.join(map(quoted, words))}]", *settings]
     if len(words) > len(keys):
         wanted = " and ".join(f"one {key}" for key in keys)
-        raise CompleteSplatError(f"give {wanted}, not {' '.join(map(_short, words))}")
+        raise CompleteSplatError(f"give {wanted}, not {printable(' '.join(words), SHORT)}")
     return [f"{key}={quoted(word)}" for key, word in zip(keys, words, strict=False)] + settings
 
 
@@ -123,21 +122,16 @@ def _refuse_unreadable(argument: str, sweep: bool) -> None:
     if not equals and not argument.startswith("~"):
         chosen = [f"{group}={argument}" for group in groups() if argument in options(group)]
         nearest = f"; did you mean {' or '.join(chosen)}?" if chosen else did_you_mean(argument, groups())
-        raise CompleteSplatError(f"{_short(argument)}: no setting, which are given as key=value{nearest}")
+        raise CompleteSplatError(f"{printable(argument, SHORT)}: no setting, which are given as key=value{nearest}")
     try:
         override = OverridesParser.create().parse_override(argument)
     except HydraException:
         text = "['TEXT','TEXT']" if value.startswith("[") else quoted(value)
-        example = _short(f'"{key}={text}"')
+        example = printable(f'"{key}={text}"', SHORT)
         message = f"cannot be read; a text with such characters wants quotes: {example}"
-        raise CompleteSplatError(f"{_short(argument)}: {message}") from None
+        raise CompleteSplatError(f"{printable(argument, SHORT)}: {message}") from None
     if override.is_sweep_override() and not sweep:
         message = f"several values; -m makes a run of each, and a list is {key}=[{value}]"
-        raise CompleteSplatError(f"{_short(argument)}: {_short(message)}")
+        raise CompleteSplatError(f"{printable(argument, SHORT)}: {printable(message, SHORT)}")
     if override.key_or_group == "out" and not override.is_sweep_override() and override.value() in ("", None):
         raise CompleteSplatError(f"{argument}: names no folder; give out=DIR")
-
-
-def _short(text: str) -> str:
-    preview = printable(text)
-    return preview if len(preview) <= MOST_SHOWN else f"{preview[:MOST_SHOWN]}..."

@@ -200,8 +200,3 @@ def _is_a(kind: type, value: object) -> bool:
     if kind is bool or isinstance(value, bool):
         return kind is bool and isinstance(value, bool)
     return isinstance(value, int | float if kind is float else kind)
-
-
-def shown(value: object) -> str:
-    """Shorten a stranger's value for a message, and escape characters that would move a terminal's cursor."""
-    return str(value).encode("unicode_escape").decode()[:80]

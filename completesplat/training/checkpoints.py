@@ -1,6 +1,5 @@
 """Checkpoints: when they are written, how files are replaced atomically, and how damaged files are recognised."""
 
-import hashlib
 import logging
 import os
 import shutil
@@ -15,7 +14,6 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
-from torch.utils._pytree import tree_leaves
 
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import DivergenceError, WeightsError
@@ -24,7 +22,7 @@ from completesplat.settings.schema import Positive
 from completesplat.signals import keep_signals
 from completesplat.training.loggers import ContinuedCSVLogger
 from completesplat.training.stopping import agreed_signal, end_training
-from completesplat.weights.checkpoint_reading import CHECKSUM, DIGEST_BYTES, check_whole, not_finite, read_checkpoint
+from completesplat.weights.checkpoint_reading import check_whole, not_finite, read_checkpoint
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 FIGURES = "figures"
@@ -36,17 +34,15 @@ class CheckpointFiles(TorchCheckpointIO):
     """Checkpoint files that are written beside their final place and renamed, so that they are whole or missing.
 
     Lightning's own class first builds the file in memory: 15 GB for 860 million parameters with optimizer and average.
-    A checkpoint is a zip archive; its checksum is the archive's comment.
+    A checkpoint is a zip archive, with a checksum (CRC-32) for each of its parts.
     """
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: object = None
     ) -> None:
         """Replace the file at this path; if the disk refuses, raise DiskError and keep the old file."""
-        size = sum(leaf.nbytes for leaf in tree_leaves(checkpoint) if isinstance(leaf, Tensor))
-        with _replaced(Path(path), size) as unfinished:
+        with _replaced(Path(path)) as unfinished:
             torch.save(checkpoint, unfinished)
-            _add_checksum(unfinished)
 
     def load_checkpoint(self, path: str | os.PathLike[str], *options: object, **more: object) -> dict[str, Any]:
         """Load a checkpoint with `read_checkpoint`, on the CPU."""
@@ -180,20 +176,9 @@ def link(source: Path, target: Path) -> None:
             shutil.copyfile(source, unfinished)
 
 
-def _replaced(path: Path, size: int = 0) -> AbstractContextManager[Path]:
+def _replaced(path: Path) -> AbstractContextManager[Path]:
     """Write a file atomically; its unfinished file has a fixed name, so that repeated kills leave one at most."""
-    return atomic_path(path, f".{path.name}.unfinished", size)
-
-
-def _add_checksum(path: Path) -> None:
-    """Append to a zip archive without a comment the SHA-256 of all bytes before it, as the archive's comment."""
-    with path.open("rb+") as file:
-        file.seek(-2, os.SEEK_END)
-        file.write((len(CHECKSUM) + DIGEST_BYTES).to_bytes(2, "little") + CHECKSUM)
-        file.seek(0)
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-        file.seek(0, os.SEEK_END)
-        file.write(digest.encode())
+    return atomic_path(path, f".{path.name}.unfinished")
 
 
 def newest_whole(last: Path) -> Path | None:

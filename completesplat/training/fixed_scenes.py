@@ -1,6 +1,5 @@
 """Callbacks that draw a few fixed scenes while a model trains, and log figures of its Gaussians and samples."""
 
-import json
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -21,7 +20,7 @@ from completesplat.export.cleaning import storable, with_screen_space_dilation
 from completesplat.export.images import Sheet, SheetCell, color_depth, image_sheet, write_png
 from completesplat.export.ply import write_ply
 from completesplat.export.prediction import plain_camera
-from completesplat.files import make_folder, write_text
+from completesplat.files import make_folder, write_json
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import diversity
@@ -162,7 +161,7 @@ def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBat
             write_ply(folder / file, with_screen_space_dilation(selected, camera), [f"scene {name}", f"step {step}"])
             entries.append({"file": file, "scene": name, "reference_camera": plain_camera(camera)})
     summary = {"step": step, "up": up.tolist(), "scenes": entries}
-    write_text(folder / "scenes.json", json.dumps(summary, indent=2) + "\n")
+    write_json(folder / "scenes.json", summary)
 
 
 def scene_panels(

@@ -71,7 +71,7 @@ class MetricsFile(ExperimentWriter):
             write_text(self.path, self._lines([*old, *self.metrics], header=True))
         else:
             lines = self._lines(self.metrics, header=False)
-            with writing(self.path, len(lines)), self.path.open("a", newline="") as file:
+            with writing(self.path), self.path.open("a", newline="") as file:
                 file.write(lines)
         self.metrics, self.begun = [], True
 

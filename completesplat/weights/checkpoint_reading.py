@@ -1,51 +1,39 @@
 """Reading of checkpoints and other `torch.save` files: plain tensors, in no more memory than the file has bytes.
 
 `torch.load(weights_only=True)` runs no code of a file, but the calls that it allows can turn a few bytes into much
-memory. The pickle is therefore read as a list of steps before it is loaded, and may only contain calls that torch.save
-writes. None of this needs Lightning.
+memory, and its tensors may repeat numbers. Therefore a dry run first adds up what the calls would make.
+None of this needs Lightning.
 """
 
-import hashlib
+import io
 import math
-import os
+import pickle
 import pickletools
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from completesplat.errors import TensorFileError, WeightsError
-from completesplat.settings.schema import shown
+from completesplat.files import SHORT, printable
 
-END, END_BYTES = b"PK\5\6", 22
-"""First bytes of a zip archive's last record, and the record's length without the comment at its end."""
-CHECKSUM, DIGEST_BYTES = b"sha256:", 64
 ZIP = b"PK\3\4"
-MOST_REPEATED, MOST_VIEWS = 2**22, 4  # elements of all tensors together: this many, and of each in the file so many
+DIRECTORY = 0x10  # attribute of a record
+MOST_REPEATED = 2**22  # numbers that all tensors together may have beyond the bytes of the file
+BYTES_PER_ENTRY = 100  # of a dictionary or tuple
+MOST_AXES = 64  # of a tensor of torch
 PLAIN = re.compile(
     r"torch (\w+Storage|Size|device|[a-z]\w*)|torch\._utils _rebuild_(tensor(_v[23])?|parameter)"
     r"|collections (OrderedDict|Counter)|_codecs encode"
 )
 """Names that build tensors, containers and bytes. torch allows more, such as byte arrays of any length."""
-NUMBERS = {"BININT", "BININT1", "BININT2", "LONG1"}
-TEXTS = {"BINUNICODE", "SHORT_BINSTRING"}
-TUPLES = {"EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"}
-MAPPINGS = {"EMPTY_DICT", "SETITEM", "SETITEMS"}
-CALLS = {"REDUCE", "BUILD", "NEWOBJ", "BINPERSID"}
-LONGEST_NAME = 16
-
-
-class _Op(NamedTuple):
-    """Operation of a pickle, its argument, and the steps whose results it takes (kept for calls and tuples)."""
-
-    name: str
-    argument: Any = None
-    inputs: tuple["_Op", ...] = ()
 
 
 def read_tensor_file(path: Path, mmap: bool = False) -> Any:
@@ -58,128 +46,117 @@ def read_tensor_file(path: Path, mmap: bool = False) -> Any:
         TensorFileError: the file is no zip archive from its first byte on, is damaged, has records or tensors that are
             larger than itself, or holds anything but tensors and plain values.
     """
-    try:
-        size = path.stat().st_size
-        with path.open("rb") as file:
-            # If a file starts with other bytes, torch reads an older format, even if an archive follows.
-            if file.read(len(ZIP)) != ZIP:
-                raise TensorFileError("not an archive of torch.save")
-            file.seek(0)
-            archive = torch._C.PyTorchFileReader(file)
-            if sum(map(archive.get_record_size, archive.get_all_records())) > size:
-                raise TensorFileError("its parts are larger than the file")
-            _check_steps(archive.get_record("data.pkl"))
-        if not mmap:
-            with zipfile.ZipFile(path) as records:  # torch compares no checksums
-                whole = sum(record.file_size for record in records.infolist()) <= size and records.testzip() is None
-            if not whole:
-                raise TensorFileError("damaged: its checksum is another")
+    with _refusing_damage():
+        _DryRun(_checked_pickle(path, sums=not mmap), path.stat().st_size + MOST_REPEATED).load()
         return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+
+
+@contextmanager
+def _refusing_damage() -> Iterator[None]:
+    try:
+        yield
     except TensorFileError:
         raise
-    except Exception as error:  # torch, zipfile and pickletools raise many kinds for a damaged file
-        raise TensorFileError(type(error).__name__) from error
+    except Exception as error:  # torch, zipfile and pickle raise many kinds for a damaged file
+        raise TensorFileError(f"damaged, cut off or of another format: {type(error).__name__}") from error
 
 
-def _check_steps(pickle: bytes) -> None:
-    """Raise TensorFileError for a pickle with a step that may make more than the file holds."""
-    stack: list[_Op] = []
-    marks: list[int] = []
-    memo: dict[object, _Op] = {}
-    stored: dict[str, int] = {}  # lengths of the storages by their names
-    elements = 0
-    for opcode, argument, _ in pickletools.genops(pickle):
-        name, before = opcode.name, opcode.stack_before
-        if name == "MARK":
-            marks.append(len(stack))
-        elif name.endswith("PUT"):
-            memo[argument] = stack[-1]
-        elif name.endswith("GET"):
-            value = memo[argument]
-            is_name = value.name == "GLOBAL" or (value.name in TEXTS and len(value.argument) <= LONGEST_NAME)
-            stack.append(value if is_name else _Op(name))
-        else:
-            marked = pickletools.markobject in before
-            first = marks.pop() - before.index(pickletools.markobject) if marked else len(stack) - len(before)
-            step = _Op(name, argument, tuple(stack[first:]) if name in CALLS | TUPLES else ())
-            if not _is_plain(step):
-                made = next((value.argument for value in step.inputs if value.name == "GLOBAL"), argument or name)
-                raise TensorFileError(f"made of {shown(made)}, not of tensors alone")
-            if name == "BINPERSID":
-                _, _, key, _, length = step.inputs[0].inputs
-                stored[key.argument] = length.argument
-            elements += _elements(step)
-            # Only the names of calls are needed.
-            stack[first:] = [_Op(name) if name in CALLS else step] * len(opcode.stack_after)
-    if elements > MOST_VIEWS * sum(stored.values()) + MOST_REPEATED:
-        raise TensorFileError("its tensors are larger than the file")
+def _checked_pickle(path: Path, sums: bool) -> bytes:
+    """Return the pickle in an archive whose records are whole; `sums`: compare their CRC-32, which torch does not."""
+    with path.open("rb") as file, zipfile.ZipFile(file) as records:
+        # If a file starts with other bytes, torch reads an older format, even if an archive follows.
+        file.seek(0)
+        if file.read(len(ZIP)) != ZIP:
+            raise TensorFileError("not an archive of torch.save")
+        # torch and zipfile may find different lists of records in a file.
+        archive = torch._C.PyTorchFileReader(str(path))
+        sizes = [archive.get_record_size(name) for name in archive.get_all_records()]
+        size = path.stat().st_size
+        if sum(sizes) > size or sum(record.file_size for record in records.infolist()) > size:
+            raise TensorFileError("its parts are larger than the file")
+        # Of a directory, torch returns memory that nobody has written to.
+        if any(record.external_attr & DIRECTORY for record in records.infolist()):
+            raise TensorFileError("damaged: a record that is a directory")
+        if sums and records.testzip() is not None:
+            raise TensorFileError("damaged: its checksum is another")
+        pickled: bytes = archive.get_record("data.pkl")
+        return pickled
 
 
-def _elements(step: _Op) -> int:
-    """Return the number of elements of the tensor that a step makes, 0 if it makes none."""
-    match step:
-        case _Op("REDUCE", _, (_Op("GLOBAL", function), _Op(_, _, (_Op("BINPERSID"), _, sizes, *_)))):
-            return abs(math.prod(size.argument for size in sizes.inputs)) if "_rebuild_tensor" in function else 0
-    return 0
+class _Made:
+    """Placeholder for a tensor, a storage or another result of a call."""
+
+    def __setitem__(self, key: object, value: object) -> None: ...
 
 
-def _is_plain(step: _Op) -> bool:
-    """Return whether `torch.save` writes this step; with arguments beside it, no large value is repeated."""
-    match step:
-        case _Op("GLOBAL"):
-            return PLAIN.fullmatch(step.argument) is not None
-        case _Op("BUILD", _, (_, state)):
-            return state.name in MAPPINGS
+class _DryRun(pickle._Unpickler):
+    """Reading of a pickle without making tensors; TensorFileError if that would take more than `most` bytes.
+
+    The unpickler in C is not used, because it reserves memory for any index that a file names.
+    """
+
+    # Later operations reserve memory for any length, and torch.save does not write them.
+    dispatch: ClassVar = {
+        code: pickle._Unpickler.dispatch[code]
+        for code in (ord(operation.code) for operation in pickletools.opcodes if operation.proto <= 2)
+    }
+
+    def __init__(self, content: bytes, most: int) -> None:
+        super().__init__(io.BytesIO(content), encoding="utf-8")
+        self.left = most
+
+    def find_class(self, module: str, name: str) -> Callable[..., _Made]:
+        """Return the stand-in for a function or class."""
+        if PLAIN.fullmatch(f"{module} {name}") is None:
+            raise TensorFileError(f"made of {printable(f'{module} {name}', SHORT)}, not of tensors alone")
+        return partial(self._call, name)
+
+    def persistent_load(self, pid: Any) -> _Made:
+        """Return the stand-in for a storage."""
+        _, _, key, _, length = pid
         # The archive's reader ignores case, so keys with letters could name one record many times.
-        case _Op("BINPERSID", _, (_Op("TUPLE", _, (_, _Op("GLOBAL"), key, _, length)),)):
-            return key.name in TEXTS and re.fullmatch("[0-9]+", key.argument) is not None and length.name in NUMBERS
-        case _Op("REDUCE", _, (_Op("GLOBAL", function), arguments)) if arguments.name in TUPLES:
-            return _is_plain_call(function, arguments.inputs)
-    return step.name not in CALLS
+        if re.fullmatch("[0-9]+", key) is None or type(length) is not int:
+            raise TensorFileError(f"made of storage {printable(key, SHORT)}, not of tensors alone")
+        return _Made()
 
+    def load_build(self) -> None:
+        """Count the entries of an object's state, as an ordered dictionary has."""
+        state = self.stack.pop()  # type: ignore[attr-defined]
+        if type(state) is not dict or not all(type(key) is str for key in state):
+            raise TensorFileError("made of unusual states, not of tensors alone")
+        self._count(BYTES_PER_ENTRY * len(state))
 
-def _is_plain_call(function: str, arguments: tuple[_Op, ...]) -> bool:
-    """Return whether a call makes no more than its arguments hold in the file."""
-    match function.split()[1], arguments:
-        case "OrderedDict", ():
-            return True
-        case "Counter", (counts,):
-            return counts.name in MAPPINGS
-        case "Size", (sizes,):
-            return sizes.name in TUPLES
-        case "device", (place, *index):
-            return place.name in TEXTS and all(number.name in NUMBERS for number in index)
-        case "encode", (text, codec):
-            # Some other codecs double the bytes each time they are called.
-            return text.name in TEXTS and codec == _Op(codec.name, "latin1")
-        case "_rebuild_parameter", _:
-            return True
-        case "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_tensor_v3", (_Op("BINPERSID"), _, sizes, *_):
-            return sizes.name in TUPLES and all(size.name in NUMBERS for size in sizes.inputs)
-    return False
+    dispatch[pickle.BUILD[0]] = load_build  # type: ignore[assignment]
+
+    def _call(self, function: str, *arguments: Any) -> _Made:
+        match function, arguments:
+            case ("OrderedDict", ()) | ("device", (str(), *_)) | ("_rebuild_parameter", (_Made(), *_)):
+                pass
+            case ("Counter", (dict() as entries,)) | ("Size", (tuple() as entries,)):
+                self._count(BYTES_PER_ENTRY * len(entries))
+            case "encode", (str() as text, "latin1"):  # some other codecs double the bytes each time they are called
+                self._count(len(text))
+            case "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_tensor_v3", (_Made(), _, tuple() as sizes, *_):
+                if len(sizes) > MOST_AXES or not all(type(size) is int for size in sizes):
+                    raise TensorFileError("made of unusual sizes, not of tensors alone")
+                self._count(abs(math.prod(sizes)))
+            case _:
+                raise TensorFileError(f"made of {function} of unusual values, not of tensors alone")
+        return _Made()
+
+    def _count(self, size: int) -> None:
+        self.left -= size
+        if self.left < 0:
+            raise TensorFileError("its content is larger than the file")
 
 
 def check_whole(path: Path) -> None:
-    """Raise WeightsError if a checkpoint has changed since it was written.
-
-    Without a checksum, as in files that torch wrote, only the end is checked.
-    """
-    bytes_of_end = END_BYTES + len(CHECKSUM) + DIGEST_BYTES
-    with path.open("rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - bytes_of_end))
-        end = file.read()
-        if not end.startswith(END):
-            if end[-END_BYTES:].startswith(END) and end.endswith(b"\0\0"):
-                return
-            raise WeightsError(f"{path}: not a readable checkpoint (damaged at its end, or cut off)")
-        digest, left = hashlib.sha256(), size - DIGEST_BYTES
-        file.seek(0)
-        while left and (part := file.read(min(left, 2**20))):
-            digest.update(part)
-            left -= len(part)
-    if end[-DIGEST_BYTES:] != digest.hexdigest().encode():
-        raise WeightsError(f"{path}: not a readable checkpoint (damaged: its checksum is another)")
+    """Raise WeightsError if a checkpoint has changed since it was written."""
+    try:
+        with _refusing_damage():
+            _checked_pickle(path, sums=True)
+    except TensorFileError as error:
+        raise WeightsError(f"{path}: not a readable checkpoint ({error})") from error
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -191,7 +168,6 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """
     if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
-    check_whole(Path(path))
     try:
         contents: dict[str, Any] = read_tensor_file(Path(path))
         name = not_finite(contents["state_dict"])

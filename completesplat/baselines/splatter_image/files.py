@@ -16,8 +16,8 @@ import yaml
 from torch import Tensor
 
 from completesplat.errors import TensorFileError, WeightsError
-from completesplat.files import atomic_path, make_folder, write_text
-from completesplat.settings.schema import Entries, Few, Natural, Range, Width, refused, shown
+from completesplat.files import SHORT, atomic_path, make_folder, printable, write_text
+from completesplat.settings.schema import Entries, Few, Natural, Range, Width, refused
 from completesplat.weights import RUN_WEIGHTS, from_hub, read_small
 from completesplat.weights.checkpoint_reading import read_tensor_file
 
@@ -130,7 +130,9 @@ def _local(path: Path) -> Path:
 
 def _download(name: str) -> tuple[Path, Path]:
     if not re.fullmatch(r"\w+", name):
-        raise WeightsError(f"{PREFIX}{shown(name)}: give NAME of a config_NAME.yaml at https://huggingface.co/{HUB}")
+        raise WeightsError(
+            f"{PREFIX}{printable(name, SHORT)}: give NAME of a config_NAME.yaml at https://huggingface.co/{HUB}"
+        )
     files = f"config_{name}.yaml", GENERAL_FILE if name == GENERAL else f"model_{name}.pth"
     advice = f"where there is a network, `hf download {HUB} {' '.join(files)} --local-dir DIR` fetches it; "
     advice += f"then give weights=DIR/{files[1]}"
@@ -157,7 +159,7 @@ def _read_config(path: Path) -> dict[str, dict[str, Any]]:
         sections[section] = {name: options.get(name) for name in hints}
         for name, hint in hints.items():
             for place, value, reason in refused(hint, sections[section][name]):
-                message = f"{path}: {section}.{name}{place} is {shown(value)}: {reason}"
+                message = f"{path}: {section}.{name}{place} is {printable(value, SHORT)}: {reason}"
                 raise WeightsError(f"{message}; only Splatter Image's weights for one image, as published, are read")
     if not sections["data"]["znear"] < sections["data"]["zfar"]:
         raise WeightsError(f"{path}: data.znear must be below data.zfar")

@@ -91,7 +91,7 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
     unfinished = out / ".turntable.unfinished"
     shutil.rmtree(unfinished, ignore_errors=True)
     try:
-        with writing(out, temporary=unfinished):
+        with writing(out, unfinished):
             turns = _write_turns(folders, unfinished, settings)
             _write_cameras(turns, unfinished, settings["direction"])
             write_sheet(turns, out / "sheet.png")

@@ -1,9 +1,9 @@
 """Latent cache on disk: it is written row by row, read memory-mapped, and used as a training set."""
 
-import math
+import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from hashlib import sha256
 from pathlib import Path
@@ -16,7 +16,7 @@ from jaxtyping import Shaped
 
 from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import TrainingScenes
-from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, json_text, read_as
+from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, read_as
 from completesplat.data.sequences import SequenceSource
 from completesplat.data.validation import ChangedFile, MissingFile, UnreadableFile, at, inside, require_file
 from completesplat.errors import CompleteSplatError, DataError
@@ -84,7 +84,7 @@ class LatentCacheManifest:
 
 def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
     """Write the manifest, which marks the store as finished."""
-    text = json_text(manifest, HEADER)
+    text = json.dumps({**HEADER, **asdict(manifest)}, indent=2, allow_nan=False) + "\n"
     write_text(root / MANIFEST, text.replace(NO_SUM, sha256(text.encode()).hexdigest()))
 
 
@@ -105,7 +105,6 @@ class ArrayWriter:
         self.path = path
         self.row = row
         self.dtype = np.dtype(dtype)
-        self.bytes_of_row = math.prod(row) * self.dtype.itemsize
         self.count = 0
 
     def __enter__(self) -> "ArrayWriter":
@@ -119,13 +118,13 @@ class ArrayWriter:
         """Append rows of the writer's dtype."""
         assert (rows.shape[1:], rows.dtype) == (self.row, self.dtype)
         self.count += len(rows)
-        with writing(self.path, self.count * self.bytes_of_row):
+        with writing(self.path):
             self._file.write(np.ascontiguousarray(rows).data)
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         whole = False
         try:
-            with writing(self.path, self.count * self.bytes_of_row), self._file:
+            with writing(self.path), self._file:
                 self._file.seek(0)
                 # The header keeps its size, because NumPy pads it for a first axis of any length.
                 assert self._write_header() == self._begin

@@ -1,15 +1,13 @@
-"""Manifest of a packed store (`manifest.json`, which is written last); functions that read and write any manifest."""
+"""Manifest of a packed store (`manifest.json`, which is written last); the reader of any manifest."""
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from completesplat.data.validation import BadAnnotation, UnreadableFile, at, field, read_json
 from completesplat.errors import DataError
-from completesplat.files import write_text
 
 MANIFEST = "manifest.json"
 HEADER = {"format": 2}
@@ -121,18 +119,6 @@ def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
     if type(value) in (arguments if origin is UnionType else (kind,)):
         return value
     raise BadAnnotation(f"{name} must be {getattr(kind, '__name__', kind)}, not of type {type(value).__name__}")
-
-
-def write_json(path: Path, content: object, header: Mapping[str, str | int] | None = None) -> None:
-    """Write a dictionary or a dataclass to a JSON file atomically."""
-    write_text(path, json_text(content, header))
-
-
-def json_text(content: object, header: Mapping[str, str | int] | None = None) -> str:
-    """Return the text that `write_json` writes."""
-    entries = asdict(content) if is_dataclass(content) and not isinstance(content, type) else content
-    assert isinstance(entries, Mapping)
-    return json.dumps({**(header or {}), **entries}, indent=1, allow_nan=False) + "\n"
 
 
 def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:

@@ -4,7 +4,6 @@ import io
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import pyarrow as pa
@@ -23,6 +22,26 @@ from completesplat.geometry.cameras import Cameras, crop_resize
 CODECS: dict[str, dict[str, int]] = {"png": {}, "jpeg": {"quality": 95, "subsampling": 0}, "bmp": {}}
 # Number of values for each frame in the columns that `checksum` covers.
 WIDTHS = {"frames": 1, "world_to_camera": 16, "intrinsics": 9, "depth_ranges": 2}
+INTEGERS, FLOATS, FILES = (pa.large_list(kind) for kind in (pa.int64(), pa.float64(), pa.large_binary()))
+SCHEMA = pa.schema(
+    {
+        "name": pa.string(),
+        "size": pa.int64(),
+        "frames": INTEGERS,
+        "world_to_camera": FLOATS,
+        "intrinsics": FLOATS,
+        "depth_ranges": pa.large_list(pa.float32()),
+        "images": FILES,
+        "masks": FILES,
+        "picture_checksums": INTEGERS,
+        "checksum": pa.int64(),
+    }
+)
+"""Columns of a store. Values of all frames are flattened in row-major order.
+
+`picture_checksums` are the CRC-32 of each frame's image and mask, because Pillow ignores PNG's checksums and JPEG has
+none. `checksum` covers the other columns. A mask may be null. Types are large because rows can exceed 2 GB.
+"""
 
 
 def encode(image: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
@@ -51,32 +70,6 @@ def decode(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tenso
     except Exception as error:
         raise BadImage(f"cannot be decoded: {error}") from error
     return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
-
-
-@cache
-def schema() -> pa.Schema:
-    """Return the columns, which `datasets` reads as well. Values of all frames are flattened in row-major order.
-
-    `picture_checksums` are the CRC-32 of each frame's image and mask, because Pillow ignores PNG's checksums and JPEG
-    has none. `checksum` covers the other columns. A mask may be null. Types are large because rows can exceed 2 GB.
-    """
-    # A local import, because it takes a second and 70 MB, which users of raw data should not pay.
-    from datasets import Features, LargeList, Value
-
-    integers, floats, files = (LargeList(Value(kind)) for kind in ("int64", "float64", "large_binary"))
-    columns = {
-        "name": Value("string"),
-        "size": Value("int64"),
-        "frames": integers,
-        "world_to_camera": floats,
-        "intrinsics": floats,
-        "depth_ranges": LargeList(Value("float32")),
-        "images": files,
-        "masks": files,
-        "picture_checksums": integers,
-        "checksum": Value("int64"),
-    }
-    return Features(columns).arrow_schema
 
 
 @dataclass(frozen=True)
@@ -120,7 +113,7 @@ def to_row(sequence: PosedSequence, usable: Sequence[int], images: Sequence[Enco
         "picture_checksums": [encoded.checksum() for encoded in images],
         "checksum": _checksum(sequence.name, size, numbers),
     }
-    return pa.Table.from_pydict({name: [value] for name, value in row.items()}, schema=schema())
+    return pa.Table.from_pydict({name: [value] for name, value in row.items()}, schema=SCHEMA)
 
 
 def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None) -> PosedSequence:

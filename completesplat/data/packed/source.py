@@ -12,7 +12,7 @@ import pyarrow as pa
 from filelock import FileLock
 
 from completesplat.data.packed.manifest import MANIFEST, Shard, read_manifest
-from completesplat.data.packed.rows import from_row, schema
+from completesplat.data.packed.rows import SCHEMA, from_row
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import (
     BadAnnotation,
@@ -64,7 +64,7 @@ def _fetch(address: str, shard: Shard, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(path.with_name(f".{path.name}.lock")):
         if not path.is_file():
-            with atomic_path(path, size=shard.bytes) as temporary:
+            with atomic_path(path) as temporary:
                 _get(address, shard.file, temporary)
                 if sha256_of(temporary) != shard.sha256:
                     raise ChangedFile("its checksum is not that of the manifest", f"{address}/{shard.file}")
@@ -137,7 +137,7 @@ class PackedSource(SequenceSource):
             if self.address is not None:
                 _fetch(self.address, shard, path)
             opened = _OpenShard(require_file(path))
-            if not opened.schema.equals(schema()):
+            if not opened.schema.equals(SCHEMA):
                 raise UnreadableFile("its columns are not those of a packed store")
             if len(opened.places) != len(shard.sequences):
                 raise BadAnnotation(f"{len(opened.places)} sequences, the manifest says {len(shard.sequences)}")

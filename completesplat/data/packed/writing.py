@@ -5,7 +5,7 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -26,14 +26,13 @@ from completesplat.data.packed.manifest import (
     differences,
     is_packed,
     parsed,
-    write_json,
 )
-from completesplat.data.packed.rows import CODECS, encode_image, schema, to_row
+from completesplat.data.packed.rows import CODECS, SCHEMA, encode_image, to_row
 from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource
 from completesplat.data.validation import TooFewFrames, at, field, read_json, refused_to
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.files import atomic_path
+from completesplat.files import atomic_path, write_json
 from completesplat.weights import sha256_of
 
 FEWEST_FRAMES = 2
@@ -85,7 +84,7 @@ class ShardWriter:
         names, frames = [], 0
         # One record batch for each sequence, so that memory holds only one sequence.
         with atomic_path(path, f"{path.name}{UNFINISHED}") as unfinished:
-            with unfinished.open("wb") as stream, pa.ipc.new_stream(stream, schema()) as writer:
+            with unfinished.open("wb") as stream, pa.ipc.new_stream(stream, SCHEMA) as writer:
                 for name in plan.names:
                     with refused_to(partial(self._refuse, refused)), at(sequence=name):
                         row = self._encode(self.sources[plan.split].read(name), refused)
@@ -95,7 +94,7 @@ class ShardWriter:
             digest = sha256_of(unfinished)
         shard = Shard(plan.file, digest, path.stat().st_size, frames, tuple(names))
         record = ShardRecord(plan.split, plan.names, shard, tuple(refused))
-        write_json(_record_path(path), record)
+        write_json(_record_path(path), asdict(record))
         return record
 
     def _encode(self, sequence: PosedSequence, refused: list[Refusal]) -> pa.Table:
@@ -258,7 +257,7 @@ def _finish(manifest: PackedManifest, out: Path, max_bad_fraction: float) -> Non
         remedy = "put the data right (then remove this folder) or raise data.max_bad_fraction"
         bad = f"{share:.1%} of the data are bad, at most {max_bad_fraction:.1%} may be ({kinds})"
         raise DataError(f"{bad}: see the .json beside the shards, and {remedy}", str(out))
-    write_json(out / MANIFEST, manifest, HEADER)
+    write_json(out / MANIFEST, {**HEADER, **asdict(manifest)})
     size = decimal(sum(shard.bytes for shard in shards))
     held = f"{frames:,} frames of {sequences:,} sequences, {size} in {len(shards):,} shards"
     logger.info("%s: %s; refused: %s", out, held, kinds)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from completesplat.errors import DataError, PlyError
+from completesplat.files import SHORT, printable
 from completesplat.ply_files import read_vertices
 
 MOST_BYTES = 2**32
@@ -105,16 +106,18 @@ def inside(root: Path, relative: str) -> Path:
     path, windows = PurePath(relative.replace("\\", "/")), PureWindowsPath(relative)
     absolute = path.is_absolute() or windows.drive
     if not path.parts or ".." in path.parts or any(text in relative for text in ("\0", "://")):
-        raise OutsidePath(f"leads outside of {root}, or nowhere: {_shortened(relative)}")
+        raise OutsidePath(f"leads outside of {root}, or nowhere: {printable(repr(relative), SHORT)}")
     try:
         # `realpath` also accepts a path that does not exist, and one whose links form a ring.
         real_root, real_path = os.path.realpath(root), os.path.realpath(root / path)
     except ValueError:
-        raise OutsidePath(f"characters that no file name has: {_shortened(relative)}") from None
+        raise OutsidePath(f"characters that no file name has: {printable(repr(relative), SHORT)}") from None
     if windows.drive or os.path.commonpath([real_root, real_path]) != real_root:
         if absolute and not os.path.lexists(path):
-            raise OutsidePath(f"a path of another machine; make it relative to {root}: {_shortened(relative)}")
-        raise OutsidePath(f"leads outside of {root}: {_shortened(relative)} is {real_path}")
+            raise OutsidePath(
+                f"a path of another machine; make it relative to {root}: {printable(repr(relative), SHORT)}"
+            )
+        raise OutsidePath(f"leads outside of {root}: {printable(repr(relative), SHORT)} is {real_path}")
     return root / (os.path.relpath(real_path, real_root) if absolute else path)
 
 
@@ -156,11 +159,11 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
 def field(entry: object, key: str, kind: type[T]) -> T:
     """Return a value of a JSON object, or refuse one that is missing or has another type than `kind`."""
     if type(entry) is not dict or key not in entry:
-        raise BadAnnotation(f"no {key} in {_shortened(entry)}")
+        raise BadAnnotation(f"no {key} in {printable(repr(entry), SHORT)}")
     value = entry[key]
     # `isinstance` would take true for an integer.
     if type(value) is not kind:
-        raise BadAnnotation(f"{key} must be of type {kind.__name__}, not {_shortened(value)}")
+        raise BadAnnotation(f"{key} must be of type {kind.__name__}, not {printable(repr(value), SHORT)}")
     return value
 
 
@@ -173,10 +176,10 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
     # Strings that look like numbers, truth values and None become arrays of other kinds.
     if array.shape != shape or array.dtype.kind not in "iuf":
         numbers = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
-        raise BadAnnotation(f"{what} must be {numbers}, not {_shortened(value)}")
+        raise BadAnnotation(f"{what} must be {numbers}, not {printable(repr(value), SHORT)}")
     array = array.astype(np.float64)
     if not (np.abs(array) < LARGEST).all():
-        raise BadAnnotation(f"{what} is not finite in float32: {_shortened(value)}")
+        raise BadAnnotation(f"{what} is not finite in float32: {printable(repr(value), SHORT)}")
     return array
 
 
@@ -186,11 +189,6 @@ def require_rotation(matrix: np.ndarray, what: str) -> None:
         raise BadCamera(f"{what} is not orthonormal")
     if np.linalg.det(matrix) < 0:
         raise BadCamera(f"{what} is a reflection, not a rotation")
-
-
-def _shortened(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def _read(path: Path, most_bytes: int) -> bytearray:

@@ -1,6 +1,5 @@
 """Check of a whole data set: numbers of usable sequences and frames, and reasons for those that are not usable."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,7 +14,7 @@ from completesplat.data.sequences import SequenceSource, overlaps, shared_names
 from completesplat.data.validation import TooFewFrames, at, refused_to
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError
-from completesplat.files import printable, write_text
+from completesplat.files import printable, write_json
 
 FEWEST_FRAMES = 2
 LARGEST_BATCH = 16
@@ -67,7 +66,7 @@ class Findings:
 
     def write(self, path: Path) -> None:
         """Write `json()` to a file."""
-        write_text(path, json.dumps(self.json(), indent=2, allow_nan=False) + "\n")
+        write_json(path, self.json())
 
 
 def check(
