@@ -15,7 +15,6 @@ from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.rasterizers import Rendering, RenderingConstants, as_seen, require_float32
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
-from completesplat.settings.options import gsplat_constants
 
 DEVICE = "cuda"
 WARP = 32
@@ -23,7 +22,7 @@ WARP = 32
 # gradients through the depth image become NaN, because gsplat multiplies coordinates before it divides them.
 FARTHEST = 1e12
 SMALLEST_BLUR, SMALLEST_NEAR_PLANE = 1e-5, 1e-6
-FRUSTUM_MARGIN = 0.3  # in gsplat's `Utils.cuh`
+COMPILED = ("max_alpha", "min_alpha", "min_transmittance", "frustum_margin")  # the defaults are those of the kernels
 
 
 class CudaRasterizer:
@@ -53,7 +52,8 @@ class CudaRasterizer:
         except ImportError as error:
             message = f'the cuda rasterizer needs gsplat ({error}): pip install "completesplat[cuda]"'
             raise CompleteSplatError(message) from error
-        for name, value in (gsplat_constants() | {"frustum_margin": FRUSTUM_MARGIN}).items():
+        for name in COMPILED:
+            value = getattr(RenderingConstants, name)
             if not math.isclose(getattr(self.constants, name), value, rel_tol=1e-6):
                 raise CompleteSplatError(
                     f"gsplat {gsplat.__version__} is compiled with {name} = {value:g}, not "
