@@ -6,7 +6,7 @@ from typing import Any
 
 from completesplat.commands.protocol import write_json
 from completesplat.results.machine import machine
-from completesplat.results.tables import records_table, show
+from completesplat.results.tables import show, table
 from completesplat.training.stage import now
 
 Work = Callable[[], object]
@@ -33,6 +33,6 @@ def report(path: Path, results: Mapping[str, Any], tables: Mapping[str, Sequence
     write_json(path, {"machine": here, **results})
     name = here["gpu"] if device == "cuda" else f"{here['processor']}, {here['threads']} threads"
     print(f"{name}, torch {here['torch']}, {here['date']}")
-    show(*(records_table(title, rows) for title, rows in tables.items()), width=140)
+    show(*(table(title, rows) for title, rows in tables.items()), width=140)
     for part, reason in results.get("not_measured", {}).items():
         print(f"{part}: not measured, because {reason}")

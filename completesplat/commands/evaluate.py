@@ -20,8 +20,9 @@ from completesplat.commands.trained import Trained
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
+from completesplat.results.measured import MODE_COLUMNS, evaluation_table
 from completesplat.results.runs import MODEL
-from completesplat.results.tables import Column, evaluation_table, show, table
+from completesplat.results.tables import show, table
 from completesplat.settings.schema import Natural, Positive, Range
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.stage import Stage
@@ -116,12 +117,6 @@ class HiddenModesEvaluation(TypedDict):
     seed: Natural
 
 
-FORMATS = {"method": "", **dict.fromkeys(("coverage", "total_variation", "sharpness", "rejected"), ".3f")}
-FORMATS |= dict.fromkeys(("energy_hidden", "energy_visible"), ".4f")
-FORMATS |= {"scenes": "d", "samples": "d"}
-COLUMNS: list[Column] = [(name.replace("_", " "), name, form) for name, form in FORMATS.items()]
-
-
 def run_hidden_modes(
     trained: Config, evaluation: HiddenModesEvaluation, trainer: Config, logger: Config | None, out: Path
 ) -> None:
@@ -165,7 +160,7 @@ def run_hidden_modes(
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
     labels = {} if tested.scenes is None else {MODEL: module.method}
     records = [{"method": labels.get(name, name), **values} for name, values in results.items()]
-    Console(width=140).print(table(title, COLUMNS, records))
+    show(table(title, records, MODE_COLUMNS), width=140)
     if skipped:
         print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
 

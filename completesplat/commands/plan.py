@@ -22,7 +22,7 @@ from completesplat.commands.fit import OTHER_WEIGHTS
 from completesplat.commands.protocol import write_json
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
-from completesplat.results.tables import Table, records_table, show
+from completesplat.results.tables import Table, show, table
 from completesplat.scene import Batch, SceneBatch
 from completesplat.settings.checks import check_image_size, check_optimizer
 from completesplat.settings.options import did_you_mean
@@ -75,7 +75,7 @@ def plan_table(plans: Mapping[str, Mapping[str, Any]]) -> Table:
         rows.append({"": key.replace("_", " "), **{name.replace("_", " "): plan[key] for name, plan in plans.items()}})
         if len(plans) > 1:
             rows[-1]["total"] = sum(plan[key] for plan in plans.values()) if key in ADDED else None
-    return records_table("completesplat plan", rows)
+    return table("completesplat plan", rows)
 
 
 def plan_of(config: DictConfig) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from completesplat.commands.trained import Trained, diffusion_of
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import CompleteSplatError
 from completesplat.export.images import image_sheet, write_png
-from completesplat.results.tables import records_table, show
+from completesplat.results.tables import show, table
 from completesplat.scene import SceneBatch
 from completesplat.settings.checks import ModelSettings
 from completesplat.settings.schema import Entries, Positive, Range, Share
@@ -61,7 +61,7 @@ def controls(
     controls_study.plot_controls(rows, out / "controls.png", title)
     title = f"{scenes[0].names[0]}: reference view of one sample, far view of {min(shown, run['samples'])}"
     write_png(out / "controls_grid.png", image_sheet(None, grid, title))
-    show(records_table("Faithfulness (PSNR, dB) and diversity", rows))
+    show(table("Faithfulness (PSNR, dB) and diversity", rows))
 
 
 def depth(
@@ -83,7 +83,7 @@ def depth(
     title = f"Render, depth and normals in a far view, and deviation of {run['samples']} samples' depth"
     title += f" in the reference and the far view; skip {skip_weight:g}, guidance {guidance_weight:g}"
     write_png(out / "depth.png", image_sheet(None, sheet, title))
-    show(records_table("Deviation of depth over samples, scene units", rows))
+    show(table("Deviation of depth over samples, scene units", rows))
 
 
 def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Unpack[Run]) -> None:
@@ -97,7 +97,7 @@ def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Un
     )
     calibration_study.plot_calibration(rows, out / "calibration.png", title)
     ideal = f"calibrated: {1 / (1 + run['samples']):.3g} of the true values below and above all samples, ratio 1"
-    show(records_table(f"Novel views; {ideal}", rows))
+    show(table(f"Novel views; {ideal}", rows))
 
 
 def modes(spread_views: Positive, out: Path, **run: Unpack[Run]) -> None:
@@ -113,7 +113,7 @@ def modes(spread_views: Positive, out: Path, **run: Unpack[Run]) -> None:
     settings = {"scenes": len(scenes), "samples": run["samples"], "seed": run["seed"], "spread_views": spread_views}
     write_json(out / "modes.json", {"settings": settings, "rows": rows})
     noise_levels.plot(rows, out / "modes.png", f"Hidden modes of {len(scenes)} scenes in noisy latents")
-    show(records_table("Share of the true mode in noisy latents", rows))
+    show(table("Share of the true mode in noisy latents", rows))
 
 
 @contextmanager

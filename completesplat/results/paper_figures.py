@@ -1,7 +1,7 @@
 """Tables of the paper, with our runs beside them if they were measured by the same protocol."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, cast
@@ -14,17 +14,19 @@ from completesplat.results.measured import (
     BEST_BY_METRIC,
     BEST_OF_K,
     LEADING,
+    OF_RUNS,
     OURS,
     Entry,
     alike,
     described,
-    entries,
+    entries_of,
     leading_headings,
     mode_tables,
+    score_rows,
     score_tables,
 )
 from completesplat.results.runs import HOW, MODES, SCORES, Job, RunTree, collect
-from completesplat.results.sweeps import figures, sweep_rows
+from completesplat.results.sweeps import sweep_rows
 from completesplat.results.tables import (
     ABSENT,
     BEST,
@@ -113,35 +115,28 @@ def parse(cell: str) -> Cell:
     return Cell(" ".join([text, *signs]), next((word for word in words if word in (BEST, SECOND)), UNMARKED))
 
 
-def _source(table: PublishedTable) -> str:
-    return f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
-
-
 def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
-    """Return the published rows, followed by those of our runs for which `belongs` is true.
+    """Return the published rows, followed by entries of ours.
 
     Times are of one sequence, warm, for the complete pipeline.
     """
-    notes, rows = Notes(), []
-    has_speed = any(column.key == "speed" for column in table.columns)
-    keys = [key for key in LEADING if key != "speed" or has_speed]
-    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in table.scored)]
+    notes, keys = Notes(), ["method"]
+    if not table.options:
+        keys = [key for key in LEADING if key in OF_RUNS or any(column.key == key for column in table.columns)]
+    rows = []
     for row in table.rows:
         cells = {"resolution": Cell(table.resolution or ABSENT)}
         cells |= {column.key: cell for column, cell in zip(table.columns, row, strict=True)}
         scores = [row[number] for number, _, _ in table.scored]
         rows.append(TableRow("paper", [*(cells.get(key, Cell(ABSENT)) for key in keys), *scores]))
-    for entry in (entry for entry in entries if belongs(table, entry)):
-        leading = entry.leading(notes)
-        scores = [
-            entry.cell(f"{table.region}_{table.view}_{column.key}", notes)
-            if data_set == entry.run.protocol["data_set"]
-            else Cell(ABSENT)
-            for _, column, data_set in table.scored
-        ]
-        rows.append(TableRow("ours", [*(leading[key] for key in keys), *scores]))
+    columns = [(f"{table.region}_{table.view}_{column.key}", None if table.options else data_set)
+               for _, column, data_set in table.scored]  # fmt: skip
+    rows += score_rows(entries, keys, columns, notes, marked=False)
+    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in table.scored)]
+    source = f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
     signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.legend.items()]
-    remarks = [_source(table), *signs, LEGEND, VIEWS, *table.remarks]
+    apart = ([APART] if entries else []) if table.options else [VIEWS]
+    remarks = [source, *signs, LEGEND, *apart, *table.remarks]
     return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
 
 
@@ -153,7 +148,7 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
     skipped, with skip connections at full weight, and on all pixels. A best of k belongs to a table whose best of k has
     the same k. A model that has seen the views that it is scored on belongs to no table.
     """
-    protocol = entry.run.protocol
+    protocol = entry.protocol
     wanted = table.evaluations.get(str(protocol.get("name")))
     if wanted is None or protocol.get("skipped") or entry.upper_bound:
         return False
@@ -170,23 +165,17 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
     return (protocol["resolution"], protocol.get("protocol_views")) == (wanted["resolution"], wanted["protocol_views"])
 
 
-def ablations_beside(table: PublishedTable, sweeps: Mapping[str, Sequence[Job]]) -> Table:
-    """Return the published rows, followed by means over seeds of sweeps, by name and protocol."""
-    notes, names = Notes(), [f"{table.region}_{table.view}_{column.key}" for _, column, _ in table.scored]
-    rows = [TableRow("paper", row) for row in table.rows]
-    for name, jobs in sweeps.items():
-        for group in alike((job, job.protocol) for job in jobs):
-            settings, protocol = sweep_rows(group), group[0].protocol
-            note = notes.number(f"{name}: mean ± sample deviation over seeds; {described(protocol, ALIKE)}.")
-            for row, cells in zip(settings, figures(settings, names), strict=True):
-                theirs = "".join(f" ({table.options[part]})" for part in row.label.split(", ") if part in table.options)
-                label = f"{OURS}{row.label}{theirs}{f', {row.seeds} seeds' if row.seeds else ''} [{note}]"
-                pairs = zip(names, cells, strict=True)
-                scores = [cell if cell.text else notes.missing(name, protocol, LACKING) for name, cell in pairs]
-                rows.append(TableRow("ours", [Cell(label), *scores]))
-    headings = [Heading("setting", figures=False), *(Heading(column.heading) for column in table.columns[1:])]
-    remarks = [_source(table), *([APART] if sweeps else []), LEGEND]
-    return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
+def sweep_entries(table: PublishedTable, name: str, jobs: Sequence[Job]) -> list[Entry]:
+    """Return a sweep's means over seeds by protocol, with the paper's names of their settings."""
+    entries = []
+    for group in alike((job, job.protocol) for job in jobs):
+        protocol = group[0].protocol
+        note = f"{name}: mean ± sample deviation over seeds; {described(protocol, ALIKE)}."
+        for row in sweep_rows(group):
+            theirs = "".join(f" ({table.options[part]})" for part in row.label.split(", ") if part in table.options)
+            label = f"{OURS}{row.label}{theirs}{f', {row.seeds} seeds' if row.seeds else ''}"
+            entries.append(replace(row, label=label, note=note, protocol=protocol, lacking=LACKING))
+    return entries
 
 
 def tables(tree: RunTree | None) -> list[Table]:
@@ -199,16 +188,21 @@ def tables(tree: RunTree | None) -> list[Table]:
         CompleteSplatError: there are no results.
     """
     if tree is None:
-        return [ablations_beside(table, {}) if table.options else beside(table, []) for table in published()]
+        return [beside(table, []) for table in published()]
     if not (tree.scores or tree.modes or tree.warnings):
         raise CompleteSplatError(f"runs={tree.folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
     options = {option for table in published() for option in table.options}
-    is_ablation = lambda job: options & set(job.label.split(", "))  # noqa: E731
     jobs = {folder: [job for job in collect(folder) if job.protocol] for folder in tree.sweeps}
-    sweeps = {folder: tested for folder, tested in jobs.items() if any(map(is_ablation, tested))}
-    single = entries([run for run in tree.scores if run.folder.parent not in sweeps])
-    named = {str(folder.relative_to(tree.folder)): tested for folder, tested in sweeps.items()}
-    made = [ablations_beside(table, named) if table.options else beside(table, single) for table in published()]
-    placed = [table for table in published() if not table.options]
-    elsewhere = [entry for entry in single if not any(belongs(table, entry) for table in placed)]
-    return [*made, *score_tables(elsewhere), *mode_tables(tree.modes)]
+    sweeps = {
+        folder: tested for folder, tested in jobs.items() if any(options & set(job.label.split(", ")) for job in tested)
+    }
+    single = entries_of(run for run in tree.scores if run.folder.parent not in sweeps)
+    made, placed = [], []
+    for table in published():
+        if table.options:
+            named = [(str(folder.relative_to(tree.folder)), tested) for folder, tested in sweeps.items()]
+            entries = [entry for name, tested in named for entry in sweep_entries(table, name, tested)]
+        else:
+            placed += (entries := [entry for entry in single if belongs(table, entry)])
+        made.append(beside(table, entries))
+    return [*made, *score_tables([entry for entry in single if entry not in placed]), *mode_tables(tree.modes)]

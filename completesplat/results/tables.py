@@ -3,13 +3,13 @@
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby, pairwise, product
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from completesplat.files import atomic_path, write_text
 from completesplat.metrics import PSNR_LIMIT
-from completesplat.results.runs import MODEL, UPPER_BOUND, Protocol, flat
+from completesplat.results.runs import Protocol
 
 if TYPE_CHECKING:
     from rich.table import Table as PrintedTable
@@ -39,12 +39,10 @@ ESCAPES = str.maketrans(
 ABSENT, BLANK = "-", "(blank)"
 LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK}: left blank in the paper."
 
-Column = tuple[str, str, str]  # heading, key of the record, and format of its values (empty for text)
-LABELS = {"full": "all\npixels", "object": "object\npixels"}
-EVALUATED = ["_".join((*place, name)) for place in product(LABELS, ("novel", "reference")) for name in ("psnr", "ssim")]
-EVALUATED_IF_POSSIBLE = [f"full_novel_{name}" for name in ("lpips", "fid", "kid")]
-EVALUATED_IF_POSSIBLE += [f"{region}_novel_sharpness" for region in LABELS]
-"""Scores in the table of an evaluation, if they were measured."""
+SHOWN = [f"full_novel_{name}" for name in METRICS]
+SHOWN += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips", "sharpness")]
+SHOWN += ["full_reference_psnr", "full_reference_ssim"]
+"""Scores that a table shows if a row has them."""
 PLAIN = (type(None), str, bool, int, float)  # types of values that a table can show
 CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
 
@@ -100,11 +98,12 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Heading:
-    """Heading of a column; the columns of a group share the heading above."""
+    """Heading of a column, and the format of its values; the columns of a group share the heading above."""
 
     text: str
     group: str = ""
     figures: bool = True  # whether the column is aligned to the right
+    form: str = ""
 
     def joined(self, separator: str = ": ") -> str:
         """Join group and text."""
@@ -162,58 +161,32 @@ class Table:
         return printed
 
 
-def table(title: str, columns: Sequence[Column], records: Iterable[Mapping[str, object]]) -> Table:
-    """Return a table with a row for each record; missing values stay empty."""
+def table(title: str, records: Sequence[Mapping[str, object]], columns: Mapping[str, Heading] | None = None) -> Table:
+    """Return a table with a row for each record, whose `source` is the row's; missing values stay empty.
+
+    Without `columns`, the records' keys are the headings, and lists and mappings are left out.
+    """
+    if columns is None:
+        entries = {key: [record.get(key) for record in records] for record in records for key in record}
+        plain = {key: values for key, values in entries.items() if all(isinstance(value, PLAIN) for value in values)}
+        columns = {
+            key: Heading(key.replace("_", "\n"), figures=any(isinstance(value, int | float) for value in values))
+            for key, values in plain.items()
+        }
     rows = []
     for record in records:
-        values = [(record.get(key), form) for _, key, form in columns]
-        rows.append(TableRow("", [Cell("" if value is None else format(value, form)) for value, form in values]))
-    return Table(title, title, [Heading(heading, figures=bool(form)) for heading, _, form in columns], rows)
+        cells = [Cell(_written(record.get(key), heading.form)) for key, heading in columns.items()]
+        rows.append(TableRow(str(record.get("source", "")), cells))
+    return Table(title, title, list(columns.values()), rows)
 
 
-def records_table(title: str, records: Sequence[Mapping[str, object]]) -> Table:
-    """Return a table of records with the same keys, which are its headings; lists and mappings are left out."""
-    columns = {key: [record.get(key) for record in records] for record in records for key in record}
-    plain = {key: values for key, values in columns.items() if all(isinstance(value, PLAIN) for value in values)}
-    headings = [
-        Heading(key.replace("_", "\n"), figures=any(isinstance(value, int | float) for value in values))
-        for key, values in plain.items()
-    ]
-    rows = [TableRow("", [Cell(_written(value)) for value in values]) for values in zip(*plain.values(), strict=True)]
-    return Table(title, title, headings, rows)
-
-
-def _written(value: object) -> str:
-    """Return a value as text: empty for None; a float below 1000 has four digits, a larger one no decimals."""
+def _written(value: object, form: str) -> str:
+    """Return a value as text; without a format, a float below 1000 has four digits, a larger one no decimals."""
+    if value is None or form:
+        return "" if value is None else format(value, form)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        return "" if value is None else str(value)
+        return str(value)
     return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1000 else f"{value:,.0f}"
-
-
-def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = MODEL) -> Table:
-    """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks.
-
-    Args:
-        model: the label of the predictor that is the model.
-    """
-    records = [flat(entry) for entry in results.values()]
-    names = [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]
-    pairs = [(name, name.replace("object", "full")) for name in EVALUATED]
-    masked = any(record.get(name) != record.get(whole) for record in records for name, whole in pairs)
-    # Without masks, every pixel is the object's; with them, sharpness is the object's.
-    names = [name for name in names if not name.startswith("full_novel_sharpness" if masked else "object")]
-    headings = [Heading("predictor", figures=False)]
-    for name in names:
-        region, view, kind = name.split("_")
-        headings.append(Heading(f"{LABELS[region]}\n{view}\n{METRICS[kind]}"))
-    labelled = {model if predictor == MODEL else predictor: entry for predictor, entry in results.items()}
-    fitted = [f"{name}: fitted to {entry['fitted_to']}." for name, entry in labelled.items() if entry.get("fitted_to")]
-    rows = []
-    for label, scores in zip(labelled, records, strict=True):
-        bound = " (upper bound)" if scores.get(UPPER_BOUND) else ""
-        rows.append(TableRow("", [Cell(label + bound), *(score_cell(name, scores.get(name)) for name in names)]))
-    title = f"{records[0]['scenes']:.0f} scenes, {records[0]['views']:.0f} novel views"
-    return Table(title, title, headings, rows, [*fitted, SSIM_NOTE, SHARPNESS_NOTE])
 
 
 def show(*tables: Table, width: int = 120) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.data.sequences import PosedSequence
-from completesplat.results.tables import Cell, Heading, Table, TableRow, show, table
+from completesplat.results.tables import Heading, show, table
 from completesplat.studies.figures import written_figure
 
 # Key in the results, label, format.
@@ -56,15 +56,17 @@ def statistics(sequences: Mapping[str, Iterable[PosedSequence]]) -> dict[str, An
 def show_statistics(results: dict[str, Any]) -> None:
     """Print the splits side by side."""
     splits = results["splits"]
-    columns = [("split", "split", ""), ("sequences", "sequences", ",d"), ("frames", "frames", ",d")]
-    headings = [Heading(part, split) for split in splits for part in PARTS]
-    rows = []
+    counts = [
+        {"split": split, **{key: summary[key] for key in ("sequences", "frames")}} for split, summary in splits.items()
+    ]
+    columns = {"": Heading("", figures=False)}
+    columns |= {f"{split} {part}": Heading(part, split) for split in splits for part in PARTS}
+    ranges: list[dict[str, object]] = []
     for key, label, form in MEASURES:
-        values = [summary[key][part] for summary in splits.values() for part in PARTS]
-        rows.append(TableRow("", [Cell(label), *(Cell("-" if x is None else format(x, form)) for x in values)]))
-    ranges = Table("ranges", "Smallest, median and largest", [Heading("", figures=False), *headings], rows)
-    counts: list[dict[str, object]] = [{"split": split, **summary} for split, summary in splits.items()]
-    show(table("Sequences and frames", columns, counts), ranges)
+        values = {f"{split} {part}": summary[key][part] for split, summary in splits.items() for part in PARTS}
+        written = {name: "-" if x is None else format(x, form) for name, x in values.items()}
+        ranges.append({"": label, **written})
+    show(table("Sequences and frames", counts), table("Smallest, median and largest", ranges, columns))
 
 
 def _measure(sequence: PosedSequence) -> Row:

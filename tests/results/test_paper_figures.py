@@ -174,7 +174,14 @@ def test_a_folder_without_results_is_refused_with_what_makes_them(runs) -> None:
 
 
 def test_hidden_modes_have_a_table_of_their_own_unless_a_protocol_is_missing(runs) -> None:
-    scores = {"coverage": 0.5, "total_variation": 0.25, "sharpness": 1.0, "rejected": 0.125, "scenes": 4, "samples": 32}
+    scores = {
+        "coverage": 0.5,
+        "total_variation": 0.25,
+        "mode_distance": 1.0,
+        "rejected": 0.125,
+        "scenes": 4,
+        "samples": 32,
+    }
     protocol = {"scenes": ["x", "y"], "method": "LatentDiffusion", "samples": 32, "data_fingerprint": "f00d"}
     for name in ("a", "b", "lacking"):
         (runs / name).mkdir()

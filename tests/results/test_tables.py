@@ -5,16 +5,17 @@ import re
 
 import pytest
 
+from completesplat.results.measured import evaluation_table
 from completesplat.results.paper_figures import published, tables
 from completesplat.results.runs import find
 from completesplat.results.tables import (
     BLANK,
     SHARPNESS_NOTE,
     SSIM_NOTE,
+    Heading,
     as_latex,
     as_markdown,
     escape,
-    evaluation_table,
     show,
     table,
     write_tables,
@@ -96,7 +97,8 @@ def test_latex_prints_special_characters_literally() -> None:
 
 
 def test_missing_entries_of_records_stay_empty(capsys) -> None:
-    shown = table("Title", [("name", "name", ""), ("figure", "figure", ".1f")], [{"name": "[red]"}, {"figure": 1.25}])
+    columns = {"name": Heading("name", figures=False), "figure": Heading("figure", form=".1f")}
+    shown = table("Title", [{"name": "[red]"}, {"figure": 1.25}], columns)
     assert [[cell.text for cell in row.cells] for row in shown.rows] == [["[red]", ""], ["", "1.2"]]
     show(shown)
     assert "[red]" in capsys.readouterr().out
