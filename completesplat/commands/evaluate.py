@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any, TypedDict, Unpack
 
 import torch
 from hydra.utils import instantiate
@@ -23,6 +23,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.results.measured import MODE_COLUMNS, evaluation_table
 from completesplat.results.runs import MODEL
 from completesplat.results.tables import show, table
+from completesplat.settings.checks import EvaluationSettings, Tested
 from completesplat.settings.schema import Natural, Positive, Range
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.stage import Stage
@@ -75,11 +76,12 @@ def set_scoring(module: Stage, evaluation: Config) -> None:
 
 
 @stopped_together()
-def run(trained: Config, evaluation: Config, trainer: Config, logger: Config | None, out: Path) -> None:
+def run(
+    evaluation: EvaluationSettings, trainer: Config, out: Path, logger: Config | None = None, **trained: Unpack[Tested]
+) -> None:
     """Write `metrics.json` and print the table.
 
     Args:
-        trained: the arguments of `Trained`.
         evaluation, trainer, logger: configs of the protocol, the trainer (without precision), loggers by name.
     """
     tested = Trained(**trained)
@@ -118,7 +120,11 @@ class HiddenModesEvaluation(TypedDict):
 
 
 def run_hidden_modes(
-    trained: Config, evaluation: HiddenModesEvaluation, trainer: Config, logger: Config | None, out: Path
+    evaluation: HiddenModesEvaluation,
+    trainer: Config,
+    out: Path,
+    logger: Config | None = None,
+    **trained: Unpack[Tested],
 ) -> None:
     """Write JSON files of hidden modes, shares and protocol, draw `hidden_modes.png`, and print the table.
 
@@ -128,7 +134,7 @@ def run_hidden_modes(
     Raises:
         CompleteSplatError: the data's hidden parts are not known, or no scene can be used.
     """
-    from completesplat.studies.mode_benchmark import draw, measure, predictors, usable
+    from completesplat.studies.mode_benchmark import measure, predictors, usable, write_sheet
 
     tested = Trained(**trained)
     quieten()
@@ -148,9 +154,11 @@ def run_hidden_modes(
     results = measured.results(samples)
     write_json(out / "hidden_modes.json", results)
     write_json(out / "shares.json", measured.shares())
-    used = {"scenes": measured.names, "skipped": skipped, **provenance(data, out), **tested.facts()}
-    write_json(out / "protocol.json", _modes_protocol(evaluation, module, data) | used)
-    draw(measured, samples, out / "hidden_modes.png")
+    stated = {"name": evaluation["name"], "method": module.method, **data.describe(), "image_size": data.image_size}
+    stated |= {"samples": samples, "views": evaluation["views"], "spread_views": evaluation["spread_views"]}
+    stated |= {"seed": evaluation["seed"], **drawing(module), "scenes": measured.names, "skipped": skipped}
+    write_json(out / "protocol.json", stated | provenance(data, out) | tested.facts())
+    write_sheet(measured, samples, out / "hidden_modes.png")
     scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
     loggers: list[Logger] = list(instantiate(logger or {}, _convert_="all").values())
     with wandb_runs(loggers, OmegaConf.load(out / CONFIG)):
@@ -163,15 +171,3 @@ def run_hidden_modes(
     show(table(title, records, MODE_COLUMNS), width=140)
     if skipped:
         print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
-
-
-def _modes_protocol(evaluation: HiddenModesEvaluation, module: Stage, data: SceneDataModule) -> dict[str, object]:
-    """Return the record of what was measured and how."""
-    return {
-        "name": evaluation["name"],
-        "method": module.method,
-        **data.describe(),
-        "image_size": data.image_size,
-        **{key: value for key, value in evaluation.items() if key in ("samples", "views", "spread_views", "seed")},
-        **drawing(module),
-    }

@@ -68,7 +68,7 @@ def alike(measurements: Iterable[tuple[Measured, Protocol]], *more: str) -> list
     return [groups[key] for key in sorted(groups)]
 
 
-def described(protocol: Protocol, keys: Sequence[str] = DESCRIBED) -> str:
+def protocol_line(protocol: Protocol, keys: Sequence[str] = DESCRIBED) -> str:
     """Describe a protocol in one line."""
     values: Mapping[str, object] = protocol
     known = {key: value for key in keys if (value := values.get(key)) is not None}
@@ -111,7 +111,9 @@ class Entry:
         """Return a cell with the score `REGION_VIEW_METRIC`, or with the number of the note on why it is missing."""
         if (value := self.scores.get(name)) is not None or not self.lacking:
             return score_cell(name, value, self.deviations.get(name), mark)
-        return notes.missing(name, self.protocol, self.lacking)
+        metric = name.rpartition("_")[2]
+        reason = self.protocol.get("missing", {}).get(metric, self.lacking)
+        return Cell(f"missing: note {notes.number(f'{metric}: {reason}')}")
 
     def leading(self, notes: Notes) -> dict[str, Cell]:
         """Return the cells before the scores, by the keys of `LEADING`."""
@@ -169,7 +171,7 @@ def _entry(run: Result, predictor: str, scores: Scores) -> Entry:
         label = f"{protocol.get('method', 'model')}{kinds[predictor]}"
         label += " (upper bound)" if entry.upper_bound else ""
     owner = "" if entry.ours and protocol.get("frame") else OURS  # any program may have written the files
-    note = f"{run.name}: {described(protocol)}."
+    note = f"{run.name}: {protocol_line(protocol)}."
     return replace(entry, label=f"{owner}{label}", note=note, lacking=f"not measured for {predictor}")
 
 
@@ -249,11 +251,11 @@ def mode_tables(runs: Sequence[Result]) -> list[Table]:
 def _mode_table(name: str, runs: Sequence[Result]) -> Table:
     notes, records = Notes(), dict[object, dict[str, object]]()
     for run in runs:
-        note = notes.number(f"{run.name}: {described(run.protocol)}.")
+        note = notes.number(f"{run.name}: {protocol_line(run.protocol)}.")
         for method, scores in run.entries.items():
             ours = method == MODEL
             label = run.protocol.get("method", "model") if ours else method.replace("_", " ")
-            record = {"source": "ours" if ours else "known", "method": f"{label} [{note}]", **scores}
+            record: dict[str, object] = {"source": "ours" if ours else "known", "method": f"{label} [{note}]", **scores}
             # Methods other than the model may have the same scores in several runs, and are then shown once.
             records.setdefault(run.name if ours else (label, *scores.items()), record)
     protocol = runs[0].protocol

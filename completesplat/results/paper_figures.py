@@ -1,10 +1,10 @@
 """Tables of the paper, with our runs beside them if they were measured by the same protocol."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from omegaconf import OmegaConf
 
@@ -18,10 +18,10 @@ from completesplat.results.measured import (
     OURS,
     Entry,
     alike,
-    described,
     entries_of,
     leading_headings,
     mode_tables,
+    protocol_line,
     score_rows,
     score_tables,
 )
@@ -54,60 +54,28 @@ LACKING = "not measured in all jobs of this row"
 APART = "Rows of ours are by the protocol in their note, not by the paper's: they compare among each other only."
 
 
-@dataclass(frozen=True)
-class PrintedColumn:
-    """Column as printed: joined levels of its heading; a key of `LEADING` or `METRICS`; a data set, or the table's."""
-
-    heading: str
-    key: str
-    data_set: str = ""
-
-
-@dataclass(frozen=True)
-class PublishedTable:
-    """Table of the paper and the protocol of its figures; the head of `figures.yaml` explains each entry.
-
-    `evaluations` has, by name of our protocol, the `resolution`, `protocol_views` and numbers of `scenes` that a run
-    must have; without `scenes`, it must have all scenes of the list.
-    """
-
-    name: str
-    place: str
-    label: str
-    title: str
-    region: str
-    view: str
-    evaluations: Mapping[str, Mapping[str, Any]]
-    says: list[str]
-    columns: list[PrintedColumn]
-    rows: list[list[Cell]]
-    legend: Mapping[str, str] = field(default_factory=dict)
-    data_set: str = ""
-    resolution: str = ""
-    subset: str = ""
-    oracle_samples: int | None = None
-    remarks: list[str] = field(default_factory=list)
-    options: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def scored(self) -> list[tuple[int, PrintedColumn, str]]:
-        """Number, column and data set of each column of scores."""
-        numbered = enumerate(self.columns)
-        return [(n, column, column.data_set or self.data_set) for n, column in numbered if column.key in METRICS]
+PublishedTable = Any
+"""Table of the paper and the protocol of its figures: an entry of `figures.yaml`, whose head explains its keys."""
 
 
 @cache
 def published() -> list[PublishedTable]:
     """Return all tables, in the paper's order."""
-    tables = []
-    for entry in cast(list[dict[str, Any]], OmegaConf.to_container(OmegaConf.load(FILE).tables)):
-        columns = [PrintedColumn(**column) for column in entry.pop("columns")]
-        rows = [[parse(cell) for cell in line.split("|")] for line in entry.pop("rows").splitlines()]
-        tables.append(PublishedTable(columns=columns, rows=rows, **entry))
-    return tables
+    return list(OmegaConf.load(FILE).tables)
 
 
-def parse(cell: str) -> Cell:
+def printed_rows(table: PublishedTable) -> list[list[Cell]]:
+    """Return the rows of a published table."""
+    return [[parse_cell(cell) for cell in line.split("|")] for line in table.rows.splitlines()]
+
+
+def scored(table: PublishedTable) -> list[tuple[int, Any, str]]:
+    """Return number, column and data set of each column of scores."""
+    numbered = enumerate(table.columns)
+    return [(n, x, x.get("data_set", table.get("data_set"))) for n, x in numbered if x.key in METRICS]
+
+
+def parse_cell(cell: str) -> Cell:
     """Convert `17.93 best` to the text `17.93` with the mark `best`; dagger and star become signs behind the text."""
     words = cell.split()
     text = " ".join(word for word in words if word not in (BEST, SECOND, *SIGNS)) or BLANK
@@ -121,22 +89,22 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
     Times are of one sequence, warm, for the complete pipeline.
     """
     notes, keys = Notes(), ["method"]
-    if not table.options:
+    if not table.get("options"):
         keys = [key for key in LEADING if key in OF_RUNS or any(column.key == key for column in table.columns)]
     rows = []
-    for row in table.rows:
-        cells = {"resolution": Cell(table.resolution or ABSENT)}
+    for row in printed_rows(table):
+        cells = {"resolution": Cell(table.get("resolution", ABSENT))}
         cells |= {column.key: cell for column, cell in zip(table.columns, row, strict=True)}
-        scores = [row[number] for number, _, _ in table.scored]
+        scores = [row[number] for number, _, _ in scored(table)]
         rows.append(TableRow("paper", [*(cells.get(key, Cell(ABSENT)) for key in keys), *scores]))
-    columns = [(f"{table.region}_{table.view}_{column.key}", None if table.options else data_set)
-               for _, column, data_set in table.scored]  # fmt: skip
+    columns = [(f"{table.region}_{table.view}_{column.key}", None if table.get("options") else data_set)
+               for _, column, data_set in scored(table)]  # fmt: skip
     rows += score_rows(entries, keys, columns, notes, marked=False)
-    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in table.scored)]
+    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in scored(table))]
     source = f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
-    signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.legend.items()]
-    apart = ([APART] if entries else []) if table.options else [VIEWS]
-    remarks = [source, *signs, LEGEND, *apart, *table.remarks]
+    signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.get("legend", {}).items()]
+    apart = ([APART] if entries else []) if table.get("options") else [VIEWS]
+    remarks = [source, *signs, LEGEND, *apart, *table.get("remarks", [])]
     return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
 
 
@@ -154,11 +122,11 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
         return False
     if protocol.get("background") is not None or protocol.get("skip_weight") not in (None, 1):
         return False
-    if protocol["data_set"] not in {data_set for *_, data_set in table.scored}:
+    if protocol["data_set"] not in {data_set for *_, data_set in scored(table)}:
         return False
-    if table.subset and protocol.get("subset") != table.subset:
+    if "subset" in table and protocol.get("subset") != table.subset:
         return False
-    if entry.predictor in (BEST_OF_K, BEST_BY_METRIC) and protocol.get("samples") != table.oracle_samples:
+    if entry.predictor in (BEST_OF_K, BEST_BY_METRIC) and protocol.get("samples") != table.get("oracle_samples"):
         return False
     if protocol["scenes"] not in wanted.get("scenes", [protocol.get("scenes_listed")]):
         return False
@@ -170,7 +138,7 @@ def sweep_entries(table: PublishedTable, name: str, jobs: Sequence[Job]) -> list
     entries = []
     for group in alike((job, job.protocol) for job in jobs):
         protocol = group[0].protocol
-        note = f"{name}: mean ± sample deviation over seeds; {described(protocol, ALIKE)}."
+        note = f"{name}: mean ± sample deviation over seeds; {protocol_line(protocol, ALIKE)}."
         for row in sweep_rows(group):
             theirs = "".join(f" ({table.options[part]})" for part in row.label.split(", ") if part in table.options)
             label = f"{OURS}{row.label}{theirs}{f', {row.seeds} seeds' if row.seeds else ''}"
@@ -178,7 +146,7 @@ def sweep_entries(table: PublishedTable, name: str, jobs: Sequence[Job]) -> list
     return entries
 
 
-def tables(tree: RunTree | None) -> list[Table]:
+def published_tables(tree: RunTree | None) -> list[Table]:
     """Return the published tables with the runs below a folder, or the published figures alone for None.
 
     A run is listed below published rows only if it was measured like them, else in a table for its protocol. The jobs
@@ -191,7 +159,7 @@ def tables(tree: RunTree | None) -> list[Table]:
         return [beside(table, []) for table in published()]
     if not (tree.scores or tree.modes or tree.warnings):
         raise CompleteSplatError(f"runs={tree.folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
-    options = {option for table in published() for option in table.options}
+    options = {option for table in published() for option in table.get("options", [])}
     jobs = {folder: [job for job in collect(folder) if job.protocol] for folder in tree.sweeps}
     sweeps = {
         folder: tested for folder, tested in jobs.items() if any(options & set(job.label.split(", ")) for job in tested)
@@ -199,7 +167,7 @@ def tables(tree: RunTree | None) -> list[Table]:
     single = entries_of(run for run in tree.scores if run.folder.parent not in sweeps)
     made, placed = [], []
     for table in published():
-        if table.options:
+        if table.get("options"):
             named = [(str(folder.relative_to(tree.folder)), tested) for folder, tested in sweeps.items()]
             entries = [entry for name, tested in named for entry in sweep_entries(table, name, tested)]
         else:

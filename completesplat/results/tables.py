@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from completesplat.files import atomic_path, write_text
 from completesplat.metrics import PSNR_LIMIT
-from completesplat.results.runs import Protocol
 
 if TYPE_CHECKING:
     from rich.table import Table as PrintedTable
@@ -121,12 +120,6 @@ class Notes:
         if text not in self.texts:
             self.texts.append(text)
         return self.texts.index(text) + 1
-
-    def missing(self, column: str, protocol: Protocol, otherwise: str) -> Cell:
-        """Return a cell that refers to a note on why a score is missing: the protocol's reason, or else `otherwise`."""
-        metric = column.rpartition("_")[2]
-        reason = protocol.get("missing", {}).get(metric, otherwise)
-        return Cell(f"missing: note {self.number(f'{metric}: {reason}')}")
 
 
 @dataclass(frozen=True)

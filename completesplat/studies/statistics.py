@@ -128,15 +128,7 @@ def _histogram(key: str, rows: dict[str, list[Row]]) -> dict[str, Any]:
     return {"edges": edges.tolist(), "counts": counts}
 
 
-# Measure, title, label of the axis.
-PANELS = [
-    ("frames_per_sequence", "Length", "frames of a sequence"),
-    ("fov_degrees", "Field of view", "horizontal angle, degrees"),
-    ("largest_angle_degrees", "Turn", "largest angle between two views, degrees"),
-    ("distance_from_first", "Baseline", "largest distance from the first camera, scene units"),
-    ("near", "Near", "nearest depth, scene units"),
-    ("far", "Far", "farthest depth, scene units"),
-]
+PANELS = [measure for measure in MEASURES if measure[0] != "path_extent"]
 DASHES = ["-", "--", ":"]
 
 
@@ -145,7 +137,7 @@ def plot_statistics(results: dict[str, Any], path: Path, title: str) -> None:
     total = {split: summary["sequences"] for split, summary in results["splits"].items()}
     numbers = ", ".join(f"{count:,} {split}" for split, count in total.items())
     with written_figure(path, f"{title}: sequences {numbers}", (13, 7)) as figure:
-        for panel, (key, heading, label) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
+        for panel, (key, label, _) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
             histogram = results["histograms"][key]
             for index, (split, count) in enumerate(total.items()):
                 if count:
@@ -153,7 +145,7 @@ def plot_statistics(results: dict[str, Any], path: Path, title: str) -> None:
                     style: dict[str, Any] = {"color": f"C{index}", "linestyle": DASHES[index % len(DASHES)]}
                     panel.stairs(shares, histogram["edges"], baseline=None, linewidth=1.8, label=split, **style)
                     panel.stairs(shares, histogram["edges"], fill=True, alpha=0.15, color=f"C{index}")
-            panel.set(title=heading, xlabel=label, ylabel="sequences of the split, %")
+            panel.set(xlabel=label, ylabel="sequences of the split, %")
             panel.set_ylim(bottom=0)
             panel.grid(alpha=0.3)
         if any(total.values()):
