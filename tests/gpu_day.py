@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from completesplat.commands.protocol import git_commit, write_json
+from completesplat.commands.protocol import git_commit, write_results
 from completesplat.results.machine import machine
 
 NETWORKS = ["autoreconstructor=tiny", "autoreconstructor.encoder.channels=[8,8,16,16]", "denoiser=tiny"]
@@ -87,7 +87,7 @@ def done(step: Step, out: Path) -> bool:
 def run(out: Path, small: bool) -> list[str]:
     """Do what is not done yet; names of the steps that failed or could not be done."""
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "machine.json", machine() | {"commit": git_commit()})
+    write_results(out / "machine.json", machine() | {"commit": git_commit()})
     lacking: list[str] = []
     for step in steps(out, small):
         if (out / f"{step.name}.txt").is_file():

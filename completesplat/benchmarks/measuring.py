@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from completesplat.commands.protocol import write_json
+from completesplat.commands.protocol import write_results
 from completesplat.results.machine import machine
-from completesplat.results.tables import show, table
+from completesplat.results.tables import records_table, show
 from completesplat.training.stage import now
 
 Work = Callable[[], object]
@@ -30,9 +30,9 @@ def report(path: Path, results: Mapping[str, Any], tables: Mapping[str, Sequence
         device: "cuda", or anything else for the processor.
     """
     here = machine()
-    write_json(path, {"machine": here, **results})
+    write_results(path, {"machine": here, **results})
     name = here["gpu"] if device == "cuda" else f"{here['processor']}, {here['threads']} threads"
     print(f"{name}, torch {here['torch']}, {here['date']}")
-    show(*(table(title, rows) for title, rows in tables.items()), width=140)
+    show(*(records_table(title, rows) for title, rows in tables.items()), width=140)
     for part, reason in results.get("not_measured", {}).items():
         print(f"{part}: not measured, because {reason}")

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from completesplat.commands.protocol import write_json
+from completesplat.commands.protocol import write_results
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.settings.schema import Entries, Positive, Range
 
@@ -26,7 +26,7 @@ def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> Non
     except DataError as error:  # concerns the data set as a whole
         findings = audit.Findings(0, 0, [error], {}, {})
     findings.write(out / "check.json")
-    audit.show(findings)
+    audit.show_findings(findings)
     if not findings.sequences:
         print(out)
         sys.exit(1)
@@ -41,7 +41,7 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
     sources = _sources(data, splits)
     tracked_names = {split: track(source.names, f"reading cameras of {split}") for split, source in sources.items()}
     results = statistics({split: _readable(sources[split], names) for split, names in tracked_names.items()})
-    write_json(out / "stats.json", results)
+    write_results(out / "stats.json", results)
     plot_statistics(results, out / "stats.png", str(data.root))
     show_statistics(results)
 

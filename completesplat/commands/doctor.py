@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from completesplat import __version__
-from completesplat.commands.protocol import write_json
+from completesplat.commands.protocol import write_results
 from completesplat.data.rendered.blender import find_blender
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.weights import SHIPPED, SUMS_FILE, check_folder
@@ -161,7 +161,7 @@ def run(config: DictConfig, out: Path) -> None:
             table.add_row(part, Text(finding.name), Text(finding.state, STYLES[finding.state]), Text(finding.details))
             broken += [f"{part}, {finding.name}: {finding.details}"] if finding.state == "broken" else []
         table.add_section()
-    write_json(out / "doctor.json", {"works": not broken, "findings": rows})
+    write_results(out / "doctor.json", {"works": not broken, "findings": rows})
     Console(width=None if Console().is_terminal else 160).print(table)
     if broken:
         print("broken: " + "; ".join(broken))

@@ -15,14 +15,14 @@ from rich.progress import track
 
 from completesplat.commands import quieten
 from completesplat.commands.jobs import CONFIG, METRICS
-from completesplat.commands.protocol import drawing, protocol, provenance, write_json
+from completesplat.commands.protocol import drawing, protocol, provenance, write_results
 from completesplat.commands.trained import Trained
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.results.measured import MODE_COLUMNS, evaluation_table
 from completesplat.results.runs import MODEL
-from completesplat.results.tables import show, table
+from completesplat.results.tables import records_table, show
 from completesplat.settings.checks import EvaluationSettings, Tested
 from completesplat.settings.schema import Natural, Positive, Range
 from completesplat.training.loggers import wandb_runs
@@ -99,7 +99,7 @@ def run(
         if not tester.is_global_zero:
             return
         described = protocol(evaluation, module, data, results, out) | tested.facts()
-        write_json(out / METRICS, {"protocol": described} | results)
+        write_results(out / METRICS, {"protocol": described} | results)
     show(evaluation_table(results, MODEL if tested.scenes is None else module.method), width=160)
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")
@@ -134,7 +134,7 @@ def run_hidden_modes(
     Raises:
         CompleteSplatError: the data's hidden parts are not known, or no scene can be used.
     """
-    from completesplat.studies.mode_benchmark import measure, predictors, usable, write_sheet
+    from completesplat.studies.mode_benchmark import measure, predictors, usable, write_modes
 
     tested = Trained(**trained)
     quieten()
@@ -152,13 +152,13 @@ def run_hidden_modes(
     shown = evaluation["shown_scenes"], evaluation["shown_samples"]
     measured = measure(methods, on_device, samples, evaluation["seed"], *shown, progress)
     results = measured.results(samples)
-    write_json(out / "hidden_modes.json", results)
-    write_json(out / "shares.json", measured.shares())
+    write_results(out / "hidden_modes.json", results)
+    write_results(out / "shares.json", measured.shares())
     stated = {"name": evaluation["name"], "method": module.method, **data.describe(), "image_size": data.image_size}
     stated |= {"samples": samples, "views": evaluation["views"], "spread_views": evaluation["spread_views"]}
     stated |= {"seed": evaluation["seed"], **drawing(module), "scenes": measured.names, "skipped": skipped}
-    write_json(out / "protocol.json", stated | provenance(data, out) | tested.facts())
-    write_sheet(measured, samples, out / "hidden_modes.png")
+    write_results(out / "protocol.json", stated | provenance(data, out) | tested.facts())
+    write_modes(measured, samples, out / "hidden_modes.png")
     scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
     loggers: list[Logger] = list(instantiate(logger or {}, _convert_="all").values())
     with wandb_runs(loggers, OmegaConf.load(out / CONFIG)):
@@ -168,6 +168,6 @@ def run_hidden_modes(
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
     labels = {} if tested.scenes is None else {MODEL: module.method}
     records = [{"method": labels.get(name, name), **values} for name, values in results.items()]
-    show(table(title, records, MODE_COLUMNS), width=140)
+    show(records_table(title, records, MODE_COLUMNS), width=140)
     if skipped:
         print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from completesplat.commands import quieten
 from completesplat.commands.evaluate import scored_data, set_scoring
 from completesplat.commands.jobs import LAST, METRICS
-from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
+from completesplat.commands.protocol import checkpoint_facts, protocol, write_results
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
@@ -107,7 +107,7 @@ def run(config: DictConfig, out: Path) -> None:
             show(evaluation_table(scores), width=160)
             described = protocol(config.evaluation, module, tested, scores, out) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
-        write_json(out / METRICS, results)  # the last file, because it means that the job is done
+        write_results(out / METRICS, results)  # the last file, because it means that the job is done
 
 
 def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:

@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from completesplat import __version__
 from completesplat.commands.imports import importing, postponing
-from completesplat.commands.protocol import git_commit, write_json
+from completesplat.commands.protocol import git_commit, write_results
 from completesplat.errors import CompleteSplatError
 from completesplat.files import UNFINISHED, atomic_path, write_bytes, writing
 from completesplat.settings.checks import check_verb
@@ -259,7 +259,7 @@ def _record(out: Path, command: list[str], overrides: list[str], config: Mapping
             record["earlier_ends"] += [{"until": now, "command": earlier["command"], **before}]
             if (results := out / METRICS).is_file():
                 renamed = results.rename(out / f"metrics_{json.loads(results.read_text())['steps']}_steps.json")
-    write_json(path, record)
+    write_results(path, record)
     return renamed
 
 

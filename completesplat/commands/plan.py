@@ -19,16 +19,16 @@ from lightning.pytorch.callbacks import WeightAveraging
 from omegaconf import DictConfig, OmegaConf
 
 from completesplat.commands.fit import OTHER_WEIGHTS
-from completesplat.commands.protocol import write_json
+from completesplat.commands.protocol import write_results
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
-from completesplat.results.tables import Table, show, table
+from completesplat.results.tables import Table, records_table, show
 from completesplat.scene import Batch, SceneBatch
 from completesplat.settings.checks import check_image_size, check_optimizer
 from completesplat.settings.options import did_you_mean
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.stage import Stage, now
-from completesplat.training.step_counts import StepCounts, count_step, encode
+from completesplat.training.step_counts import StepCounts, count_step, with_latents
 from completesplat.training.steps import MEBIBYTE, Training, peak_megabytes, synthetic_batch
 
 HERE = "this"
@@ -48,7 +48,7 @@ ADDED = ("steps", "days", "gpu_hours", "price")
 def run(config: DictConfig, out: Path) -> None:
     """Print the plan of a training and write `plan.json`."""
     plan = plan_of(config)
-    write_json(out / "plan.json", plan)
+    write_results(out / "plan.json", plan)
     show(plan_table({"plan": plan}), width=160)
     print("Assumptions:", " ".join(f"{key}={value}" for key, value in plan["assumptions"].items()))
     for line in plan["remarks"]:
@@ -75,7 +75,7 @@ def plan_table(plans: Mapping[str, Mapping[str, Any]]) -> Table:
         rows.append({"": key.replace("_", " "), **{name.replace("_", " "): plan[key] for name, plan in plans.items()}})
         if len(plans) > 1:
             rows[-1]["total"] = sum(plan[key] for plan in plans.values()) if key in ADDED else None
-    return table("completesplat plan", rows)
+    return records_table("completesplat plan", rows)
 
 
 def plan_of(config: DictConfig) -> dict[str, Any]:
@@ -237,7 +237,7 @@ def timed(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, fl
     module: Stage = build(copied.model, _convert_="all").to(device)
     inputs: Batch = synthetic_batch(config.data.image_size, scenes, config.data.targets).to(device)
     if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch) and config.data.latent_cache is not None:
-        inputs = encode(module, inputs)
+        inputs = with_latents(module, inputs)
     training, seconds = Training(module, precision(config)), []
 
     def step() -> None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
 
 
-def write_json(path: Path, content: Mapping[str, object]) -> None:
+def write_results(path: Path, content: Mapping[str, object]) -> None:
     """Write results in one step, so that an existing file is whole.
 
     JSON has no NaN and no infinities: they become null, and the entry `not_finite` lists their values.

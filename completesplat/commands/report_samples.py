@@ -15,12 +15,12 @@ from rich.console import Console
 from rich.progress import track
 
 from completesplat.commands import quieten
-from completesplat.commands.protocol import write_json
+from completesplat.commands.protocol import write_results
 from completesplat.commands.trained import Trained, diffusion_of
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import CompleteSplatError
 from completesplat.export.images import image_sheet, write_png
-from completesplat.results.tables import show, table
+from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
 from completesplat.settings.checks import ModelSettings
 from completesplat.settings.schema import Entries, Positive, Range, Share
@@ -112,8 +112,8 @@ def modes(spread_views: Positive, out: Path, **run: Unpack[Run]) -> None:
 def _report(path: Path, title: str, rows: Sequence[Mapping[str, object]], run: Run, **settings: float) -> None:
     """Write the rows of a study with its settings to a JSON file, and print them."""
     shared = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
-    write_json(path, {"settings": shared | settings, "rows": rows})
-    show(table(title, rows))
+    write_results(path, {"settings": shared | settings, "rows": rows})
+    show(records_table(title, rows))
 
 
 @contextmanager

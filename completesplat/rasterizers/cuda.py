@@ -77,7 +77,7 @@ class CudaRasterizer:
             message = "the cuda rasterizer has no gradient to the intrinsics: detach them, or take rasterizer=reference"
             raise CompleteSplatError(message)
         height, width = cameras.image_size
-        prepared = prepare(gaussians, drawable(gaussians, cameras, self.constants))
+        prepared = padded(gaussians, drawable(gaussians, cameras, self.constants))
         images, alphas, _ = self._rasterization(
             **dict(zip(("means", "quats", "scales", "opacities", "colors"), vars(prepared).values(), strict=True)),
             **{"viewmats": cameras.world_to_camera, "Ks": cameras.intrinsics, "width": width, "height": height},
@@ -121,7 +121,7 @@ def _magnification(cameras: Cameras, constants: RenderingConstants) -> Float[Ten
     return (focal * (1 + slope.square()).sqrt()).amax(-1)
 
 
-def prepare(gaussians: Gaussians, mask: Bool[Tensor, "batch gaussian"]) -> Gaussians:
+def padded(gaussians: Gaussians, mask: Bool[Tensor, "batch gaussian"]) -> Gaussians:
     """Return Gaussians that are safe for gsplat: unit quaternions, and zeros for those outside of the mask.
 
     Zero opacity keeps a Gaussian out of the image; zeros for its other values keep NaN out of the gradients. The

@@ -19,9 +19,9 @@ from completesplat.results.tables import (
     Table,
     TableRow,
     marks,
+    records_table,
     score_cell,
     score_heading,
-    table,
 )
 
 BEST_OF_K, BEST_BY_METRIC, MEAN_OF_K = "best_of_k", "best_of_k_by_metric", "mean_of_k"
@@ -262,5 +262,5 @@ def _mode_table(name: str, runs: Sequence[Result]) -> Table:
     data = protocol.get("data_set") or f"data {protocol.get('data_fingerprint', 'unknown')[:12]}"
     columns = {key: value for key, value in MODE_COLUMNS.items() if any(key in each for each in records.values())}
     ordered = sorted(records.values(), key=lambda record: record["source"] != "ours")
-    made = table(f"Hidden modes, {data}", ordered, columns)
+    made = records_table(f"Hidden modes, {data}", ordered, columns)
     return replace(made, name=name, remarks=[MODES_EXPLAINED], notes=notes)

@@ -17,7 +17,7 @@ METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid"
 FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f", "sharpness": ".2f"}
 BETTER = {"psnr": "↑", "ssim": "↑", "lpips": "↓", "fid": "↓", "kid": "↓", "sharpness": "(truth: 1)"}
 """Better direction of each metric. Sharpness has none, because a blur has less than the truth and noise has more."""
-GROUPS = {
+HEADING_GROUPS = {
     "full_novel": "all pixels, novel views",
     "object_novel": "object pixels, novel views",
     "full_reference": "reference view",
@@ -49,7 +49,7 @@ CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "ma
 def score_heading(name: str) -> "Heading":
     """Return a heading for a score named `REGION_VIEW_METRIC`: its better direction, grouped by region and view."""
     group, _, metric = name.rpartition("_")
-    return Heading(f"{METRICS[metric]} {BETTER[metric]}", GROUPS[group])
+    return Heading(f"{METRICS[metric]} {BETTER[metric]}", HEADING_GROUPS[group])
 
 
 def marks(values: Sequence[float | None], competing: Sequence[bool], name: str) -> list[str]:
@@ -154,7 +154,9 @@ class Table:
         return printed
 
 
-def table(title: str, records: Sequence[Mapping[str, object]], columns: Mapping[str, Heading] | None = None) -> Table:
+def records_table(
+    title: str, records: Sequence[Mapping[str, object]], columns: Mapping[str, Heading] | None = None
+) -> Table:
     """Return a table with a row for each record, whose `source` is the row's; missing values stay empty.
 
     Without `columns`, the records' keys are the headings, and lists and mappings are left out.

@@ -85,7 +85,7 @@ def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
     stage 2 is at fault; if neither do, stage 1 is. A deterministic method returns `samples` equal renders. Samples are
     computed and rendered `batch` at a time.
     """
-    methods: dict[str, Rung] = {"model": lambda scene, other, seed: module.write_sheet(scene, [seed], samples, batch)}
+    methods: dict[str, Rung] = {"model": lambda scene, other, seed: module.draw(scene, [seed], samples, batch)}
     frozen = module.completesplat.autoreconstructor if isinstance(module, LatentDiffusion) else None
     network = frozen or getattr(module, "model", None)
     if isinstance(network, VariationalAutoReconstructor):
@@ -216,7 +216,7 @@ def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenMode
     return selected, skipped
 
 
-def write_sheet(measured: Measured, samples: int, path: Path) -> None:
+def write_modes(measured: Measured, samples: int, path: Path) -> None:
     """Write a PNG with a row for each scene of `Measured.rows`."""
     title = f"Hidden modes: {len(measured.names)} scenes, {samples} samples each. Input; then from behind: every mode, "
     write_png(path, image_sheet(None, measured.rows, f"{title}samples with their modes"))

@@ -99,8 +99,8 @@ def plot_noise_levels(table: Sequence[Row], path: Path, title: str) -> None:
     with written_figure(path, title, (8, 6)) as figure:
         top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
         levels = [row["level"] for row in table]
-        top.plot_noise_levels(levels, [row["best_share"] for row in table], "o-", label="best classifier")
-        top.plot_noise_levels(levels, [row["denoiser_share"] for row in table], "o-", label="denoiser")
+        top.plot(levels, [row["best_share"] for row in table], "o-", label="best classifier")
+        top.plot(levels, [row["denoiser_share"] for row in table], "o-", label="denoiser")
         top.set(ylabel="share of the true mode", ylim=(0, 1.05))
         top.legend()
         steps = sum(row["steps"] for row in table)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.data.sequences import PosedSequence
-from completesplat.results.tables import Heading, show, table
+from completesplat.results.tables import Heading, records_table, show
 from completesplat.studies.figures import written_figure
 
 # Key in the results, label, format.
@@ -66,7 +66,7 @@ def show_statistics(results: dict[str, Any]) -> None:
         values = {f"{split} {part}": summary[key][part] for split, summary in splits.items() for part in PARTS}
         written = {name: "-" if x is None else format(x, form) for name, x in values.items()}
         ranges.append({"": label, **written})
-    show(table("Sequences and frames", counts), table("Smallest, median and largest", ranges, columns))
+    show(records_table("Sequences and frames", counts), records_table("Smallest, median and largest", ranges, columns))
 
 
 def _measure(sequence: PosedSequence) -> Row:

@@ -16,8 +16,8 @@ from completesplat.results.tables import (
     as_latex,
     as_markdown,
     escape,
+    records_table,
     show,
-    table,
     write_tables,
 )
 
@@ -98,7 +98,7 @@ def test_latex_prints_special_characters_literally() -> None:
 
 def test_missing_entries_of_records_stay_empty(capsys) -> None:
     columns = {"name": Heading("name", figures=False), "figure": Heading("figure", form=".1f")}
-    shown = table("Title", [{"name": "[red]"}, {"figure": 1.25}], columns)
+    shown = records_table("Title", [{"name": "[red]"}, {"figure": 1.25}], columns)
     assert [[cell.text for cell in row.cells] for row in shown.rows] == [["[red]", ""], ["", "1.2"]]
     show(shown)
     assert "[red]" in capsys.readouterr().out
