@@ -154,10 +154,11 @@ def run_hidden_modes(
     results = measured.results(samples)
     write_results(out / "hidden_modes.json", results)
     write_results(out / "shares.json", measured.shares())
-    stated = {"name": evaluation["name"], "method": module.method, **data.describe(), "image_size": data.image_size}
-    stated |= {"samples": samples, "views": evaluation["views"], "spread_views": evaluation["spread_views"]}
-    stated |= {"seed": evaluation["seed"], **drawing(module), "scenes": measured.names, "skipped": skipped}
-    write_results(out / "protocol.json", stated | provenance(data, out) | tested.facts())
+    used_settings = ("name", "samples", "views", "spread_views", "seed")
+    settings = {key: value for key, value in evaluation.items() if key in used_settings}
+    stated = {**settings, "method": module.method, **data.describe(), "image_size": data.image_size, **drawing(module)}
+    used = {"scenes": measured.names, "skipped": skipped, **provenance(data, out), **tested.facts()}
+    write_results(out / "protocol.json", stated | used)
     write_modes(measured, samples, out / "hidden_modes.png")
     scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
     loggers: list[Logger] = list(instantiate(logger or {}, _convert_="all").values())

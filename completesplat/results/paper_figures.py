@@ -97,8 +97,9 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
         cells |= {column.key: cell for column, cell in zip(table.columns, row, strict=True)}
         scores = [row[number] for number, _, _ in scored(table)]
         rows.append(TableRow("paper", [*(cells.get(key, Cell(ABSENT)) for key in keys), *scores]))
-    columns = [(f"{table.region}_{table.view}_{column.key}", None if table.get("options") else data_set)
-               for _, column, data_set in scored(table)]  # fmt: skip
+    names = [f"{table.region}_{table.view}_{column.key}" for _, column, _ in scored(table)]
+    data_sets = [None if table.get("options") else data_set for *_, data_set in scored(table)]
+    columns = list(zip(names, data_sets, strict=True))
     rows += score_rows(entries, keys, columns, notes, marked=False)
     headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in scored(table))]
     source = f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
