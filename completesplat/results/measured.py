@@ -9,6 +9,7 @@ from completesplat.results.runs import MODEL, UPPER_BOUND, Protocol, Result, Sco
 from completesplat.results.tables import (
     ABSENT,
     LEGEND,
+    METRICS,
     SHARPNESS_NOTE,
     SHOWN,
     SSIM_NOTE,
@@ -226,16 +227,18 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = M
     first = next(iter(records.values()))
     pairs = [(f"object_novel_{name}", f"full_novel_{name}") for name in ("psnr", "ssim")]
     masked = any(record.get(name) != record.get(whole) for record in records.values() for name, whole in pairs)
-    # Without masks, every pixel is the object's; with them, sharpness is the object's.
+    # Without masks, every pixel is the object's; with them, sharpness is the object's. More columns are too wide.
+    apart = ("full_novel_sharpness", "object_novel_lpips") if masked else "object"
     names = [name for name in SHOWN if any(name in record for record in records.values())]
-    names = [name for name in names if not name.startswith("full_novel_sharpness" if masked else "object")]
+    names = [name for name in names if not name.startswith(apart)]
     entries = []
     for label, scores in records.items():
         bound = " (upper bound)" if scores.get(UPPER_BOUND) else ""
         entries.append(Entry(label + bound, scores, None))
     rows = score_rows(entries, ["method"], [(name, None) for name in names], Notes(), marked=False)
-    narrow = [replace(heading, group=heading.group.replace(" ", "\n")) for heading in map(score_heading, names)]
-    headings = [Heading("predictor", figures=False), *narrow]
+    headings = [Heading("predictor", figures=False)]
+    for region, view, metric in (name.split("_") for name in names):
+        headings.append(Heading(f"{'all' if region == 'full' else region}\npixels\n{view}\n{METRICS[metric]}"))
     fitted = {label: entry.get("fitted_to") for label, entry in zip(records, results.values(), strict=True)}
     remarks = [f"{label}: fitted to {views}." for label, views in fitted.items() if views]
     title = f"{first['scenes']:.0f} scenes, {first['views']:.0f} novel views"

@@ -20,7 +20,8 @@ BETTER = {"psnr": "↑", "ssim": "↑", "lpips": "↓", "fid": "↓", "kid": "�
 HEADING_GROUPS = {
     "full_novel": "all pixels, novel views",
     "object_novel": "object pixels, novel views",
-    "full_reference": "reference view",
+    "full_reference": "all pixels, reference view",
+    "object_reference": "object pixels, reference view",
 }
 SSIM_NOTE = "SSIM: mean over all pixels, images mirrored at their border (skimage leaves 5 pixels out on every side)."
 """Note below tables with SSIM; the border has 37 % of the pixels of a 48 x 48 image, 15 % of a 128 x 128 one."""
@@ -40,7 +41,7 @@ LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK
 
 SHOWN = [f"full_novel_{name}" for name in METRICS]
 SHOWN += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips", "sharpness")]
-SHOWN += ["full_reference_psnr", "full_reference_ssim"]
+SHOWN += [f"{region}_reference_{name}" for region in ("full", "object") for name in ("psnr", "ssim")]
 """Scores that a table shows if a row has them."""
 PLAIN = (type(None), str, bool, int, float)  # types of values that a table can show
 CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
