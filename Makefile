@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-processes test-slow test-wheel test-browser fuzz check lock bench gpu docs notebooks release clean
+.PHONY: help demo demo-train test test-processes test-slow test-wheel test-browser fuzz check size lock bench gpu docs notebooks release clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -91,6 +91,9 @@ lock: $(READY) ## Write requirements.lock: the newest versions that pyproject.to
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
 	$(BIN)/python -m uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --upgrade --generate-hashes \
 	  --no-annotate --no-emit-package torch --custom-compile-command "make lock" --quiet --output-file requirements.lock
+
+size: ## Print the lines of code of package and tests
+	@$(PYTHON) tests/lines_of_code.py completesplat tests
 
 bench: $(READY) ## Time the rasterizer backends, side by side
 	$(BIN)/completesplat bench rasterizers

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# Threads of torch's GNU OpenMP spin by default while they wait for the next of hundreds of small parallel regions. Beside
-# another busy process they take turns with those that they wait for: a sample then takes many times as long. What a
-# user has set (also GOMP_SPINCOUNT, which libgomp prefers) stays. torch reads it when it is loaded.
+# By default, threads of torch's GNU OpenMP spin while they wait for the next of hundreds of small parallel regions.
+# Beside another busy process they keep the threads that they wait for off the cores. What a user has set (also
+# GOMP_SPINCOUNT, which libgomp prefers) stays. torch reads it when it is loaded.
 if "torch" not in sys.modules:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 

@@ -258,7 +258,7 @@ def test_the_scenes_of_all_steps_are_shown(model, photo):
 
 def test_another_sampler_is_saved_with_the_weights(model, photo, tmp_path):
     changed = copy.deepcopy(model)
-    changed.replace_sampler(OmegaConf.to_container(compose_config("fit", "sampler=unipc5").sampler))
+    changed.replace_sampler(OmegaConf.to_container(compose_config("fit", "sampler=unipc10", "sampler.steps=5").sampler))
     assert not same(changed(photo)[0], model(photo)[0])
     changed.save_pretrained(tmp_path / "changed")
     loaded = CompleteSplat.from_pretrained(tmp_path / "changed")

@@ -168,7 +168,7 @@ def test_every_setting_of_every_class_is_checked():
         ["autoreconstructor=stable_diffusion", "denoiser=stable_diffusion", "posterior=views"],
         ["autoreconstructor=minis", "conditioning=stable_diffusion", "posterior=views", "sampler=dpm20"],
         ["denoiser=stable_diffusion_no_text", "posterior=image", "objective=flow"],
-        ["ablation=no_skips", "sampler=unipc5"],
+        ["ablation=no_skips", "sampler=unipc10"],
     ],
 )
 def test_what_the_configuration_tree_offers_may_be_saved_and_loaded(chosen):

@@ -7,7 +7,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import get_class, instantiate
+from hydra.utils import instantiate
 from rich.console import Console
 
 from completesplat.benchmarks.measuring import Row, report
@@ -17,14 +17,12 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
+from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.rasterizers.selection import FASTER, failure
 from completesplat.settings.schema import Positive
 from completesplat.training.steps import peak_megabytes
 
-CLASSES = {
-    "reference": "completesplat.rasterizers.reference.ReferenceRasterizer",
-    "tiled": "completesplat.rasterizers.tiled.TiledRasterizer",
-    "cuda": "completesplat.rasterizers.cuda.CudaRasterizer",
-}
+BACKENDS = {"reference": ReferenceRasterizer, **FASTER}
 LONGEST_SECONDS = 4.0  # a backend that has run this long on a workload does not repeat it
 Tick = Callable[[str], None]
 
@@ -50,24 +48,20 @@ def run(
 
 
 def working_backends(names: Sequence[str], constants: RenderingConstants) -> tuple[list[Backend], dict[str, str]]:
-    """Return the named backends that can render a small scene on this machine, and reasons for the others.
+    """Return the named backends that work on this machine, and reasons for the others (`selection.failure`).
 
     Raises:
-        CompleteSplatError: a name is not in `CLASSES`.
+        CompleteSplatError: a name is not in `BACKENDS`.
     """
-    for name in names:
-        if name not in CLASSES:
-            raise CompleteSplatError(f"backends: {name!r} does not exist; choose from {', '.join(CLASSES)}")
     backends, absent = [], {}
     for name in names:
-        try:
-            backend = Backend(name, get_class(CLASSES[name])(constants))
-            gaussians, cameras = splatter_scene(8, 1, "trained")
-            rendering_milliseconds(backend.rasterizer, gaussians.to(backend.device), cameras.to(backend.device))
-        except Exception as error:  # a broken installation may raise anything
-            absent[name] = " ".join(str(error).split()) or type(error).__name__
+        if name not in BACKENDS:
+            raise CompleteSplatError(f"backends: {name!r} does not exist; choose from {', '.join(BACKENDS)}")
+        reason = failure(name, constants) if name in FASTER else None
+        if reason is None:
+            backends.append(Backend(name, BACKENDS[name](constants)))
         else:
-            backends.append(backend)
+            absent[name] = " ".join(reason.split())
     return backends, absent
 
 

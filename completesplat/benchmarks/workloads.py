@@ -10,7 +10,7 @@ from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unproject
 from completesplat.rasterizers import Rasterizer
 from completesplat.training.stage import now
-from completesplat.training.steps import DISTANCE, FOV_DEGREES, orbit
+from completesplat.training.steps import DISTANCE, FOV_DEGREES, cameras_on_orbit
 
 OPACITIES = ("trained", "initial")
 MOST_REFERENCE_PAIRS = 2**28  # of a Gaussian and a pixel; the reference takes a second for a tenth of them
@@ -40,7 +40,7 @@ def splatter_scene(size: int, views: int, opacity: str) -> tuple[Gaussians, Came
     generator = torch.Generator().manual_seed(0)
     source = Cameras(torch.eye(4), pinhole(FOV_DEGREES, size), (size, size))
     layers = [_layer(layer, source, opacity, generator) for layer in range(2)]
-    return concatenate(layers)[None], orbit(size, views)
+    return concatenate(layers)[None], cameras_on_orbit(size, views)
 
 
 def _layer(layer: int, source: Cameras, opacity: str, generator: torch.Generator) -> Gaussians:

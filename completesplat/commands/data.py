@@ -26,7 +26,7 @@ def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> Non
     except DataError as error:  # concerns the data set as a whole
         findings = audit.Findings(0, 0, [error], {}, {})
     findings.write(out / "check.json")
-    audit.show(findings)
+    audit.show_findings(findings)
     if not findings.sequences:
         print(out)
         sys.exit(1)
@@ -48,7 +48,7 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
 
 def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path) -> None:
     """Write `show.png`: images of some sequences, evenly spread over a split."""
-    from completesplat.studies.contact_sheet import show as draw
+    from completesplat.studies.contact_sheet import write_contact_sheet
 
     source = _sources(data, [split])[split]
     names = source.names
@@ -56,7 +56,9 @@ def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: P
     sequences = list(_readable(source, chosen))
     if not sequences:
         raise DataError(f"no {split} sequences that can be used", str(data.root))
-    draw(sequences, out / "show.png", images, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences")
+    write_contact_sheet(
+        sequences, out / "show.png", images, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences"
+    )
 
 
 def prepare(
@@ -82,7 +84,6 @@ def latents(
     ckpt: str | Path,
     overrides: Sequence[str],
     trust: bool,
-    conditioning: Any,
     out: Path,
     frames: Positive | None,
     views: Positive,
@@ -90,6 +91,7 @@ def latents(
     batch_size: Positive,
     devices: Positive,
     num_nodes: Positive,
+    conditioning: Any = None,
 ) -> None:
     """Encode the training set of a stage-1 run into `out`; see `completesplat.training.encoding`."""
     from hydra.utils import instantiate

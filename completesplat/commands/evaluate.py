@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any, TypedDict, Unpack
 
 import torch
 from hydra.utils import instantiate
@@ -21,8 +21,10 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.files import write_json
+from completesplat.results.measured import MODE_COLUMNS, evaluation_table
 from completesplat.results.runs import MODEL
-from completesplat.results.tables import Column, evaluation_table, show, table
+from completesplat.results.tables import records_table, show
+from completesplat.settings.checks import EvaluationSettings, Tested
 from completesplat.settings.schema import Natural, Positive, Range
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.stage import Stage
@@ -75,11 +77,12 @@ def set_scoring(module: Stage, evaluation: Config) -> None:
 
 
 @stopped_together()
-def run(trained: Config, evaluation: Config, trainer: Config, logger: Config | None, out: Path) -> None:
+def run(
+    evaluation: EvaluationSettings, trainer: Config, out: Path, logger: Config | None = None, **trained: Unpack[Tested]
+) -> None:
     """Write `metrics.json` and print the table.
 
     Args:
-        trained: the arguments of `Trained`.
         evaluation, trainer, logger: configs of the protocol, the trainer (without precision), loggers by name.
     """
     tested = Trained(**trained)
@@ -117,14 +120,12 @@ class HiddenModesEvaluation(TypedDict):
     seed: Natural
 
 
-FORMATS = {"method": "", **dict.fromkeys(("coverage", "total_variation", "sharpness", "rejected"), ".3f")}
-FORMATS |= dict.fromkeys(("energy_hidden", "energy_visible"), ".4f")
-FORMATS |= {"scenes": "d", "samples": "d"}
-COLUMNS: list[Column] = [(name.replace("_", " "), name, form) for name, form in FORMATS.items()]
-
-
 def run_hidden_modes(
-    trained: Config, evaluation: HiddenModesEvaluation, trainer: Config, logger: Config | None, out: Path
+    evaluation: HiddenModesEvaluation,
+    trainer: Config,
+    out: Path,
+    logger: Config | None = None,
+    **trained: Unpack[Tested],
 ) -> None:
     """Write JSON files of hidden modes, shares and protocol, draw `hidden_modes.png`, and print the table.
 
@@ -134,7 +135,7 @@ def run_hidden_modes(
     Raises:
         CompleteSplatError: the data's hidden parts are not known, or no scene can be used.
     """
-    from completesplat.studies.mode_benchmark import draw, measure, predictors, usable
+    from completesplat.studies.mode_benchmark import measure, predictors, usable, write_modes
 
     tested = Trained(**trained)
     quieten()
@@ -154,9 +155,12 @@ def run_hidden_modes(
     results = measured.results(samples)
     write_json(out / "hidden_modes.json", results)
     write_json(out / "shares.json", measured.shares())
+    used_settings = ("name", "samples", "views", "spread_views", "seed")
+    settings = {key: value for key, value in evaluation.items() if key in used_settings}
+    stated = {**settings, "method": module.method, **data.describe(), "image_size": data.image_size, **drawing(module)}
     used = {"scenes": measured.names, "skipped": skipped, **provenance(data, out), **tested.facts()}
-    write_json(out / "protocol.json", _modes_protocol(evaluation, module, data) | used)
-    draw(measured, samples, out / "hidden_modes.png")
+    write_json(out / "protocol.json", stated | used)
+    write_modes(measured, samples, out / "hidden_modes.png")
     scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
     loggers: list[Logger] = list(instantiate(logger or {}, _convert_="all").values())
     with wandb_runs(loggers, OmegaConf.load(out / CONFIG)):
@@ -166,18 +170,6 @@ def run_hidden_modes(
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
     labels = {} if tested.scenes is None else {MODEL: module.method}
     records = [{"method": labels.get(name, name), **values} for name, values in results.items()]
-    Console(width=140).print(table(title, COLUMNS, records))
+    show(records_table(title, records, MODE_COLUMNS), width=140)
     if skipped:
         print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
-
-
-def _modes_protocol(evaluation: HiddenModesEvaluation, module: Stage, data: SceneDataModule) -> dict[str, object]:
-    """Return the record of what was measured and how."""
-    return {
-        "name": evaluation["name"],
-        "method": module.method,
-        **data.describe(),
-        "image_size": data.image_size,
-        **{key: value for key, value in evaluation.items() if key in ("samples", "views", "spread_views", "seed")},
-        **drawing(module),
-    }

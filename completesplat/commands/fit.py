@@ -22,8 +22,9 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import write_json
+from completesplat.results.measured import evaluation_table
 from completesplat.results.runs import PLAN, read_record
-from completesplat.results.tables import evaluation_table, show
+from completesplat.results.tables import show
 from completesplat.settings.checks import check_image_size, check_optimizer, check_verb
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs

@@ -18,7 +18,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from hydra.utils import get_method, instantiate
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from completesplat import __version__
@@ -29,7 +29,6 @@ from completesplat.files import UNFINISHED, atomic_path, write_bytes, write_json
 from completesplat.settings.checks import check_verb
 from completesplat.settings.composition import resolved_settings, use_working_folder
 from completesplat.settings.options import did_you_mean
-from completesplat.settings.schema import check_settings
 from completesplat.signals import Interrupted, ended_by_signals
 from completesplat.weights import RUN_CHECKPOINT
 
@@ -174,7 +173,6 @@ def start(verb: str, config: DictConfig, out: Path) -> object:
         if config.get("task") is None:
             run = partial(import_module(f"completesplat.commands.{verb}").run, config, out)
         else:
-            check_settings(get_method(config.task._target_), resolved_settings(config.task))
             run = partial(instantiate, config.task, out=out, _convert_="all")
     return run()
 

@@ -28,7 +28,7 @@ from completesplat.settings.checks import check_image_size, check_optimizer
 from completesplat.settings.options import did_you_mean
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.stage import Stage, now
-from completesplat.training.step_counts import StepCounts, count_step, encode
+from completesplat.training.step_counts import StepCounts, count_step, with_latents
 from completesplat.training.steps import MEBIBYTE, Training, peak_megabytes, synthetic_batch
 
 HERE = "this"
@@ -152,7 +152,7 @@ def steps_of(config: DictConfig, sequences: int) -> int:
     return int(min(limits))
 
 
-def untrained(config: DictConfig) -> DictConfig:
+def without_weights(config: DictConfig) -> DictConfig:
     """Return a copy of a config whose module is built without reading weights and without compiling."""
     config = copy.deepcopy(config)
     OmegaConf.set_struct(config, False)
@@ -167,7 +167,7 @@ def untrained(config: DictConfig) -> DictConfig:
 
 def counted(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
     """Return the counts of a process that takes `batch` scenes at a time."""
-    copied = untrained(config)
+    copied = without_weights(config)
     gpu = config.gpu != HERE or torch.cuda.is_available()
     copied.rasterizer = {"_target_": "completesplat.training.step_counts.StoreOnly", "gpu": gpu}
     for key, value in changes.items():
@@ -232,12 +232,12 @@ def timed(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, fl
     if scenes is None:
         message = f"a step with one scene takes {(fixed + grows / batch) / BYTES:.3g} GB, at most {limit / BYTES:.3g}"
         raise CompleteSplatError(f"gpu={HERE}: {message} GB are timed; give a GPU by name")
-    copied = untrained(config)
+    copied = without_weights(config)
     copied.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
     module: Stage = build(copied.model, _convert_="all").to(device)
     inputs: Batch = synthetic_batch(config.data.image_size, scenes, config.data.targets).to(device)
     if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch) and config.data.latent_cache is not None:
-        inputs = encode(module, inputs)
+        inputs = with_latents(module, inputs)
     training, seconds = Training(module, precision(config)), []
 
     def step() -> None:

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from completesplat.errors import CompleteSplatError
-from completesplat.results.paper_figures import tables as published_tables
-from completesplat.results.runs import find
+from completesplat.results.paper_figures import published_tables
+from completesplat.results.runs import find_results
 from completesplat.results.sweeps import write_summary
 from completesplat.results.tables import show, write_tables
 
@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 def tables(runs: str | None, out: Path) -> None:
     """Write `tables.md`, `.csv` and `.tex` of the results below `runs` (None: the published figures); print them."""
-    tree = None if runs is None else find(Path(runs))
+    tree = None if runs is None else find_results(Path(runs))
     made = published_tables(tree)
     write_tables(made, out)
     show(*made, width=240)

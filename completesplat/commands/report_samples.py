@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Unpack
+from typing import Annotated, NotRequired, Unpack
 
 import torch
 from rich.console import Console
@@ -24,11 +24,10 @@ from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
 from completesplat.settings.checks import ModelSettings
 from completesplat.settings.schema import Entries, Positive, Range, Share
-from completesplat.studies import calibration as calibration_study
-from completesplat.studies import controls as controls_study
-from completesplat.studies import depth as depth_study
-from completesplat.studies import noise_levels
-from completesplat.studies.controls import Tick
+from completesplat.studies.calibration import calibration_rows, plot_calibration
+from completesplat.studies.controls import Tick, controls_rows, controls_strips, grid, plot_controls
+from completesplat.studies.depth import depth_rows, depth_strips
+from completesplat.studies.noise_levels import noise_level_rows, plot_noise_levels, scenes_in_all_modes
 from completesplat.studies.samples import SampleRenderer, first_scenes
 from completesplat.training.stage import Stage
 
@@ -38,7 +37,7 @@ Weights = Annotated[Sequence[Share], Entries(1)]
 class Run(ModelSettings):
     """Arguments of `Trained`, number of test scenes (the first ones), and number of samples of each scene."""
 
-    data: Mapping[str, object] | None
+    data: NotRequired[Mapping[str, object]]
     rasterizer: Mapping[str, object]
     scenes: Positive
     samples: Annotated[int, Range(2)]
@@ -51,17 +50,16 @@ def controls(
 
     All pairs of the weights and the paper's three are measured; `conf/report_task/controls.yaml` explains the settings.
     """
-    weights = controls_study.grid(skip_weights, guidance_weights)
-    with _opened(run) as (renderer, scenes, settings, tick):
-        rows = controls_study.rows(renderer, weights, scenes, near_degrees, tick)
+    weights = grid(skip_weights, guidance_weights)
+    with _opened(run) as (renderer, scenes, tick):
+        rows = controls_rows(renderer, weights, scenes, near_degrees, tick)
         tick("the grid")
-        grid = controls_study.strips(renderer, weights, scenes[0], shown)
-    write_json(out / "controls.json", {"settings": settings | {"near_degrees": near_degrees}, "rows": rows})
+        sheet = controls_strips(renderer, weights, scenes[0], shown)
     title = f"Controls: {len(scenes)} scenes, {run['samples']} samples each; (skip, guidance) of the paper in red"
-    controls_study.plot_controls(rows, out / "controls.png", title)
+    plot_controls(rows, out / "controls.png", title)
     title = f"{scenes[0].names[0]}: reference view of one sample, far view of {min(shown, run['samples'])}"
-    write_png(out / "controls_grid.png", image_sheet(None, grid, title))
-    show(records_table("Faithfulness (PSNR, dB) and diversity", rows))
+    write_png(out / "controls_grid.png", image_sheet(None, sheet, title))
+    _report(out / "controls.json", "Faithfulness (PSNR, dB) and diversity", rows, run, near_degrees=near_degrees)
 
 
 def depth(
@@ -74,62 +72,63 @@ def depth(
     **run: Unpack[Run],
 ) -> None:
     """Write `depth.json` and `depth.png`, and print the table; `conf/report_task/depth.yaml` explains the settings."""
-    weights = controls_study.grid([skip_weight], [guidance_weight])
-    with _opened(run) as (renderer, scenes, settings, tick):
-        rows = depth_study.rows(renderer, weights, scenes, far_degrees, tick)
+    weights = grid([skip_weight], [guidance_weight])
+    with _opened(run) as (renderer, scenes, tick):
+        rows = depth_rows(renderer, weights, scenes, far_degrees, tick)
         tick("the figure")
-        sheet = depth_study.strips(renderer, scenes[:shown_scenes], skip_weight, guidance_weight, shown)
-    write_json(out / "depth.json", {"settings": settings | {"far_degrees": far_degrees}, "rows": rows})
+        sheet = depth_strips(renderer, scenes[:shown_scenes], skip_weight, guidance_weight, shown)
     title = f"Render, depth and normals in a far view, and deviation of {run['samples']} samples' depth"
     title += f" in the reference and the far view; skip {skip_weight:g}, guidance {guidance_weight:g}"
     write_png(out / "depth.png", image_sheet(None, sheet, title))
-    show(records_table("Deviation of depth over samples, scene units", rows))
+    _report(out / "depth.json", "Deviation of depth over samples, scene units", rows, run, far_degrees=far_degrees)
 
 
 def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Unpack[Run]) -> None:
     """Write `calibration.json` and its figure, and print the table; `CompleteSplat.generate` explains both weights."""
     weights = {"skip_weight": skip_weight, "guidance_weight": guidance_weight}
-    with _opened(run) as (renderer, scenes, settings, tick):
-        rows = calibration_study.rows(renderer, scenes, tick, **weights)
-    write_json(out / "calibration.json", {"settings": settings | weights, "rows": rows})
-    title = (
-        f"{run['samples']} samples of each of {len(scenes)} scenes; skip {skip_weight:g}, guidance {guidance_weight:g}"
-    )
-    calibration_study.plot_calibration(rows, out / "calibration.png", title)
+    with _opened(run) as (renderer, scenes, tick):
+        rows = calibration_rows(renderer, scenes, tick, **weights)
+    title = f"{run['samples']} samples of each of {len(scenes)} scenes"
+    plot_calibration(rows, out / "calibration.png", f"{title}; skip {skip_weight:g}, guidance {guidance_weight:g}")
     ideal = f"calibrated: {1 / (1 + run['samples']):.3g} of the true values below and above all samples, ratio 1"
-    show(records_table(f"Novel views; {ideal}", rows))
+    _report(out / "calibration.json", f"Novel views; {ideal}", rows, run, **weights)
 
 
 def modes(spread_views: Positive, out: Path, **run: Unpack[Run]) -> None:
-    """Write `modes.json` and `modes.png`, and print the table; `studies.noise_levels.rows` explains its columns."""
+    """Write `modes.json` and `modes.png`, and print the table; `noise_level_rows` explains its columns."""
     stage, data = _opened_stage(run)
     model = diffusion_of(stage)
     if not model.autoreconstructor.sees_views:
         raise CompleteSplatError("these latents are equal in all modes: report modes needs posterior=views")
     data.setup("test")
     progress = partial(track, description="Scenes in all modes", console=Console(stderr=True))
-    scenes = noise_levels.scenes_in_all_modes(data.hidden_modes(1, spread_views), run["scenes"], progress)
-    rows = noise_levels.rows(model, [x.to(stage.device) for x in scenes], run["samples"], run["seed"])
-    settings = {"scenes": len(scenes), "samples": run["samples"], "seed": run["seed"], "spread_views": spread_views}
-    write_json(out / "modes.json", {"settings": settings, "rows": rows})
-    noise_levels.plot(rows, out / "modes.png", f"Hidden modes of {len(scenes)} scenes in noisy latents")
-    show(records_table("Share of the true mode in noisy latents", rows))
+    scenes = scenes_in_all_modes(data.hidden_modes(1, spread_views), run["scenes"], progress)
+    rows = noise_level_rows(model, [x.to(stage.device) for x in scenes], run["samples"], run["seed"])
+    plot_noise_levels(rows, out / "modes.png", f"Hidden modes of {len(scenes)} scenes in noisy latents")
+    used = {"scenes": len(scenes), "spread_views": spread_views}
+    _report(out / "modes.json", "Share of the true mode in noisy latents", rows, run, **used)
+
+
+def _report(path: Path, title: str, rows: Sequence[Mapping[str, object]], run: Run, **settings: float) -> None:
+    """Write the rows of a study with its settings to a JSON file, and print them."""
+    shared = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
+    write_json(path, {"settings": shared | settings, "rows": rows})
+    show(records_table(title, rows))
 
 
 @contextmanager
-def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], dict[str, float], Tick]]:
-    """Yield renderer and first test scenes (on a GPU if there is one), settings for the results file, and a status."""
+def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], Tick]]:
+    """Yield renderer and first test scenes (on a GPU if there is one), and a status."""
     stage, data = _opened_stage(run)
     scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
-    settings: dict[str, float] = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
     renderer = SampleRenderer(diffusion_of(stage), stage.rasterizer, stage.background, run["samples"], run["seed"])
     with Console(stderr=True).status("drawing") as status:
-        yield renderer, scenes, settings, lambda text: status.update(f"drawing: {text}")
+        yield renderer, scenes, lambda text: status.update(f"drawing: {text}")
 
 
 def _opened_stage(run: Run) -> tuple[Stage, SceneDataModule]:
     """Return the stage, on a GPU if there is one, and the data."""
     quieten()
     model = run["ckpt"], run["overrides"], run["trust"], run["weights"]
-    stage, data = Trained(*model, data=run["data"], rasterizer=run["rasterizer"], seed=run["seed"]).open()
+    stage, data = Trained(*model, data=run.get("data"), rasterizer=run["rasterizer"], seed=run["seed"]).open()
     return stage.to("cuda" if torch.cuda.is_available() else "cpu").eval(), data

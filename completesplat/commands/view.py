@@ -36,7 +36,7 @@ def run(config: DictConfig, out: Path) -> None:
 
     from completesplat.viewer.access import start_server, stop_server
 
-    config.update(settings_of(Path(config.path)) if config.path is not None else {})
+    config.update(setting_of_path(Path(config.path)) if config.path is not None else {})
     drawn = config.scene is None and config.watch is None
     if drawn and config.weights != AUTO and ":" not in config.weights:  # as in `splatter_image:NAME`
         check_name(config.weights)
@@ -60,7 +60,7 @@ def run(config: DictConfig, out: Path) -> None:
         stop_server(server) if page is None else page.close()
 
 
-def settings_of(path: Path) -> dict[str, str]:
+def setting_of_path(path: Path) -> dict[str, str]:
     """Return the setting (`scene`, `image`, `weights`, `watch`) for a path; raise CompleteSplatError if none fits."""
     if path.is_file():
         return {KINDS.get(path.suffix.lower(), "image"): str(path)}

@@ -68,7 +68,7 @@ def mesh_of(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras, pivot:
     low, high = seen.amin(0) - 2 * voxel, seen.amax(0) + 2 * voxel
     axes = [torch.arange(low[i].item(), high[i].item(), voxel, device=maps.device) for i in range(3)]
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
-    field = distances(grid.flatten(0, 2), cameras, maps[:, :1], TRUNCATION * voxel).view(grid.shape[:3])
+    field = signed_distances(grid.flatten(0, 2), cameras, maps[:, :1], TRUNCATION * voxel).view(grid.shape[:3])
     field = torch.where((grid - center).norm(dim=-1) < radius, field, 1)
     if not (field < 0).any():
         raise CompleteSplatError("mesh: what is seen in the middle of the photo is too thin to be a solid")
@@ -97,7 +97,7 @@ def looked_up(points: Points, cameras: Cameras, maps: Maps) -> Iterator[tuple[Te
         yield values[:, row, column], ahead
 
 
-def distances(points: Points, cameras: Cameras, depths: Maps, truncation: float) -> Float[Tensor, " point"]:
+def signed_distances(points: Points, cameras: Cameras, depths: Maps, truncation: float) -> Float[Tensor, " point"]:
     """Return mean signed distances to the surfaces in units of the truncation, from -1 (inside, unseen) to 1."""
     total, weights = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
     for (depth,), ahead in looked_up(points, cameras, depths):

@@ -36,7 +36,7 @@ def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> dict
     `coverage`: share of the modes (of positive probability) that at least one sample belongs to. `total_variation`:
     half the sum of absolute differences between the samples' shares and the modes' probabilities. Rejected samples are
     a class of probability 0, so 1 is the worst. A perfect sampler with few samples does not reach 0, so compare with
-    draws from the true distribution. `sharpness`: mean distance of a sample to its nearest mode, divided by that of
+    draws from the true distribution. `mode_distance`: mean distance of a sample to its nearest mode, divided by that of
     the modes' mean to its nearest mode (0: exactly modes). `rejected`: share of rejected samples.
     """
     classes = classify(samples, modes, probabilities)
@@ -47,7 +47,7 @@ def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> dict
     return {
         "coverage": (shares[possible] > 0).float().mean().item(),
         "total_variation": 0.5 * ((shares - probabilities).abs().sum() + rejected).item(),
-        "sharpness": (distances(samples, modes).min(dim=1).values.mean() / from_mean).item(),
+        "mode_distance": (distances(samples, modes).min(dim=1).values.mean() / from_mean).item(),
         "rejected": rejected.item(),
     }
 

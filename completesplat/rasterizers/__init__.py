@@ -5,7 +5,7 @@ composited from front to back, with the constants of one shared config.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import wraps
 from typing import Protocol, TypeVar, cast, runtime_checkable
 
@@ -16,18 +16,17 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.settings.options import gsplat_constants
 from completesplat.tensors import TensorDataclass
 
 
 @dataclass(frozen=True)
 class RenderingConstants:
-    """Constants on which all backends agree; by default those of the installed gsplat (`gsplat_constants`).
+    """Constants on which all backends agree; by default those compiled into the kernels of gsplat 1.5.
 
     Attributes:
         blur: added to the diagonal of the projected covariance, in px^2.
         near_plane: Gaussians whose centre is at this depth or nearer are culled, in world units.
-        max_alpha: clamp on a Gaussian's alpha at a pixel (0.999 in gsplat 1.5.3, 0.99 in 1.6).
+        max_alpha: clamp on a Gaussian's alpha at a pixel.
         min_alpha: contributions below it are skipped.
         min_transmittance: a pixel stops before the Gaussian that would bring its transmittance to this or less.
         frustum_margin: the Jacobian is evaluated at a point clamped to this multiple of half the field of view
@@ -36,9 +35,9 @@ class RenderingConstants:
 
     blur: float = 0.3
     near_plane: float = 0.01
-    max_alpha: float = field(default_factory=lambda: gsplat_constants()["max_alpha"])
-    min_alpha: float = field(default_factory=lambda: gsplat_constants()["min_alpha"])
-    min_transmittance: float = field(default_factory=lambda: gsplat_constants()["min_transmittance"])
+    max_alpha: float = 0.999
+    min_alpha: float = 1 / 255
+    min_transmittance: float = 1e-4
     frustum_margin: float = 0.3
 
 

@@ -15,7 +15,6 @@ from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.rasterizers import Rendering, RenderingConstants, as_seen, require_float32
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
-from completesplat.settings.options import gsplat_constants
 
 DEVICE = "cuda"
 WARP = 32
@@ -23,7 +22,7 @@ WARP = 32
 # gradients through the depth image become NaN, because gsplat multiplies coordinates before it divides them.
 FARTHEST = 1e12
 SMALLEST_BLUR, SMALLEST_NEAR_PLANE = 1e-5, 1e-6
-FRUSTUM_MARGIN = 0.3  # in gsplat's `Utils.cuh`
+COMPILED = ("max_alpha", "min_alpha", "min_transmittance", "frustum_margin")  # the defaults are those of the kernels
 
 
 class CudaRasterizer:
@@ -53,7 +52,8 @@ class CudaRasterizer:
         except ImportError as error:
             message = f'the cuda rasterizer needs gsplat ({error}): pip install "completesplat[cuda]"'
             raise CompleteSplatError(message) from error
-        for name, value in (gsplat_constants() | {"frustum_margin": FRUSTUM_MARGIN}).items():
+        for name in COMPILED:
+            value = getattr(RenderingConstants, name)
             if not math.isclose(getattr(self.constants, name), value, rel_tol=1e-6):
                 raise CompleteSplatError(
                     f"gsplat {gsplat.__version__} is compiled with {name} = {value:g}, not "
@@ -77,7 +77,7 @@ class CudaRasterizer:
             message = "the cuda rasterizer has no gradient to the intrinsics: detach them, or take rasterizer=reference"
             raise CompleteSplatError(message)
         height, width = cameras.image_size
-        prepared = prepare(gaussians, drawable(gaussians, cameras, self.constants))
+        prepared = padded(gaussians, drawable(gaussians, cameras, self.constants))
         images, alphas, _ = self._rasterization(
             **dict(zip(("means", "quats", "scales", "opacities", "colors"), vars(prepared).values(), strict=True)),
             **{"viewmats": cameras.world_to_camera, "Ks": cameras.intrinsics, "width": width, "height": height},
@@ -121,7 +121,7 @@ def _magnification(cameras: Cameras, constants: RenderingConstants) -> Float[Ten
     return (focal * (1 + slope.square()).sqrt()).amax(-1)
 
 
-def prepare(gaussians: Gaussians, mask: Bool[Tensor, "batch gaussian"]) -> Gaussians:
+def padded(gaussians: Gaussians, mask: Bool[Tensor, "batch gaussian"]) -> Gaussians:
     """Return Gaussians that are safe for gsplat: unit quaternions, and zeros for those outside of the mask.
 
     Zero opacity keeps a Gaussian out of the image; zeros for its other values keep NaN out of the gradients. The

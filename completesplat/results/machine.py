@@ -5,27 +5,14 @@ import platform
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import Any
 
 
-class Machine(TypedDict):
-    """Processor, GPU (if there is one), versions, and the date."""
-
-    processor: str
-    cores: int | None
-    threads: int
-    system: str
-    python: str
-    torch: str
-    date: str
-    gpu: NotRequired[str]
-
-
-def machine() -> Machine:
-    """Return the description as values that JSON can hold."""
+def machine() -> dict[str, Any]:
+    """Return processor, `gpu` (if there is one), versions and the date, as values that JSON can hold."""
     import torch
 
-    described = Machine(
+    described = dict[str, Any](
         processor=_processor(),
         cores=os.cpu_count(),
         threads=torch.get_num_threads(),

@@ -2,21 +2,25 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
-from completesplat.results.runs import MODEL, UPPER_BOUND, Protocol, Result, Scores
+from completesplat.results.runs import MODEL, UPPER_BOUND, Protocol, Result, Scores, flat
 from completesplat.results.tables import (
     ABSENT,
     LEGEND,
     METRICS,
+    SHARPNESS_NOTE,
+    SHOWN,
     SSIM_NOTE,
+    UNMARKED,
     Cell,
     Heading,
     Notes,
     Table,
     TableRow,
     marks,
+    records_table,
     score_cell,
     score_heading,
 )
@@ -24,8 +28,10 @@ from completesplat.results.tables import (
 BEST_OF_K, BEST_BY_METRIC, MEAN_OF_K = "best_of_k", "best_of_k_by_metric", "mean_of_k"
 OURS = "completesplat: "  # not "ours", because the paper gives its rows that name
 COST = {"inference": "inference", "rendering": "rendering"}
-LEADING = {"method": "method", "speed": "rendering speed", **COST, "scenes": "scenes", "resolution": "pixels"}
+LEADING = {"method": "method", "speed": "rendering speed", **COST, "seeds": "seeds", "scenes": "scenes"}
+LEADING |= {"resolution": "pixels"}
 """The columns before the scores, and their headings."""
+OF_RUNS = ["method", *COST, "scenes", "resolution"]
 
 ALIKE = ["name", "data_set", "subset", "split", "resolution", "crop", "background", "precision", "scenes", "skipped"]
 ALIKE += ["views", "protocol_views", "scene_list"]
@@ -33,14 +39,21 @@ ALIKE += ["views", "protocol_views", "scene_list"]
 DESCRIBED = [*ALIKE, "image_size", "scenes_listed", "samples", "criterion", "seed", "sampler", "steps", "skip_weight"]
 DESCRIBED += ["guidance_weight", "color_fits", "ema", "commit", "frame", "align", "fitted_to"]
 """Entries of the protocol that the note on a row states."""
-COLUMNS = [f"full_novel_{name}" for name in METRICS]
-COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips", "sharpness")] + ["full_reference_psnr"]
-"""Scores that a table shows if a run has them."""
-MODE_SCORES = {"coverage": "coverage ↑", "total_variation": "total variation ↓", "sharpness": "sharpness ↓"}
-MODE_SCORES |= {"rejected": "rejected ↓"}
+MODE_COLUMNS = {
+    "method": Heading("method", figures=False),
+    "coverage": Heading("coverage ↑", form=".3f"),
+    "total_variation": Heading("total variation ↓", form=".3f"),
+    "mode_distance": Heading("mode distance ↓", form=".3f"),
+    "rejected": Heading("rejected ↓", form=".3f"),
+    "energy_hidden": Heading("energy hidden ↓", form=".4f"),
+    "energy_visible": Heading("energy visible ↓", form=".4f"),
+    "scenes": Heading("scenes", form="g"),
+    "samples": Heading("samples", form="g"),
+}
 MODES_EXPLAINED = (
     "Coverage: share of the modes that samples hit. Total variation: of the samples' distribution from the true one. "
-    "Sharpness: distance to the nearest mode over that of the modes' mean. Rejected: share of the samples."
+    "Mode distance: to the nearest mode over that of the modes' mean. Rejected: share of the samples. "
+    "Energy: scores of the pixels that the reference hides, and of the others."
 )
 
 Measured = TypeVar("Measured")
@@ -56,7 +69,7 @@ def alike(measurements: Iterable[tuple[Measured, Protocol]], *more: str) -> list
     return [groups[key] for key in sorted(groups)]
 
 
-def described(protocol: Protocol, keys: Sequence[str] = DESCRIBED) -> str:
+def protocol_line(protocol: Protocol, keys: Sequence[str] = DESCRIBED) -> str:
     """Describe a protocol in one line."""
     values: Mapping[str, object] = protocol
     known = {key: value for key in keys if (value := values.get(key)) is not None}
@@ -72,52 +85,68 @@ def described(protocol: Protocol, keys: Sequence[str] = DESCRIBED) -> str:
 
 @dataclass(frozen=True)
 class Entry:
-    """Scores of one predictor in one run."""
+    """Scores of one predictor in one run, or their means over the seeds of a sweep's setting.
 
-    run: Result
-    predictor: str
+    `deviations` are sample standard deviations over seeds. An upper bound has seen the views that it is scored on.
+    `note` says how the scores were measured, and `lacking` why others are missing.
+    """
+
+    label: str
     scores: Scores
+    scenes: int | str | None
+    predictor: str = MODEL
+    upper_bound: bool = False
+    seeds: int | None = None
+    steps: int | str | None = None
+    deviations: Scores = field(default_factory=dict)
+    protocol: Protocol = field(default_factory=Protocol)
+    note: str = ""
+    lacking: str = ""
 
     @property
     def ours(self) -> bool:
         """Whether the predictor is the run's model rather than a naive one."""
         return self.predictor in (MODEL, BEST_OF_K, BEST_BY_METRIC, MEAN_OF_K)
 
-    @property
-    def upper_bound(self) -> bool:
-        """Whether the predictor has seen the views that it is scored on."""
-        return bool(self.scores.get(UPPER_BOUND))
-
-    def method(self, notes: Notes) -> Cell:
-        """Return the method, its kind of sampling, and the number of the note that describes the protocol."""
-        protocol, label = self.run.protocol, self.predictor.replace("_", " ")
-        if self.ours:
-            samples = protocol.get("samples", 1)
-            oracle, criterion = f", {samples}-best oracle by", str(protocol.get("criterion")).upper()
-            kinds = {BEST_OF_K: f"{oracle} {criterion}", BEST_BY_METRIC: f"{oracle} each metric"}
-            kinds[MEAN_OF_K] = f", mean of {samples} samples"
-            kinds[MODEL] = ", single sample" if protocol.get("sampler") or samples != 1 else ""
-            label = f"{protocol.get('method', 'model')}{kinds[self.predictor]}"
-            label += " (upper bound)" if self.upper_bound else ""
-        owner = "" if self.ours and protocol.get("frame") else OURS  # any program may have written the files
-        return Cell(f"{owner}{label} [{_note(self.run, notes)}]")
-
-    def cell(self, name: str, notes: Notes) -> Cell:
+    def cell(self, name: str, notes: Notes, mark: str = UNMARKED) -> Cell:
         """Return a cell with the score `REGION_VIEW_METRIC`, or with the number of the note on why it is missing."""
-        if (value := self.scores.get(name)) is not None:
-            return score_cell(name, value)
-        return notes.missing(name, self.run.protocol, f"not measured for {self.predictor}")
+        if (value := self.scores.get(name)) is not None or not self.lacking:
+            return score_cell(name, value, self.deviations.get(name), mark)
+        metric = name.rpartition("_")[2]
+        reason = self.protocol.get("missing", {}).get(metric, self.lacking)
+        return Cell(f"missing: note {notes.number(f'{metric}: {reason}')}")
 
     def leading(self, notes: Notes) -> dict[str, Cell]:
-        """Return the cells before the scores, by the keys of `LEADING`; unknown values are `ABSENT`."""
-        protocol = self.run.protocol
-        times = {part: time_cell(self.scores.get(f"seconds_{part}")) for part in COST}
-        sizes = {"scenes": Cell(str(protocol["scenes"])), "resolution": Cell(str(protocol["resolution"]))}
-        return {"method": self.method(notes), "speed": Cell(ABSENT), **times, **sizes}
+        """Return the cells before the scores, by the keys of `LEADING`."""
+        method = f"{self.label} [{notes.number(self.note)}]" if self.note else self.label
+        cells = {"method": Cell(method), "resolution": Cell(str(self.protocol.get("resolution", ABSENT)))}
+        cells |= {part: time_cell(self.scores.get(f"seconds_{part}")) for part in COST}
+        counts = {"seeds": self.seeds, "scenes": self.scenes}
+        return cells | {key: Cell("" if value is None else str(value)) for key, value in counts.items()}
 
 
-def _note(run: Result, notes: Notes) -> int:
-    return notes.number(f"{run.name}: {described(run.protocol)}.")
+def score_rows(
+    entries: Sequence[Entry], keys: Sequence[str], columns: Sequence[tuple[str, str | None]], notes: Notes, marked: bool
+) -> list[TableRow]:
+    """Return a row for each entry: cells by keys of `LEADING`, then its scores.
+
+    Naive predictors and upper bounds do not compete for the marks of the best and the second best.
+
+    Args:
+        columns: scores, each with the data set that it is of, or None for any.
+        marked: whether to mark the best.
+    """
+    competing = [marked and entry.ours and not entry.upper_bound for entry in entries]
+    mark = {name: marks([entry.scores.get(name) for entry in entries], competing, name) for name, _ in columns}
+    rows = []
+    for index, entry in enumerate(entries):
+        leading = entry.leading(notes)
+        cells = [leading.get(key, Cell(ABSENT)) for key in keys]
+        for name, data_set in columns:
+            apart = data_set not in (None, entry.protocol.get("data_set"))
+            cells.append(Cell(ABSENT) if apart else entry.cell(name, notes, mark[name][index]))
+        rows.append(TableRow("ours" if entry.ours else "naive", cells))
+    return rows
 
 
 def leading_headings(keys: Iterable[str]) -> list[Heading]:
@@ -126,9 +155,25 @@ def leading_headings(keys: Iterable[str]) -> list[Heading]:
     return [Heading(LEADING[key], group, key not in ("method", "speed")) for key, group in named]
 
 
-def entries(runs: Sequence[Result]) -> list[Entry]:
+def entries_of(runs: Iterable[Result]) -> list[Entry]:
     """Return all entries of all runs, in the order of their files."""
-    return [Entry(run, predictor, scores) for run in runs for predictor, scores in run.entries.items()]
+    return [_entry(run, predictor, scores) for run in runs for predictor, scores in run.entries.items()]
+
+
+def _entry(run: Result, predictor: str, scores: Scores) -> Entry:
+    protocol, label = run.protocol, predictor.replace("_", " ")
+    entry = Entry(label, scores, protocol["scenes"], predictor, bool(scores.get(UPPER_BOUND)), protocol=protocol)
+    if entry.ours:
+        samples = protocol.get("samples", 1)
+        oracle, criterion = f", {samples}-best oracle by", str(protocol.get("criterion")).upper()
+        kinds = {BEST_OF_K: f"{oracle} {criterion}", BEST_BY_METRIC: f"{oracle} each metric"}
+        kinds[MEAN_OF_K] = f", mean of {samples} samples"
+        kinds[MODEL] = ", single sample" if protocol.get("sampler") or samples != 1 else ""
+        label = f"{protocol.get('method', 'model')}{kinds[predictor]}"
+        label += " (upper bound)" if entry.upper_bound else ""
+    owner = "" if entry.ours and protocol.get("frame") else OURS  # any program may have written the files
+    note = f"{run.name}: {protocol_line(protocol)}."
+    return replace(entry, label=f"{owner}{label}", note=note, lacking=f"not measured for {predictor}")
 
 
 def time_cell(seconds: float | None) -> Cell:
@@ -144,12 +189,12 @@ def time_cell(seconds: float | None) -> Cell:
 
 def score_tables(entries: Sequence[Entry]) -> list[Table]:
     """Return a table for each protocol, in the order of data sets and protocols."""
-    groups = alike((entry, entry.run.protocol) for entry in entries)
+    groups = alike((entry, entry.protocol) for entry in entries)
     return [_score_table(f"own_{index}", group) for index, group in enumerate(groups, 1)]
 
 
 def _score_table(name: str, entries: Sequence[Entry]) -> Table:
-    protocol, notes = entries[0].run.protocol, Notes()
+    protocol, notes = entries[0].protocol, Notes()
     # Our models first; a naive predictor has the same scores in all runs of a protocol, so it is shown once.
     naive: dict[object, Entry] = {}
     for entry in entries:
@@ -157,27 +202,47 @@ def _score_table(name: str, entries: Sequence[Entry]) -> Table:
         if not entry.ours:
             naive.setdefault((entry.predictor, *scores.items()), entry)
     selected = [*(entry for entry in entries if entry.ours), *naive.values()]
-    columns = [column for column in COLUMNS if any(_known(entry, column) for entry in selected)]
-    competing = [entry.ours and not entry.upper_bound for entry in selected]
-    marked = {name: marks([entry.scores.get(name) for entry in selected], competing, name) for name in columns}
-    identity = [key for key in LEADING if key != "speed"]
-    rows = []
-    for index, entry in enumerate(selected):
-        leading = entry.leading(notes)
-        cells = [leading[key] for key in identity]
-        cells += [replace(entry.cell(name, notes), mark=marked[name][index]) for name in columns]
-        rows.append(TableRow("ours" if entry.ours else "naive", cells))
+    columns = [column for column in SHOWN if any(_known(entry, column) for entry in selected)]
+    rows = score_rows(selected, OF_RUNS, [(column, None) for column in columns], notes, marked=True)
     title = f"{protocol['data_set']}, {protocol.get('name', 'scores')}, {protocol['resolution']} pixels"
     remarks = ["Ours, best in bold and second best underlined; not by the protocol of any published table."]
     remarks += [f"Measured alike in all rows. {SSIM_NOTE}", LEGEND]
-    return Table(name, title, [*leading_headings(identity), *map(score_heading, columns)], rows, remarks, notes)
+    return Table(name, title, [*leading_headings(OF_RUNS), *map(score_heading, columns)], rows, remarks, notes)
 
 
 def _known(entry: Entry, column: str) -> bool:
     """Return whether an entry has the score of a column, or a stated reason for lacking it."""
     region, _, name = column.split("_")
-    stated = name in entry.run.protocol.get("missing", {}) and any(key.startswith(region) for key in entry.scores)
+    stated = name in entry.protocol.get("missing", {}) and any(key.startswith(region) for key in entry.scores)
     return stated or column in entry.scores
+
+
+def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = MODEL) -> Table:
+    """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks.
+
+    Args:
+        model: the label of the predictor that is the model.
+    """
+    records = {model if name == MODEL else name: flat(entry) for name, entry in results.items()}
+    first = next(iter(records.values()))
+    pairs = [(f"object_novel_{name}", f"full_novel_{name}") for name in ("psnr", "ssim")]
+    masked = any(record.get(name) != record.get(whole) for record in records.values() for name, whole in pairs)
+    # Without masks, every pixel is the object's; with them, sharpness is the object's. More columns are too wide.
+    apart = ("full_novel_sharpness", "object_novel_lpips") if masked else "object"
+    names = [name for name in SHOWN if any(name in record for record in records.values())]
+    names = [name for name in names if not name.startswith(apart)]
+    entries = []
+    for label, scores in records.items():
+        bound = " (upper bound)" if scores.get(UPPER_BOUND) else ""
+        entries.append(Entry(label + bound, scores, None))
+    rows = score_rows(entries, ["method"], [(name, None) for name in names], Notes(), marked=False)
+    headings = [Heading("predictor", figures=False)]
+    for region, view, metric in (name.split("_") for name in names):
+        headings.append(Heading(f"{'all' if region == 'full' else region}\npixels\n{view}\n{METRICS[metric]}"))
+    fitted = {label: entry.get("fitted_to") for label, entry in zip(records, results.values(), strict=True)}
+    remarks = [f"{label}: fitted to {views}." for label, views in fitted.items() if views]
+    title = f"{first['scenes']:.0f} scenes, {first['views']:.0f} novel views"
+    return Table(title, title, headings, rows, [*remarks, SSIM_NOTE, SHARPNESS_NOTE])
 
 
 def mode_tables(runs: Sequence[Result]) -> list[Table]:
@@ -187,18 +252,18 @@ def mode_tables(runs: Sequence[Result]) -> list[Table]:
 
 
 def _mode_table(name: str, runs: Sequence[Result]) -> Table:
-    notes = Notes()
-    rows: dict[str, dict[object, list[Cell]]] = {"ours": {}, "known": {}}
+    notes, records = Notes(), dict[object, dict[str, object]]()
     for run in runs:
+        note = notes.number(f"{run.name}: {protocol_line(run.protocol)}.")
         for method, scores in run.entries.items():
-            label = str(run.protocol.get("method", "model")) if method == MODEL else method.replace("_", " ")
-            cells = [Cell(f"{scores[key]:.3f}", value=scores[key]) for key in MODE_SCORES]
-            cells += [Cell(f"{scores[key]:g}") for key in ("scenes", "samples")]
+            ours = method == MODEL
+            label = run.protocol.get("method", "model") if ours else method.replace("_", " ")
+            record: dict[str, object] = {"source": "ours" if ours else "known", "method": f"{label} [{note}]", **scores}
             # Methods other than the model may have the same scores in several runs, and are then shown once.
-            key, source = (run.name, "ours") if method == MODEL else ((label, *cells), "known")
-            rows[source].setdefault(key, [Cell(f"{label} [{_note(run, notes)}]"), *cells])
-    headings = [Heading("method", figures=False), *map(Heading, [*MODE_SCORES.values(), "scenes", "samples"])]
+            records.setdefault(run.name if ours else (label, *scores.items()), record)
     protocol = runs[0].protocol
     data = protocol.get("data_set") or f"data {protocol.get('data_fingerprint', 'unknown')[:12]}"
-    body = [TableRow(source, cells) for source, members in rows.items() for cells in members.values()]
-    return Table(name, f"Hidden modes, {data}", headings, body, [MODES_EXPLAINED], notes)
+    columns = {key: value for key, value in MODE_COLUMNS.items() if any(key in each for each in records.values())}
+    ordered = sorted(records.values(), key=lambda record: record["source"] != "ours")
+    made = records_table(f"Hidden modes, {data}", ordered, columns)
+    return replace(made, name=name, remarks=[MODES_EXPLAINED], notes=notes)

@@ -1,10 +1,10 @@
 """Tables of the paper, with our runs beside them if they were measured by the same protocol."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from omegaconf import OmegaConf
 
@@ -14,17 +14,19 @@ from completesplat.results.measured import (
     BEST_BY_METRIC,
     BEST_OF_K,
     LEADING,
+    OF_RUNS,
     OURS,
     Entry,
     alike,
-    described,
-    entries,
+    entries_of,
     leading_headings,
     mode_tables,
+    protocol_line,
+    score_rows,
     score_tables,
 )
 from completesplat.results.runs import HOW, MODES, SCORES, Job, RunTree, collect
-from completesplat.results.sweeps import figures, sweep_rows
+from completesplat.results.sweeps import sweep_rows
 from completesplat.results.tables import (
     ABSENT,
     BEST,
@@ -52,60 +54,28 @@ LACKING = "not measured in all jobs of this row"
 APART = "Rows of ours are by the protocol in their note, not by the paper's: they compare among each other only."
 
 
-@dataclass(frozen=True)
-class PrintedColumn:
-    """Column as printed: joined levels of its heading; a key of `LEADING` or `METRICS`; a data set, or the table's."""
-
-    heading: str
-    key: str
-    data_set: str = ""
-
-
-@dataclass(frozen=True)
-class PublishedTable:
-    """Table of the paper and the protocol of its figures; the head of `figures.yaml` explains each entry.
-
-    `evaluations` has, by name of our protocol, the `resolution`, `protocol_views` and numbers of `scenes` that a run
-    must have; without `scenes`, it must have all scenes of the list.
-    """
-
-    name: str
-    place: str
-    label: str
-    title: str
-    region: str
-    view: str
-    evaluations: Mapping[str, Mapping[str, Any]]
-    says: list[str]
-    columns: list[PrintedColumn]
-    rows: list[list[Cell]]
-    legend: Mapping[str, str] = field(default_factory=dict)
-    data_set: str = ""
-    resolution: str = ""
-    subset: str = ""
-    oracle_samples: int | None = None
-    remarks: list[str] = field(default_factory=list)
-    options: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def scored(self) -> list[tuple[int, PrintedColumn, str]]:
-        """Number, column and data set of each column of scores."""
-        numbered = enumerate(self.columns)
-        return [(n, column, column.data_set or self.data_set) for n, column in numbered if column.key in METRICS]
+PublishedTable = Any
+"""Table of the paper and the protocol of its figures: an entry of `figures.yaml`, whose head explains its keys."""
 
 
 @cache
 def published() -> list[PublishedTable]:
     """Return all tables, in the paper's order."""
-    tables = []
-    for entry in cast(list[dict[str, Any]], OmegaConf.to_container(OmegaConf.load(FILE).tables)):
-        columns = [PrintedColumn(**column) for column in entry.pop("columns")]
-        rows = [[parse(cell) for cell in line.split("|")] for line in entry.pop("rows").splitlines()]
-        tables.append(PublishedTable(columns=columns, rows=rows, **entry))
-    return tables
+    return list(OmegaConf.load(FILE).tables)
 
 
-def parse(cell: str) -> Cell:
+def printed_rows(table: PublishedTable) -> list[list[Cell]]:
+    """Return the rows of a published table."""
+    return [[parse_cell(cell) for cell in line.split("|")] for line in table.rows.splitlines()]
+
+
+def scored(table: PublishedTable) -> list[tuple[int, Any, str]]:
+    """Return number, column and data set of each column of scores."""
+    numbered = enumerate(table.columns)
+    return [(n, x, x.get("data_set", table.get("data_set"))) for n, x in numbered if x.key in METRICS]
+
+
+def parse_cell(cell: str) -> Cell:
     """Convert `17.93 best` to the text `17.93` with the mark `best`; dagger and star become signs behind the text."""
     words = cell.split()
     text = " ".join(word for word in words if word not in (BEST, SECOND, *SIGNS)) or BLANK
@@ -113,35 +83,29 @@ def parse(cell: str) -> Cell:
     return Cell(" ".join([text, *signs]), next((word for word in words if word in (BEST, SECOND)), UNMARKED))
 
 
-def _source(table: PublishedTable) -> str:
-    return f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
-
-
 def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
-    """Return the published rows, followed by those of our runs for which `belongs` is true.
+    """Return the published rows, followed by entries of ours.
 
     Times are of one sequence, warm, for the complete pipeline.
     """
-    notes, rows = Notes(), []
-    has_speed = any(column.key == "speed" for column in table.columns)
-    keys = [key for key in LEADING if key != "speed" or has_speed]
-    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in table.scored)]
-    for row in table.rows:
-        cells = {"resolution": Cell(table.resolution or ABSENT)}
+    notes, keys = Notes(), ["method"]
+    if not table.get("options"):
+        keys = [key for key in LEADING if key in OF_RUNS or any(column.key == key for column in table.columns)]
+    rows = []
+    for row in printed_rows(table):
+        cells = {"resolution": Cell(table.get("resolution", ABSENT))}
         cells |= {column.key: cell for column, cell in zip(table.columns, row, strict=True)}
-        scores = [row[number] for number, _, _ in table.scored]
+        scores = [row[number] for number, _, _ in scored(table)]
         rows.append(TableRow("paper", [*(cells.get(key, Cell(ABSENT)) for key in keys), *scores]))
-    for entry in (entry for entry in entries if belongs(table, entry)):
-        leading = entry.leading(notes)
-        scores = [
-            entry.cell(f"{table.region}_{table.view}_{column.key}", notes)
-            if data_set == entry.run.protocol["data_set"]
-            else Cell(ABSENT)
-            for _, column, data_set in table.scored
-        ]
-        rows.append(TableRow("ours", [*(leading[key] for key in keys), *scores]))
-    signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.legend.items()]
-    remarks = [_source(table), *signs, LEGEND, VIEWS, *table.remarks]
+    names = [f"{table.region}_{table.view}_{column.key}" for _, column, _ in scored(table)]
+    data_sets = [None if table.get("options") else data_set for *_, data_set in scored(table)]
+    columns = list(zip(names, data_sets, strict=True))
+    rows += score_rows(entries, keys, columns, notes, marked=False)
+    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in scored(table))]
+    source = f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
+    signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.get("legend", {}).items()]
+    apart = ([APART] if entries else []) if table.get("options") else [VIEWS]
+    remarks = [source, *signs, LEGEND, *apart, *table.get("remarks", [])]
     return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
 
 
@@ -153,43 +117,37 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
     skipped, with skip connections at full weight, and on all pixels. A best of k belongs to a table whose best of k has
     the same k. A model that has seen the views that it is scored on belongs to no table.
     """
-    protocol = entry.run.protocol
+    protocol = entry.protocol
     wanted = table.evaluations.get(str(protocol.get("name")))
     if wanted is None or protocol.get("skipped") or entry.upper_bound:
         return False
     if protocol.get("background") is not None or protocol.get("skip_weight") not in (None, 1):
         return False
-    if protocol["data_set"] not in {data_set for *_, data_set in table.scored}:
+    if protocol["data_set"] not in {data_set for *_, data_set in scored(table)}:
         return False
-    if table.subset and protocol.get("subset") != table.subset:
+    if "subset" in table and protocol.get("subset") != table.subset:
         return False
-    if entry.predictor in (BEST_OF_K, BEST_BY_METRIC) and protocol.get("samples") != table.oracle_samples:
+    if entry.predictor in (BEST_OF_K, BEST_BY_METRIC) and protocol.get("samples") != table.get("oracle_samples"):
         return False
     if protocol["scenes"] not in wanted.get("scenes", [protocol.get("scenes_listed")]):
         return False
     return (protocol["resolution"], protocol.get("protocol_views")) == (wanted["resolution"], wanted["protocol_views"])
 
 
-def ablations_beside(table: PublishedTable, sweeps: Mapping[str, Sequence[Job]]) -> Table:
-    """Return the published rows, followed by means over seeds of sweeps, by name and protocol."""
-    notes, names = Notes(), [f"{table.region}_{table.view}_{column.key}" for _, column, _ in table.scored]
-    rows = [TableRow("paper", row) for row in table.rows]
-    for name, jobs in sweeps.items():
-        for group in alike((job, job.protocol) for job in jobs):
-            settings, protocol = sweep_rows(group), group[0].protocol
-            note = notes.number(f"{name}: mean ± sample deviation over seeds; {described(protocol, ALIKE)}.")
-            for row, cells in zip(settings, figures(settings, names), strict=True):
-                theirs = "".join(f" ({table.options[part]})" for part in row.label.split(", ") if part in table.options)
-                label = f"{OURS}{row.label}{theirs}{f', {row.seeds} seeds' if row.seeds else ''} [{note}]"
-                pairs = zip(names, cells, strict=True)
-                scores = [cell if cell.text else notes.missing(name, protocol, LACKING) for name, cell in pairs]
-                rows.append(TableRow("ours", [Cell(label), *scores]))
-    headings = [Heading("setting", figures=False), *(Heading(column.heading) for column in table.columns[1:])]
-    remarks = [_source(table), *([APART] if sweeps else []), LEGEND]
-    return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
+def sweep_entries(table: PublishedTable, name: str, jobs: Sequence[Job]) -> list[Entry]:
+    """Return a sweep's means over seeds by protocol, with the paper's names of their settings."""
+    entries = []
+    for group in alike((job, job.protocol) for job in jobs):
+        protocol = group[0].protocol
+        note = f"{name}: mean ± sample deviation over seeds; {protocol_line(protocol, ALIKE)}."
+        for row in sweep_rows(group):
+            theirs = "".join(f" ({table.options[part]})" for part in row.label.split(", ") if part in table.options)
+            label = f"{OURS}{row.label}{theirs}{f', {row.seeds} seeds' if row.seeds else ''}"
+            entries.append(replace(row, label=label, note=note, protocol=protocol, lacking=LACKING))
+    return entries
 
 
-def tables(tree: RunTree | None) -> list[Table]:
+def published_tables(tree: RunTree | None) -> list[Table]:
     """Return the published tables with the runs below a folder, or the published figures alone for None.
 
     A run is listed below published rows only if it was measured like them, else in a table for its protocol. The jobs
@@ -199,16 +157,21 @@ def tables(tree: RunTree | None) -> list[Table]:
         CompleteSplatError: there are no results.
     """
     if tree is None:
-        return [ablations_beside(table, {}) if table.options else beside(table, []) for table in published()]
+        return [beside(table, []) for table in published()]
     if not (tree.scores or tree.modes or tree.warnings):
         raise CompleteSplatError(f"runs={tree.folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
-    options = {option for table in published() for option in table.options}
-    is_ablation = lambda job: options & set(job.label.split(", "))  # noqa: E731
+    options = {option for table in published() for option in table.get("options", [])}
     jobs = {folder: [job for job in collect(folder) if job.protocol] for folder in tree.sweeps}
-    sweeps = {folder: tested for folder, tested in jobs.items() if any(map(is_ablation, tested))}
-    single = entries([run for run in tree.scores if run.folder.parent not in sweeps])
-    named = {str(folder.relative_to(tree.folder)): tested for folder, tested in sweeps.items()}
-    made = [ablations_beside(table, named) if table.options else beside(table, single) for table in published()]
-    placed = [table for table in published() if not table.options]
-    elsewhere = [entry for entry in single if not any(belongs(table, entry) for table in placed)]
-    return [*made, *score_tables(elsewhere), *mode_tables(tree.modes)]
+    sweeps = {
+        folder: tested for folder, tested in jobs.items() if any(options & set(job.label.split(", ")) for job in tested)
+    }
+    single = entries_of(run for run in tree.scores if run.folder.parent not in sweeps)
+    made, placed = [], []
+    for table in published():
+        if table.get("options"):
+            named = [(str(folder.relative_to(tree.folder)), tested) for folder, tested in sweeps.items()]
+            entries = [entry for name, tested in named for entry in sweep_entries(table, name, tested)]
+        else:
+            placed += (entries := [entry for entry in single if belongs(table, entry)])
+        made.append(beside(table, entries))
+    return [*made, *score_tables([entry for entry in single if entry not in placed]), *mode_tables(tree.modes)]

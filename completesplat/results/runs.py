@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypedDict, cast
+from typing import Any, TypedDict, cast
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -14,7 +14,6 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
-from completesplat.results.machine import Machine
 
 SCORES, MODES = "metrics.json", "hidden_modes.json"
 RECORD, CONFIG, PLAN = "run.json", "config.yaml", "multirun.yaml"
@@ -44,7 +43,7 @@ class Protocol(TypedDict, total=False):
     resolution: int
     scenes: int
     missing: dict[str, str]
-    machine: Machine
+    machine: dict[str, Any]
     checkpoint: dict[str, str]
     data_fingerprint: str
 
@@ -95,7 +94,7 @@ class RunTree:
     warnings: list[str] = field(default_factory=list)
 
 
-def find(folder: Path) -> RunTree:
+def find_results(folder: Path) -> RunTree:
     """Search a folder and everything below it, except hidden folders."""
     if not folder.is_dir():
         raise CompleteSplatError(f"runs={folder}: no such folder")

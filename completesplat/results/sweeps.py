@@ -3,7 +3,6 @@
 import logging
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -13,16 +12,14 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 
 from completesplat.results.machine import machine
+from completesplat.results.measured import Entry, score_rows
 from completesplat.results.runs import MODEL, SEED, UPPER_BOUND, Job, collect, typed
 from completesplat.results.tables import (
-    EVALUATED_IF_POSSIBLE,
+    SHOWN,
     SSIM_NOTE,
-    Cell,
     Heading,
+    Notes,
     Table,
-    TableRow,
-    marks,
-    score_cell,
     score_heading,
     show,
     write_csv,
@@ -39,7 +36,6 @@ CAPTION = (
 )
 PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
 IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
-ALWAYS = ["full_novel_psnr", "full_novel_ssim", "object_novel_psnr", "object_novel_ssim", "full_reference_psnr"]
 
 
 class SweepSummary(Callback):
@@ -70,31 +66,18 @@ def _summarize(config: Any, last: bool) -> None:
         log.warning("no summary of the sweep: %s: %s", type(error).__name__, error)
 
 
-@dataclass(frozen=True)
-class SweepRow:
-    """Scores of one setting, averaged over seeds, or of a naive predictor, which has no seeds.
+def sweep_rows(finished: Sequence[Job]) -> list[Entry]:
+    """Return means over seeds for each setting, sorted by label, and then for the naive predictors.
 
-    `deviations` are sample standard deviations over seeds. A score that was not measured in all jobs is left out,
-    because a mean over fewer seeds than the row states would mislead.
+    A score that was not measured in all jobs is left out, because a mean over fewer seeds than the row states would
+    mislead.
     """
-
-    label: str
-    seeds: int | None
-    scenes: int | str | None
-    steps: int | str | None
-    upper_bound: bool
-    means: dict[str, float]
-    deviations: dict[str, float]
-
-
-def sweep_rows(finished: Sequence[Job]) -> list[SweepRow]:
-    """Return a row for each setting, sorted by label, and then the naive predictors."""
     settings: dict[frozenset[tuple[str, str]], list[Job]] = {}
     for job in finished:
         shared = frozenset((key, value) for key, value in job.overrides.items() if key != SEED)
         settings.setdefault(shared, []).append(job)
 
-    def order(row: SweepRow) -> list[tuple[bool, str]]:  # alphabetical by part, the unchanged method last
+    def order(row: Entry) -> list[tuple[bool, str]]:  # alphabetical by part, the unchanged method last
         return [(part == PROPOSED, part) for part in row.label.split(", ")]
 
     ours = sorted((_row(jobs[0].label, jobs) for jobs in settings.values()), key=order)
@@ -102,7 +85,7 @@ def sweep_rows(finished: Sequence[Job]) -> list[SweepRow]:
     return [*ours, *(_row(name, [job for job in finished if name in job.test], name) for name in naive)]
 
 
-def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> SweepRow:
+def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> Entry:
     tables = [job.test.get(predictor, {}) for job in jobs]
     scenes = _common(int(table["scenes"]) for table in tables if table)
     bound = any(table.get(UPPER_BOUND) for table in tables)
@@ -110,11 +93,12 @@ def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> SweepRow:
     values = {name: [table[name] for table in tables if name in table] for name in names}
     means = {name: fmean(each) for name, each in values.items() if len(each) == len(jobs)}
     if predictor != MODEL:
-        return SweepRow(label, None, scenes, None, bound, means, {})
+        return Entry(label, means, scenes, predictor, bound)
     # An infinite PSNR has no standard deviation.
     finite = {name: all(map(math.isfinite, values[name])) for name in means if len(jobs) > 1}
     deviations = {name: stdev(values[name]) if known else math.nan for name, known in finite.items()}
-    return SweepRow(label, len(jobs), scenes, _common(job.steps for job in jobs), bound, means, deviations)
+    steps = _common(job.steps for job in jobs)
+    return Entry(label, means, scenes, predictor, bound, len(jobs), steps, deviations)
 
 
 def _common(values: Iterable[int]) -> int | str | None:
@@ -123,34 +107,22 @@ def _common(values: Iterable[int]) -> int | str | None:
     return different[0] if len(different) == 1 else "/".join(map(str, different)) or None
 
 
-def figures(rows: Sequence[SweepRow], names: Sequence[str]) -> list[list[Cell]]:
-    """Return a cell for each row and metric: `21.34 ± 0.12`, best and second best marked, empty if not measured.
+def summarize(*folders: Path) -> tuple[list[Entry], Table]:
+    """Return rows and table of all jobs in a sweep's folder, or in its parts on several machines, finished or not.
 
-    Naive predictors and upper bounds do not compete. One seed has no standard deviation.
+    One seed has no standard deviation.
     """
-    competing = [row.seeds is not None and not row.upper_bound for row in rows]
-    marked = {name: marks([row.means.get(name) for row in rows], competing, name) for name in names}
-    return [
-        [score_cell(name, row.means.get(name), row.deviations.get(name), marked[name][index]) for name in names]
-        for index, row in enumerate(rows)
-    ]
-
-
-def summarize(*folders: Path) -> tuple[list[SweepRow], Table]:
-    """Return rows and table of all jobs in a sweep's folder, or in its parts on several machines, finished or not."""
     jobs = collect(*folders)
     rows = sweep_rows([job for job in jobs if job.finished])
-    names = [*ALWAYS, *(name for name in EVALUATED_IF_POSSIBLE if any(name in row.means for row in rows))]
-    body = []
-    for row, cells in zip(rows, figures(rows, names), strict=True):
-        identity = [Cell("" if value is None else str(value)) for value in (row.label, row.seeds, row.scenes)]
-        body.append(TableRow("naive" if row.seeds is None else "ours", [*identity, *cells]))
+    names = [name for name in SHOWN if any(name in row.scores for row in rows)]
+    columns = [(name, None) for name in names]
+    body = score_rows(rows, ("method", "seeds", "scenes"), columns, Notes(), marked=True)
     headings = [Heading("ablation", figures=False), Heading("seeds"), Heading("scenes"), *map(score_heading, names)]
     remarks = [CAPTION if rows else "No job of this sweep has finished.", *_remarks(jobs, rows)]
     return rows, Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
 
 
-def _remarks(jobs: Sequence[Job], rows: Sequence[SweepRow]) -> list[str]:
+def _remarks(jobs: Sequence[Job], rows: Sequence[Entry]) -> list[str]:
     """Return sentences on finished and missing jobs, on rows that do not compare, on commit, machine and commands."""
     finished = [job for job in jobs if job.finished]
     remarks = [f"{len(finished)} of {len(jobs)} jobs have finished."]
@@ -182,11 +154,11 @@ def write_summary(folder: Path, *parts: Path) -> Table:
     `parts` are the folders of one sweep on several machines; the files then cover all of them.
     """
     rows, table = summarize(*(parts or [folder]))
-    names = list(dict.fromkeys(name for row in rows for name in row.means))
+    names = list(dict.fromkeys(name for row in rows for name in row.scores))
     header = [*IDENTITY, *(f"{name}_{kind}" for name in names for kind in ("mean", "deviation"))]
     lines = []
     for row in rows:
-        scores = [score for name in names for score in (row.means.get(name), row.deviations.get(name))]
+        scores = [score for name in names for score in (row.scores.get(name), row.deviations.get(name))]
         lines.append([row.label, row.seeds, row.scenes, row.steps, row.upper_bound, *scores])
     write_csv(folder / "summary.csv", header, lines)
     write_documents([table], folder / "summary")

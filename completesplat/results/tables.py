@@ -3,13 +3,12 @@
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby, pairwise, product
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from completesplat.files import atomic_path, write_text
 from completesplat.metrics import PSNR_LIMIT
-from completesplat.results.runs import MODEL, UPPER_BOUND, Protocol, Scores, flat
 
 if TYPE_CHECKING:
     from rich.table import Table as PrintedTable
@@ -18,10 +17,11 @@ METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid"
 FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f", "sharpness": ".2f"}
 BETTER = {"psnr": "↑", "ssim": "↑", "lpips": "↓", "fid": "↓", "kid": "↓", "sharpness": "(truth: 1)"}
 """Better direction of each metric. Sharpness has none, because a blur has less than the truth and noise has more."""
-GROUPS = {
+HEADING_GROUPS = {
     "full_novel": "all pixels, novel views",
     "object_novel": "object pixels, novel views",
-    "full_reference": "reference view",
+    "full_reference": "all pixels, reference view",
+    "object_reference": "object pixels, reference view",
 }
 SSIM_NOTE = "SSIM: mean over all pixels, images mirrored at their border (skimage leaves 5 pixels out on every side)."
 """Note below tables with SSIM; the border has 37 % of the pixels of a 48 x 48 image, 15 % of a 128 x 128 one."""
@@ -39,12 +39,10 @@ ESCAPES = str.maketrans(
 ABSENT, BLANK = "-", "(blank)"
 LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK}: left blank in the paper."
 
-Column = tuple[str, str, str]  # heading, key of the record, and format of its values (empty for text)
-LABELS = {"full": "all\npixels", "object": "object\npixels"}
-EVALUATED = ["_".join((*place, name)) for place in product(LABELS, ("novel", "reference")) for name in ("psnr", "ssim")]
-EVALUATED_IF_POSSIBLE = [f"full_novel_{name}" for name in ("lpips", "fid", "kid")]
-EVALUATED_IF_POSSIBLE += [f"{region}_novel_sharpness" for region in LABELS]
-"""Scores in the table of an evaluation, if they were measured."""
+SHOWN = [f"full_novel_{name}" for name in METRICS]
+SHOWN += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips", "sharpness")]
+SHOWN += [f"{region}_reference_{name}" for region in ("full", "object") for name in ("psnr", "ssim")]
+"""Scores that a table shows if a row has them."""
 PLAIN = (type(None), str, bool, int, float)  # types of values that a table can show
 CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
 
@@ -52,7 +50,7 @@ CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "ma
 def score_heading(name: str) -> "Heading":
     """Return a heading for a score named `REGION_VIEW_METRIC`: its better direction, grouped by region and view."""
     group, _, metric = name.rpartition("_")
-    return Heading(f"{METRICS[metric]} {BETTER[metric]}", GROUPS[group])
+    return Heading(f"{METRICS[metric]} {BETTER[metric]}", HEADING_GROUPS[group])
 
 
 def marks(values: Sequence[float | None], competing: Sequence[bool], name: str) -> list[str]:
@@ -100,11 +98,12 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Heading:
-    """Heading of a column; the columns of a group share the heading above."""
+    """Heading of a column, and the format of its values; the columns of a group share the heading above."""
 
     text: str
     group: str = ""
     figures: bool = True  # whether the column is aligned to the right
+    form: str = ""
 
     def joined(self, separator: str = ": ") -> str:
         """Join group and text."""
@@ -122,12 +121,6 @@ class Notes:
         if text not in self.texts:
             self.texts.append(text)
         return self.texts.index(text) + 1
-
-    def missing(self, column: str, protocol: Protocol, otherwise: str) -> Cell:
-        """Return a cell that refers to a note on why a score is missing: the protocol's reason, or else `otherwise`."""
-        metric = column.rpartition("_")[2]
-        reason = protocol.get("missing", {}).get(metric, otherwise)
-        return Cell(f"missing: note {self.number(f'{metric}: {reason}')}")
 
 
 @dataclass(frozen=True)
@@ -162,64 +155,34 @@ class Table:
         return printed
 
 
-def table(title: str, columns: Sequence[Column], records: Iterable[Mapping[str, object]]) -> Table:
-    """Return a table with a row for each record; missing values stay empty."""
+def records_table(
+    title: str, records: Sequence[Mapping[str, object]], columns: Mapping[str, Heading] | None = None
+) -> Table:
+    """Return a table with a row for each record, whose `source` is the row's; missing values stay empty.
+
+    Without `columns`, the records' keys are the headings, and lists and mappings are left out.
+    """
+    if columns is None:
+        entries = {key: [record.get(key) for record in records] for record in records for key in record}
+        plain = {key: values for key, values in entries.items() if all(isinstance(value, PLAIN) for value in values)}
+        columns = {
+            key: Heading(key.replace("_", "\n"), figures=any(isinstance(value, int | float) for value in values))
+            for key, values in plain.items()
+        }
     rows = []
     for record in records:
-        values = [(record.get(key), form) for _, key, form in columns]
-        rows.append(TableRow("", [Cell("" if value is None else format(value, form)) for value, form in values]))
-    return Table(title, title, [Heading(heading, figures=bool(form)) for heading, _, form in columns], rows)
+        cells = [Cell(_written(record.get(key), heading.form)) for key, heading in columns.items()]
+        rows.append(TableRow(str(record.get("source", "")), cells))
+    return Table(title, title, list(columns.values()), rows)
 
 
-def records_table(title: str, records: Sequence[Mapping[str, object]]) -> Table:
-    """Return a table of records with the same keys, which are its headings; lists and mappings are left out."""
-    columns = {key: [record.get(key) for record in records] for record in records for key in record}
-    plain = {key: values for key, values in columns.items() if all(isinstance(value, PLAIN) for value in values)}
-    headings = [
-        Heading(key.replace("_", "\n"), figures=any(isinstance(value, int | float) for value in values))
-        for key, values in plain.items()
-    ]
-    rows = [TableRow("", [Cell(_written(value)) for value in values]) for values in zip(*plain.values(), strict=True)]
-    return Table(title, title, headings, rows)
-
-
-def _written(value: object) -> str:
-    """Return a value as text: empty for None; a float below 1000 has four digits, a larger one no decimals."""
+def _written(value: object, form: str) -> str:
+    """Return a value as text; without a format, a float below 1000 has four digits, a larger one no decimals."""
+    if value is None or form:
+        return "" if value is None else format(value, form)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        return "" if value is None else str(value)
+        return str(value)
     return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1000 else f"{value:,.0f}"
-
-
-def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = MODEL) -> Table:
-    """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks.
-
-    Args:
-        model: the label of the predictor that is the model.
-    """
-    records = [flat(entry) for entry in results.values()]
-    names = _reported(records)
-    headings = [Heading("predictor", figures=False)]
-    for name in names:
-        region, view, kind = name.split("_")
-        headings.append(Heading(f"{LABELS[region]}\n{view}\n{METRICS[kind]}"))
-    labelled = {model if predictor == MODEL else predictor: entry for predictor, entry in results.items()}
-    fitted = [f"{name}: fitted to {entry['fitted_to']}." for name, entry in labelled.items() if entry.get("fitted_to")]
-    rows = []
-    for label, scores in zip(labelled, records, strict=True):
-        bound = " (upper bound)" if scores.get(UPPER_BOUND) else ""
-        rows.append(TableRow("", [Cell(label + bound), *(score_cell(name, scores.get(name)) for name in names)]))
-    title = f"{records[0]['scenes']:.0f} scenes, {records[0]['views']:.0f} novel views"
-    return Table(title, title, headings, rows, [*fitted, SSIM_NOTE, SHARPNESS_NOTE])
-
-
-def _reported(records: Sequence[Scores]) -> list[str]:
-    """Return the names of the scores in the table: object pixels only if there are masks."""
-    names = [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]
-    pairs = [(name, name.replace("object", "full")) for name in EVALUATED]
-    masked = any(record.get(name) != record.get(whole) for record in records for name, whole in pairs)
-    # Without masks, every pixel is the object's; with them, sharpness is the object's.
-    unreported = "full_novel_sharpness" if masked else "object"
-    return [name for name in names if not name.startswith(unreported)]
 
 
 def show(*tables: Table, width: int = 120) -> None:

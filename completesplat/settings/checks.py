@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, TypedDict
 
 from hydra.utils import get_object, instantiate
-from omegaconf import DictConfig, ListConfig, Node, OmegaConf
+from omegaconf import DictConfig, ListConfig, Node, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.options import did_you_mean
-from completesplat.settings.schema import OneOf, Positive, Range, Seed, Share, arguments_of, check_settings, check_value
+from completesplat.settings.schema import Positive, Range, Seed, Share, arguments_of, check_settings, check_value
 
 Container = DictConfig | ListConfig
 
@@ -28,7 +28,7 @@ LEVELS = (
 )
 
 
-Precision = Annotated[object, OneOf(("32-true", "bf16-mixed", "16-mixed", 32, "bf16", 16))]
+Precision = Literal["32-true", "bf16-mixed", "16-mixed", 32, "bf16", 16]
 """Lightning's precisions with weights in float32, which Gaussians and cameras need."""
 
 
@@ -109,39 +109,47 @@ class View(SceneSettings):
     port: Annotated[int, Range(1, 65535)]
 
 
-class RunSettings(TypedDict):
-    """Settings of every verb that reads a run."""
-
-    overrides: Sequence[str]
-
-
-class ModelSettings(RunSettings):
+class ModelSettings(TypedDict):
     """Settings of `completesplat test` and of reports on samples that choose the model."""
 
     ckpt: str | None
     weights: str | None
+    overrides: Sequence[str]
     seed: Annotated[int, Range(0, 2**32 - 1)]
     trust: bool
 
 
-class Test(ModelSettings):
-    """Settings of `completesplat test`."""
+class Tested(ModelSettings, total=False):
+    """Settings of `completesplat test`, all of which `Trained` takes."""
 
-    evaluation: EvaluationSettings
     scenes: str | None
-    frame: Annotated[str, OneOf(("opencv", "opengl"))]
-    align: Annotated[str, OneOf(("none", "scale"))]
+    frame: Literal["opencv", "opengl"]
+    align: Literal["none", "scale"]
     method: str | None
+    data: Mapping[str, object]
+    rasterizer: Mapping[str, object]
+    sampler: Mapping[str, object]
 
 
-VERBS: dict[str, type] = {"fit": Fit, "plan": Plan, "predict": Predict, "view": View, "test": Test}
+VERBS: dict[str, type] = {"fit": Fit, "plan": Plan, "predict": Predict, "view": View, "test": Tested}
+"""Settings of verbs; the settings of a task are the arguments of its function."""
 
 
 def check_verb(verb: str, config: DictConfig) -> None:
     """Raise CompleteSplatError for the first unfit setting of a verb or, except for `view`, of its parts."""
-    check_settings(VERBS.get(verb, RunSettings), config)
+    if verb in VERBS:
+        check_settings(VERBS[verb], config)
+    if "task" in config:
+        complete_task(config)
     if verb != "view":  # `view` shows its page before it imports torch, so it checks its parts later
         check_parts(config)
+
+
+def complete_task(config: DictConfig) -> None:
+    """Let a config's task refer to the settings of the config that have the names of its function's arguments."""
+    names = part_arguments(config.task)[0].keys() & config.keys()
+    with open_dict(config):
+        config.task.update({name: f"${{{name}}}" for name in names - config.task.keys() - {"out"}})
 
 
 def check_parts(config: Container, place: str = "") -> None:

@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.arguments import for_hydra
 from completesplat.settings.checks import part_arguments
-from completesplat.settings.options import LEAST_LIKE, conf_folder, did_you_mean, gsplat_constants, options, search
+from completesplat.settings.options import LEAST_LIKE, conf_folder, did_you_mean, options, search
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 NOT_THERE = re.compile(r"Could not override '([^']+)'")
@@ -174,5 +174,4 @@ def best_precision() -> str:
 # Resolvers used in `conf/`. Jobs that a cluster starts import this module, too.
 OmegaConf.register_new_resolver("run_name", lambda: RUN_NAME, replace=True)
 OmegaConf.register_new_resolver("best_precision", best_precision, replace=True)
-OmegaConf.register_new_resolver("gsplat", lambda name: gsplat_constants()[name], replace=True)
 OmegaConf.register_new_resolver("job_name", job_name, replace=True)

@@ -4,11 +4,9 @@ A comment above a key or behind its value explains the key; the first comment of
 """
 
 import re
-import runpy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from difflib import get_close_matches
 from functools import cache
-from importlib.util import find_spec
 from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
@@ -188,18 +186,3 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
     """Return an ending for a message about an unknown name: the nearest of `names`, or nothing if none is near."""
     nearest = get_close_matches(name, list(names), cutoff=LEAST_LIKE)
     return f"; did you mean {' or '.join(nearest)}?" if nearest else ""
-
-
-def gsplat_constants() -> dict[str, float]:
-    """Return the constants compiled into the kernels of the installed gsplat, without importing it.
-
-    Releases from 1.6 on state them in `gsplat/cuda/_constants.py`. Release 1.5.3 has them in its kernels only
-    (`RasterizeToPixels3DGSFwd.cu`, `Common.h`); its values are the defaults, also where gsplat is not installed.
-    """
-    spec = find_spec("gsplat")
-    files = [Path(folder, "cuda", "_constants.py") for folder in (spec and spec.submodule_search_locations) or ()]
-    stated = {"MAX_ALPHA": 0.999, "ALPHA_THRESHOLD": 1 / 255, "TRANSMITTANCE_THRESHOLD": 1e-4}
-    for file in filter(Path.is_file, files):
-        stated |= runpy.run_path(str(file))
-    names = {"max_alpha": "MAX_ALPHA", "min_alpha": "ALPHA_THRESHOLD", "min_transmittance": "TRANSMITTANCE_THRESHOLD"}
-    return {name: stated[constant] for name, constant in names.items()}

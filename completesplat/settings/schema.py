@@ -43,18 +43,6 @@ class Range:
 
 
 @dataclass(frozen=True)
-class OneOf:
-    """Rule for `Annotated`: one of several values."""
-
-    choices: tuple[object, ...]
-
-    def refusal(self, value: object) -> str | None:
-        """Return why the value is refused, None if it is accepted."""
-        choices = ", ".join("null" if choice is None else str(choice) for choice in self.choices)
-        return None if value in self.choices else f"choose one of {choices}"
-
-
-@dataclass(frozen=True)
 class Entries:
     """Rule for `Annotated`: a list with a minimum and a maximum number of entries."""
 
@@ -94,7 +82,7 @@ class Refused(NamedTuple):
 def check_settings(function: object, settings: Mapping[str, object]) -> None:
     """Check settings against the annotations of the same names, of a function's arguments or in a `TypedDict`.
 
-    Numbers, choices, lists, mappings and `TypedDict`s are checked, with `Range`, `OneOf` and `Entries`; any
+    Numbers, choices, lists, mappings and `TypedDict`s are checked, with `Range` and `Entries`; any
     other annotation accepts everything.
 
     Raises:
@@ -151,8 +139,9 @@ def refused(annotation: object, value: object) -> list[Refused]:
         return unfit or [Refused("", value, reason) for rule in rules if (reason := rule.refusal(value))]
     members = arguments if origin in (Union, UnionType) else (annotation,)
     if annotation is not NoneType and all(get_origin(m) is Literal or m is NoneType for m in members):
-        choices = OneOf(tuple(choice for member in members for choice in get_args(member) or (None,)))
-        return refused(Annotated[object, choices], value)
+        choices = [choice for member in members for choice in get_args(member) or (None,)]
+        written = ", ".join("null" if choice is None else str(choice) for choice in choices)
+        return [] if value in choices else [Refused("", value, f"choose one of {written}")]
     if origin in (Union, UnionType):
         # A setting is never a `Tensor`, so `float | Tensor` means float. Without numbers, other classes accept all.
         plain = [member for member in arguments if not isinstance(member, type) or member in KINDS]
@@ -182,9 +171,8 @@ def described(annotation: object) -> str:
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
-        choices = [", ".join(map(str, rule.choices)) for rule in rules if isinstance(rule, OneOf)]
         ranges = [rule.words() for rule in rules if isinstance(rule, Range)]
-        return ", ".join(choices or filter(None, [described(kind), *ranges]))
+        return ", ".join(filter(None, [described(kind), *ranges]))
     if origin in (Union, UnionType):
         return " or ".join(dict.fromkeys(filter(None, map(described, arguments))))
     if origin is Literal:

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
 from completesplat.metrics.scoring import novel_values
-from completesplat.scene import SceneBatch
-from completesplat.studies.controls import Tick
+from completesplat.studies.controls import Scenes, Tick
 from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import SampleRenderer, mean_over_scenes
 
@@ -25,7 +24,7 @@ Truth = Float[Tensor, " value"]
 BINS = 10
 
 
-def rows(renderer: SampleRenderer, scenes: Sequence[SceneBatch], tick: Tick, **settings: float) -> list[dict[str, Any]]:
+def calibration_rows(renderer: SampleRenderer, scenes: Scenes, tick: Tick, **settings: float) -> list[dict[str, Any]]:
     """Return a row for each region of novel views (`novel_values`), with means over the scenes.
 
     `energy_N` is the energy score of N samples, `below_all` and `above_all` are the ends of the rank histogram `ranks`.

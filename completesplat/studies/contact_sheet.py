@@ -99,7 +99,7 @@ def _common_point(cameras: Cameras) -> Float[Tensor, "3"] | None:
     return point if met else None
 
 
-def show(sequences: Sequence[PosedSequence], path: Path, images: int, title: str) -> None:
+def write_contact_sheet(sequences: Sequence[PosedSequence], path: Path, images: int, title: str) -> None:
     """Write a PNG with a row of images for each sequence.
 
     The images are evenly spaced from first to last frame. An unreadable image is a grey cell with the error's kind.

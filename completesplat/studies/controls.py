@@ -30,7 +30,9 @@ def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> li
     return sorted({*product(map(float, skip_weights), map(float, guidance_weights)), *PAPER})
 
 
-def rows(renderer: SampleRenderer, settings: Settings, scenes: Scenes, near_degrees: float, tick: Tick) -> list[Row]:
+def controls_rows(
+    renderer: SampleRenderer, settings: Settings, scenes: Scenes, near_degrees: float, tick: Tick
+) -> list[Row]:
     """Return a row for each setting, with means over the scenes.
 
     `reference_psnr` is of the reference view. `near_object_psnr` is of the true object's pixels in targets at most
@@ -61,7 +63,7 @@ def over_settings(settings: Settings, scenes: Scenes, measure: Measure, tick: Ti
     return results
 
 
-def strips(renderer: SampleRenderer, settings: Settings, scene: SceneBatch, samples: int) -> Sheet:
+def controls_strips(renderer: SampleRenderer, settings: Settings, scene: SceneBatch, samples: int) -> Sheet:
     """Return rows by skip weight and columns by guidance weight: one sample's reference view, several far views.
 
     The far view is the target whose direction differs most from the reference's. The first row is the truth.

@@ -22,7 +22,9 @@ def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tens
     return torch.where(count > 1, (from_mean.square().sum(0) / (count - 1)).sqrt(), torch.nan)
 
 
-def rows(renderer: SampleRenderer, settings: Settings, scenes: Scenes, far_degrees: float, tick: Tick) -> list[Row]:
+def depth_rows(
+    renderer: SampleRenderer, settings: Settings, scenes: Scenes, far_degrees: float, tick: Tick
+) -> list[Row]:
     """Return a row for each (skip weight, guidance weight), with means over the scenes.
 
     `reference_deviation` is the mean of `deviation` over the reference view's pixels, in the scene's units;
@@ -42,7 +44,7 @@ def rows(renderer: SampleRenderer, settings: Settings, scenes: Scenes, far_degre
 def deviations(
     depth: Float[Tensor, "sample view 1 height width"], scene: SceneBatch, far_degrees: float
 ) -> dict[str, float | None]:
-    """Return the figures of `rows` for one scene (a batch of one); `depth` is of the reference view and all targets."""
+    """Return the figures of `depth_rows` for one scene (a batch of one), given depths of all its views."""
     maps, masks = deviation(depth), scene.all_views().masks[0]
     far = 1 + torch.nonzero(~near(scene.reference.cameras[0], scene.targets.cameras[0], far_degrees))[:, 0]
     figures: dict[str, float | None] = {}
@@ -58,7 +60,9 @@ def _mean(values: Float[Tensor, "..."]) -> float | None:
     return known.mean().item() if len(known) else None
 
 
-def strips(renderer: SampleRenderer, scenes: Scenes, skip_weight: float, guidance_weight: float, shown: int) -> Sheet:
+def depth_strips(
+    renderer: SampleRenderer, scenes: Scenes, skip_weight: float, guidance_weight: float, shown: int
+) -> Sheet:
     """Return a row for each scene: the truth, some samples in the far view, and where all samples disagree.
 
     The far view is the target whose direction differs most from the reference's. The truth is the input and the far

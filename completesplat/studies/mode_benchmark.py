@@ -216,7 +216,7 @@ def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenMode
     return selected, skipped
 
 
-def draw(measured: Measured, samples: int, path: Path) -> None:
+def write_modes(measured: Measured, samples: int, path: Path) -> None:
     """Write a PNG with a row for each scene of `Measured.rows`."""
     title = f"Hidden modes: {len(measured.names)} scenes, {samples} samples each. Input; then from behind: every mode, "
     write_png(path, image_sheet(None, measured.rows, f"{title}samples with their modes"))

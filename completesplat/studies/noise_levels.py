@@ -37,7 +37,7 @@ def scenes_in_all_modes(
 
 
 @torch.no_grad()
-def rows(model: CompleteSplat, scenes: Sequence[SceneBatch], draws: int, seed: int) -> list[Row]:
+def noise_level_rows(model: CompleteSplat, scenes: Sequence[SceneBatch], draws: int, seed: int) -> list[Row]:
     """Return a row for each of `LEVELS`, with means over scenes, modes and draws of noise.
 
     `best_share` is the true mode's probability given the noisy latent, for a classifier that knows the latents of all
@@ -77,7 +77,7 @@ def standardised(model: CompleteSplat, versions: SceneBatch) -> Posterior:
 def shares(
     model: CompleteSplat, modes: Posterior, condition: Tensor, step: int, draws: int, generator: torch.Generator
 ) -> Float[Tensor, "2"]:
-    """Return the means of `best_share` and `denoiser_share` (see `rows`) at one timestep."""
+    """Return the means of `best_share` and `denoiser_share` (see `noise_level_rows`) at one timestep."""
     true = torch.arange(len(modes.mean)).repeat_interleave(draws)
     noise = [torch.randn(len(true), *modes.mean.shape[1:], generator=generator).to(modes.mean) for _ in range(2)]
     timestep = torch.tensor(step, device=modes.mean.device)
@@ -94,7 +94,7 @@ def shares(
     return torch.stack([x.gather(1, true.to(x.device)[:, None]).mean() for x in (best, weights)]).cpu()
 
 
-def plot(table: Sequence[Row], path: Path, title: str) -> None:
+def plot_noise_levels(table: Sequence[Row], path: Path, title: str) -> None:
     """Write a PNG with both shares by noise level, and below them the timesteps of training and of the sampler."""
     with written_figure(path, title, (8, 6)) as figure:
         top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))

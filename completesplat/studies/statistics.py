@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.data.sequences import PosedSequence
-from completesplat.results.tables import Cell, Heading, Table, TableRow, show, table
+from completesplat.results.tables import Heading, records_table, show
 from completesplat.studies.figures import written_figure
 
 # Key in the results, label, format.
@@ -56,15 +56,17 @@ def statistics(sequences: Mapping[str, Iterable[PosedSequence]]) -> dict[str, An
 def show_statistics(results: dict[str, Any]) -> None:
     """Print the splits side by side."""
     splits = results["splits"]
-    columns = [("split", "split", ""), ("sequences", "sequences", ",d"), ("frames", "frames", ",d")]
-    headings = [Heading(part, split) for split in splits for part in PARTS]
-    rows = []
+    counts = [
+        {"split": split, **{key: summary[key] for key in ("sequences", "frames")}} for split, summary in splits.items()
+    ]
+    columns = {"": Heading("", figures=False)}
+    columns |= {f"{split} {part}": Heading(part, split) for split in splits for part in PARTS}
+    ranges: list[dict[str, object]] = []
     for key, label, form in MEASURES:
-        values = [summary[key][part] for summary in splits.values() for part in PARTS]
-        rows.append(TableRow("", [Cell(label), *(Cell("-" if x is None else format(x, form)) for x in values)]))
-    ranges = Table("ranges", "Smallest, median and largest", [Heading("", figures=False), *headings], rows)
-    counts: list[dict[str, object]] = [{"split": split, **summary} for split, summary in splits.items()]
-    show(table("Sequences and frames", columns, counts), ranges)
+        values = {f"{split} {part}": summary[key][part] for split, summary in splits.items() for part in PARTS}
+        written = {name: "-" if x is None else format(x, form) for name, x in values.items()}
+        ranges.append({"": label, **written})
+    show(records_table("Sequences and frames", counts), records_table("Smallest, median and largest", ranges, columns))
 
 
 def _measure(sequence: PosedSequence) -> Row:
@@ -126,15 +128,7 @@ def _histogram(key: str, rows: dict[str, list[Row]]) -> dict[str, Any]:
     return {"edges": edges.tolist(), "counts": counts}
 
 
-# Measure, title, label of the axis.
-PANELS = [
-    ("frames_per_sequence", "Length", "frames of a sequence"),
-    ("fov_degrees", "Field of view", "horizontal angle, degrees"),
-    ("largest_angle_degrees", "Turn", "largest angle between two views, degrees"),
-    ("distance_from_first", "Baseline", "largest distance from the first camera, scene units"),
-    ("near", "Near", "nearest depth, scene units"),
-    ("far", "Far", "farthest depth, scene units"),
-]
+PANELS = [measure for measure in MEASURES if measure[0] != "path_extent"]
 DASHES = ["-", "--", ":"]
 
 
@@ -143,7 +137,7 @@ def plot_statistics(results: dict[str, Any], path: Path, title: str) -> None:
     total = {split: summary["sequences"] for split, summary in results["splits"].items()}
     numbers = ", ".join(f"{count:,} {split}" for split, count in total.items())
     with written_figure(path, f"{title}: sequences {numbers}", (13, 7)) as figure:
-        for panel, (key, heading, label) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
+        for panel, (key, label, _) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
             histogram = results["histograms"][key]
             for index, (split, count) in enumerate(total.items()):
                 if count:
@@ -151,7 +145,7 @@ def plot_statistics(results: dict[str, Any], path: Path, title: str) -> None:
                     style: dict[str, Any] = {"color": f"C{index}", "linestyle": DASHES[index % len(DASHES)]}
                     panel.stairs(shares, histogram["edges"], baseline=None, linewidth=1.8, label=split, **style)
                     panel.stairs(shares, histogram["edges"], fill=True, alpha=0.15, color=f"C{index}")
-            panel.set(title=heading, xlabel=label, ylabel="sequences of the split, %")
+            panel.set(xlabel=label, ylabel="sequences of the split, %")
             panel.set_ylim(bottom=0)
             panel.grid(alpha=0.3)
         if any(total.values()):

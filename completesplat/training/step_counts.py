@@ -190,7 +190,7 @@ def count_step(
         weights, latent_bytes = live.bytes, None
         inputs: Batch = synthetic_batch(image_size, batch, targets)
         if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch):
-            encoded = encode(module, inputs)  # rows of a cache are in float32 with a checksum, images in bytes
+            encoded = with_latents(module, inputs)  # rows of a cache are in float32 with a checksum, images in bytes
             part = 4 if module.completesplat.conditioning.frozen else 1
             latent_bytes = 8 * encoded.mean[0].numel() + part * encoded.condition[0].numel() + 4
             inputs = encoded if cached else inputs
@@ -238,7 +238,7 @@ def fake_tensors() -> Iterator[None]:
 
 
 @torch.no_grad()
-def encode(module: LatentDiffusion, scenes: SceneBatch) -> CachedScene:
+def with_latents(module: LatentDiffusion, scenes: SceneBatch) -> CachedScene:
     """Return the scenes as a latent cache would give them."""
     parts, images = module.completesplat, scenes.reference.images
     latent = torch.zeros_like(module.inputs(scenes)[0])

@@ -63,7 +63,7 @@ def autocast(device: torch.device, precision: str) -> torch.autocast:
     return torch.autocast(device.type, torch.bfloat16, enabled=precision.startswith("bf16"))
 
 
-def orbit(size: int, views: int) -> Cameras:
+def cameras_on_orbit(size: int, views: int) -> Cameras:
     """Return cameras [1 view] on an orbit about the object, for images of side `size`."""
     angles = 0.5 + 2 * math.pi * torch.arange(views) / views
     target = torch.tensor([0.0, 0.0, DISTANCE])
@@ -75,7 +75,7 @@ def orbit(size: int, views: int) -> Cameras:
 def synthetic_batch(size: int, batch: int, targets: int) -> SceneBatch:
     """Return views of noise from an orbit, because the content of images does not change the work of a step."""
     generator = torch.Generator().manual_seed(0)
-    cameras = orbit(size, 1 + targets)[0]
+    cameras = cameras_on_orbit(size, 1 + targets)[0]
     cameras = cameras.relative_to(cameras[0]).map(lambda tensor: tensor.expand(batch, *tensor.shape))
     images = torch.rand(batch, 1 + targets, 3, size, size, generator=generator)
     views = Views(images, cameras, torch.ones_like(images[:, :, :1]))

@@ -7,6 +7,7 @@ from support import compose_config, strict_json
 
 from completesplat.benchmarks import paper
 from completesplat.benchmarks.paper import FIGURES, WAYS, compiled, is_as_in_the_paper, measured
+from completesplat.settings.checks import complete_task
 
 CHANNELS = "channels=[8,8,16,16]"
 QUICK = [
@@ -40,7 +41,9 @@ def test_both_stages_are_measured_written_and_printed(command, tmp_path, monkeyp
 
 def papers_work(*settings: str) -> bool:
     """Return whether these settings give the work of the paper's durations."""
-    task = OmegaConf.to_container(compose_config("bench", "bench_task=paper", *settings).task, resolve=True)
+    config = compose_config("bench", "bench_task=paper", *settings)
+    complete_task(config)
+    task = OmegaConf.to_container(config.task, resolve=True)
     data = task["data"]
     work = {"image_size": data["image_size"], "batch": data["batch_size"]}
     return is_as_in_the_paper(work | {key: task[key] for key in ("samples", "steps")}, task["channels"])

@@ -14,7 +14,7 @@ from PIL import Image
 from support import SMALL, compose_config, strict_json
 
 from completesplat.commands.trained import Trained
-from completesplat.commands.view import settings_of
+from completesplat.commands.view import setting_of_path
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
 from completesplat.generator import CompleteSplat, OneAnswer
@@ -44,7 +44,7 @@ def test_a_runs_folder_its_weights_and_its_checkpoint_give_the_same_scenes(pipel
     scenes = []
     for weights in (run, run / "weights", run / "checkpoints/last.ckpt"):
         scenes.append(CompleteSplat.from_pretrained(weights)(pipeline.photograph(), samples=samples))
-        assert settings_of(weights) == {"weights": str(run / "weights" if weights.is_dir() else weights)}
+        assert setting_of_path(weights) == {"weights": str(run / "weights" if weights.is_dir() else weights)}
     for others in scenes[1:]:
         for scene, other in zip(scenes[0], others, strict=True):
             assert all(torch.equal(value, getattr(other, name)) for name, value in vars(scene).items())
@@ -119,7 +119,7 @@ def test_a_run_of_fitted_scenes_leaves_them_and_says_so_when_a_photograph_is_giv
     assert 0 < read_ply(folder / "scene.ply").count <= 300
     Image.open(folder / "sheet.png").verify()
     assert strict_json(folder / "scene.json")["settings"]["scene"] in folder.name
-    assert settings_of(run) == {"scene": str(run)}
+    assert setting_of_path(run) == {"scene": str(run)}
     refused = command("predict", f"image={pipeline.photograph()}", f"weights={run}", f"out={tmp_path / 'out'}")
     assert (refused.status, refused.err.count("\n")) == (2, 1)
     assert "PerScene" in refused.err

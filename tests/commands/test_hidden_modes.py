@@ -5,7 +5,7 @@ import pytest
 from support import refused, strict_json
 
 FEW = [f"evaluation.{few}" for few in ("samples=3", "batch=2", "views=1", "spread_views=2", "shown_samples=2")]
-FIGURES = {"coverage", "total_variation", "sharpness", "rejected", "scenes", "samples"}
+FIGURES = {"coverage", "total_variation", "mode_distance", "rejected", "scenes", "samples"}
 FIGURES |= {"energy_hidden", "energy_visible"}
 METHODS = {"model", "posterior_mean", "posterior_samples", "other_scene"}
 
@@ -24,7 +24,7 @@ def test_every_method_is_scored(command, pipeline, tmp_path, stage):
         assert f"{scores['energy_hidden']:.4f}" in finished.out
     mean, true = results["mean_predictor"], results["true_sampler"]
     assert (mean["coverage"], mean["total_variation"], mean["rejected"]) == (0, 1, 1)
-    assert (true["sharpness"], true["rejected"]) == (0, 0)
+    assert (true["mode_distance"], true["rejected"]) == (0, 0)
     assert true["coverage"] <= 0.75  # three draws of four modes
     assert set(strict_json(tmp_path / "out/shares.json")) == set(results)
     assert imageio.imread(tmp_path / "out/hidden_modes.png").ndim == 3

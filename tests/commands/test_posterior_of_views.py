@@ -10,7 +10,7 @@ from plyfile import PlyData
 from support import SMALL, refused, strict_json, write_capture
 
 LADDER = {"model", "posterior_mean", "posterior_samples", "other_scene", "mean_predictor", "true_sampler"}
-SCORES = {"coverage", "total_variation", "sharpness", "rejected", "energy_hidden", "energy_visible"}
+SCORES = {"coverage", "total_variation", "mode_distance", "rejected", "energy_hidden", "energy_visible"}
 ENCODER = [f"autoreconstructor.encoder.{setting}" for setting in ("channels=[8,16]", "norm_groups=4")]
 SIZES = [*SMALL, "data.targets=2", *ENCODER]
 

@@ -16,8 +16,8 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.gaussians import Gaussians
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.results.paper_figures import tables
-from completesplat.results.runs import find, flat
+from completesplat.results.paper_figures import published_tables
+from completesplat.results.runs import find_results, flat
 from completesplat.results.tables import as_markdown
 from completesplat.scene import SceneBatch
 from completesplat.training.scene_files import SceneFiles
@@ -69,7 +69,7 @@ def test_samples_score_the_same_from_files_as_from_the_model(command, pipeline, 
     assert {key: described[key] for key in named} == named
     assert described["checkpoint"]["path"] == str(model_test / "splats")
     assert len(described["checkpoint"]["sha256"]) == 64
-    text = "\n".join(map(as_markdown, tables(find(tmp_path))))
+    text = "\n".join(map(as_markdown, published_tables(find_results(tmp_path))))
     assert "| Mine (read from files), single sample [1] |" in text
     assert "| completesplat: copy reference [1] |" in text
     assert "frame opencv, align none, checkpoint sha256 " in text

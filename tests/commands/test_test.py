@@ -87,7 +87,7 @@ def test_the_protocol_records_the_measurement(scored, pipeline, monkeypatch):
 
     monkeypatch.setattr(Sampler, "__call__", watched)
     change = "overrides=['model.guidance_weight=0.5','data.evaluation_targets=1']"
-    printed, metrics = scored("diffusion", change, "sampler=dpm10", "seed=3")
+    printed, metrics = scored("diffusion", change, "sampler=dpm20", "sampler.steps=10", "seed=3")
     described, model = metrics["protocol"], metrics["model"]
     assert set(used) == {("DPMSolverMultistepScheduler", 10)}
     assert model["views"] == model["scenes"] == described["scenes"]
@@ -112,7 +112,7 @@ def test_the_protocol_records_the_measurement(scored, pipeline, monkeypatch):
 
 
 def test_the_best_of_several_samples_stands_beside_one_and_the_mean(scored):
-    _, metrics = scored("diffusion", "evaluation.scoring.samples=3", "sampler=dpm10")
+    _, metrics = scored("diffusion", "evaluation.scoring.samples=3", "sampler=dpm20", "sampler.steps=10")
     one, best, mean = (metrics[row]["full"]["novel"]["psnr"] for row in ("model", "best_of_k", "mean_of_k"))
     assert best >= max(one, mean)
     curve = metrics["best_of_k"]["curve"]

@@ -15,7 +15,7 @@ from viewer_scenes import balls
 from written_commands import ROOT
 
 from completesplat.commands.jobs import alone_in
-from completesplat.commands.view import newest_scenes, scenes_in, settings_of, show_newest
+from completesplat.commands.view import newest_scenes, scenes_in, setting_of_path, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.training.fixed_scenes import write_newest
@@ -37,14 +37,14 @@ def test_what_a_path_stands_for(tmp_path):
     outer = folder(tmp_path / "o", "photo/sample_00.ply", "run.json")
     files = folder(tmp_path / "f", "A.PLY", "photo.jpg")
     fitted = folder(tmp_path / "c", "checkpoints/last.ckpt", "config.yaml", "scene.ply")
-    assert settings_of(fitted) == {"scene": str(fitted)}
-    assert settings_of(weights) == {"weights": str(weights)}
-    assert settings_of(run) == {"weights": str(run / "weights")}
-    assert settings_of(prediction) == {"scene": str(prediction)}
-    assert settings_of(outer) == {"scene": str(outer)}
-    assert settings_of(files / "A.PLY") == {"scene": str(files / "A.PLY")}
-    assert settings_of(files) == {"scene": str(files)}
-    assert settings_of(files / "photo.jpg") == {"image": str(files / "photo.jpg")}
+    assert setting_of_path(fitted) == {"scene": str(fitted)}
+    assert setting_of_path(weights) == {"weights": str(weights)}
+    assert setting_of_path(run) == {"weights": str(run / "weights")}
+    assert setting_of_path(prediction) == {"scene": str(prediction)}
+    assert setting_of_path(outer) == {"scene": str(outer)}
+    assert setting_of_path(files / "A.PLY") == {"scene": str(files / "A.PLY")}
+    assert setting_of_path(files) == {"scene": str(files)}
+    assert setting_of_path(files / "photo.jpg") == {"image": str(files / "photo.jpg")}
 
 
 def test_the_scenes_of_a_folder_can_be_chosen(tmp_path):
@@ -68,7 +68,7 @@ def test_what_cannot_be_shown_is_refused(tmp_path):
         ),
     ):
         with pytest.raises(CompleteSplatError, match=re.escape(message)):
-            settings_of(tmp_path / path)
+            setting_of_path(tmp_path / path)
 
 
 def test_weights_that_are_not_there_are_refused_before_the_page_opens(command):
@@ -89,13 +89,13 @@ def run_in_training(path, step: int = 2):
 
 def test_a_run_is_watched_while_a_process_is_at_work_in_it(tmp_path):
     run = run_in_training(folder(tmp_path / "run", "checkpoints/last.ckpt", "config.yaml"))
-    assert settings_of(run) == {"weights": str(run)}
+    assert setting_of_path(run) == {"weights": str(run)}
     (run / ".lock").touch()
-    assert settings_of(run) == {"weights": str(run)}
+    assert setting_of_path(run) == {"weights": str(run)}
     with alone_in(run):
-        assert settings_of(run) == {"watch": str(run)}
+        assert setting_of_path(run) == {"watch": str(run)}
         assert (run / ".lock").read_text().split()[0] == str(os.getpid())  # as it was
-    assert settings_of(run) == {"weights": str(run)}
+    assert setting_of_path(run) == {"weights": str(run)}
 
 
 def test_what_a_run_writes_is_shown_when_it_is_new(tmp_path, capsys):

@@ -9,7 +9,7 @@ from support import strict_json
 from torch import Tensor
 
 from completesplat.data.validation import ChangedFile, MissingFile
-from completesplat.data.validation.audit import Findings, check, show
+from completesplat.data.validation.audit import Findings, check, show_findings
 from completesplat.data.validation.processes import map_in_processes
 
 
@@ -68,7 +68,7 @@ def test_every_planted_fault_is_found_once_written_and_shown(tmp_path: Path, cap
     assert {"sequence": "x", "frame": None, "file": None, "reason": "score below 0.5"} in written["refused"]
     others = dict.fromkeys(("missing file", "changed file", "malformed annotation", "too few frames"), 1)
     assert written["counts"] == {"unusable image": 3, "left out: score below 0.5": 2, **others}
-    show(findings)
+    show_findings(findings)
     shown = capsys.readouterr().out
     assert "1 sequences are in both train and val: b\n" in shown
     for text in ("left out: score below 0.5", "unusable image", "a/2.jpg, a, frame 2: truncated"):
@@ -111,10 +111,10 @@ def test_two_processes_find_the_same_in_the_same_order() -> None:
 
 def test_sound_data_show_no_table_and_strange_names_are_shown_whole(capsys: pytest.CaptureFixture[str]) -> None:
     """Neither markup nor control characters nor undecodable bytes in a name change how the table looks."""
-    show(check_quietly(train=Source({"a": (1, 2)}), val=Source({})))
+    show_findings(check_quietly(train=Source({"a": (1, 2)}), val=Source({})))
     assert capsys.readouterr().out == "usable sequences: 1, their usable frames: 2 (train 1 and 2, val 0 and 0)\n"
     name = "[bold]" + "long/" * 50 + "\x1b[31m\n\udc80"
-    show(check_quietly(train=Source({"a": (1, 2)}, refused=[MissingFile("no such file", name)])))
+    show_findings(check_quietly(train=Source({"a": (1, 2)}, refused=[MissingFile("no such file", name)])))
     printed = capsys.readouterr().out.splitlines()
     assert max(map(len, printed)) <= 120
     cell = "".join(line.split("│")[3].strip() for line in printed if "│" in line)

@@ -19,7 +19,7 @@ from completesplat.errors import CompleteSplatError
 NOISE = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 DDIM = NOISE | {"clip_sample": False, "set_alpha_to_one": True, "timestep_spacing": "trailing"}
 NAMES = sorted(p.stem for p in (conf_folder() / "sampler").glob("[!_]*.yaml") if not p.stem.startswith("flow"))
-SOLVERS = ["ddim20", "dpm20", "unipc10"]
+SOLVERS = ["ddim50", "dpm20", "unipc10"]
 MEAN, STD = 0.7, 0.5
 
 
@@ -123,8 +123,8 @@ def test_an_exact_denoiser_gives_the_data_distribution(name, kind):
     # Pure noise stands for h_T, of which a little is signal: the mean comes out 0.03 too low even by the exact flow.
     assert abs(drawn.mean() - MEAN) < 0.04
     assert abs(drawn.mean() - exact_result(gaussian_noise(2000)).mean()) < 0.01
-    # In 20 steps DDIM's first order is still seen.
-    assert abs(drawn.std() - STD) < {"ddim20": 0.08}.get(name, 0.02)
+    # In 50 steps DDIM's first order is still seen.
+    assert abs(drawn.std() - STD) < {"ddim50": 0.04}.get(name, 0.02)
 
 
 @pytest.mark.parametrize("steps", [25, 50])
@@ -134,7 +134,7 @@ def test_ddim_is_of_first_order_and_dpm_solver_2m_of_second(steps):
     assert coarse / fine == pytest.approx(4, rel=0.25)
 
 
-@pytest.mark.parametrize(("name", "steps"), [*product(NAMES, [1, None]), ("ddim20", 1000)])
+@pytest.mark.parametrize(("name", "steps"), [*product(NAMES, [1, None]), ("ddim50", 1000)])
 def test_a_step_costs_one_call_of_the_whole_batch(name, steps):
     own, calls = made(name), []
     noise = gaussian_noise(3)

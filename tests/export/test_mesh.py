@@ -96,7 +96,7 @@ def test_what_no_view_sees_is_inside_and_what_lies_before_surfaces_or_emptiness_
     cameras = mesh.cameras_around(torch.zeros(3), 1.0, 0.5)  # at a distance of sqrt(5)
     center, ahead, depths = torch.zeros(1, 3), 5**0.5, torch.ones(20, 1, 96, 96)
     for depth, expected in ((ahead - 0.21, -1.0), (ahead - 0.1, -0.5), (ahead, 0), (ahead + 0.1, 0.5), (9, 1), (0, 1)):
-        result = mesh.distances(center, cameras, depths * depth, 0.2)
+        result = mesh.signed_distances(center, cameras, depths * depth, 0.2)
         torch.testing.assert_close(result, torch.tensor([float(expected)]), rtol=0, atol=1e-4)
 
 

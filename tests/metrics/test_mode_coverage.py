@@ -1,4 +1,4 @@
-"""Coverage, distance and sharpness on constructed truths, whose scores are known in closed form."""
+"""Coverage, distance and distance to modes on constructed truths, whose scores are known in closed form."""
 
 import pytest
 import torch
@@ -23,7 +23,7 @@ def plain(*values: float) -> torch.Tensor:
 
 def test_a_sampler_of_every_mode_in_proportion_is_perfect():
     result = scores(MODES.repeat(8, 1, 1), MODES, EVEN)
-    assert (result["coverage"], result["total_variation"], result["sharpness"], result["rejected"]) == (1, 0, 0, 0)
+    assert (result["coverage"], result["total_variation"], result["mode_distance"], result["rejected"]) == (1, 0, 0, 0)
     uneven = scores(MODES[[0, 0, 1, 2]], MODES, UNEVEN)
     assert (uneven["coverage"], uneven["total_variation"]) == (1, 0)
 
@@ -32,7 +32,7 @@ def test_a_sampler_of_every_mode_in_proportion_is_perfect():
 def test_the_mean_of_the_modes_is_rejected_always(probabilities):
     result = scores(mean_of(MODES, probabilities).expand(5, -1, -1), MODES, probabilities)
     assert (result["coverage"], result["total_variation"], result["rejected"]) == (0, 1, 1)
-    assert result["sharpness"] == pytest.approx(1)
+    assert result["mode_distance"] == pytest.approx(1)
     modes, third = plain(0.0, 0.49, 1.0), torch.full((3,), 1 / 3)  # it lies beside a mode
     assert classify(mean_of(modes, third)[None], modes, third).tolist() == [REJECTED]
     assert classify(modes, modes, third).tolist() == [0, 1, 2]

@@ -13,8 +13,6 @@ import runpy
 import sys
 from dataclasses import replace
 from functools import partial
-from importlib.machinery import ModuleSpec
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -178,19 +176,11 @@ def pretend_a_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
 
 
-def pretend_gsplat(monkeypatch: pytest.MonkeyPatch, folder: Path, **constants: float) -> None:
-    """An empty gsplat in a folder whose files state these constants, or none."""
-    package, spec = ModuleType("gsplat"), ModuleSpec("gsplat", None, is_package=True)
-    spec.submodule_search_locations = [str(folder)]
-    package.__dict__.update(__version__="9", __spec__=spec, rasterization=None)
+def pretend_gsplat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty gsplat."""
+    package = ModuleType("gsplat")
+    package.__dict__.update(__version__="9", rasterization=None)
     monkeypatch.setitem(sys.modules, "gsplat", package)
-    (folder / "cuda").mkdir(exist_ok=True)
-    if constants:
-        lines = [f"{name} = {value!r}" for name, value in constants.items()]
-        (folder / "cuda/_constants.py").write_text("\n".join(lines))
-
-
-RELEASE_1_6 = {"MAX_ALPHA": 0.99, "ALPHA_THRESHOLD": 1.0 / 255.0, "TRANSMITTANCE_THRESHOLD": 1e-4}
 
 
 draw = partial(degenerate_gaussians.draw, followed=("world_to_camera",))
@@ -319,19 +309,19 @@ def test_refused_calls(front_end: list) -> None:
         ({"near_plane": 0.0}, "near_plane of at least"),
     ],
 )
-def test_refused_constants(changes: dict, message: str, monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+def test_refused_constants(changes: dict, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     pretend_a_device(monkeypatch)
-    pretend_gsplat(monkeypatch, tmp_path)
+    pretend_gsplat(monkeypatch)
     CudaRasterizer(RenderingConstants(blur=0.1, near_plane=1.0))
     with pytest.raises(CompleteSplatError, match=message):
         CudaRasterizer(RenderingConstants(**changes))
 
 
-@pytest.mark.parametrize(("stated", "max_alpha", "other"), [({}, 0.999, 0.99), (RELEASE_1_6, 0.99, 0.999)])
-def test_all_backends_take_the_constants_of_the_installed_gsplat(stated, max_alpha, other, monkeypatch, tmp_path):
+def test_all_backends_take_the_constants_of_gsplats_kernels(monkeypatch):
     """A run that was trained with others keeps them: `cuda` refuses, the others draw with them."""
+    max_alpha, other = 0.999, 0.99
     pretend_a_device(monkeypatch)
-    pretend_gsplat(monkeypatch, tmp_path, **stated)
+    pretend_gsplat(monkeypatch)
     configured = instantiate(compose_config("fit", "rasterizer=cuda").rasterizer.constants)
     assert configured == RenderingConstants() == CudaRasterizer().constants
     assert configured.max_alpha == max_alpha

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from completesplat.errors import CompleteSplatError
-from completesplat.results.paper_figures import tables
-from completesplat.results.runs import find
+from completesplat.results.paper_figures import published_tables
+from completesplat.results.runs import find_results
 from completesplat.results.tables import SSIM_NOTE, Table
 
 HYDRANTS = {"name": "co3d", "data_set": "co3d/hydrant", "resolution": 128, "image_size": 128, "scenes": 77}
@@ -25,7 +25,7 @@ PAPERS = ["full_images", "realestate10k", "ablations", "objects_only"]
 
 
 def made(runs) -> dict[str, Table]:
-    return {table.name: table for table in tables(find(runs))}
+    return {table.name: table for table in published_tables(find_results(runs))}
 
 
 def texts(table: Table) -> list[dict[str, str]]:
@@ -40,7 +40,7 @@ def ours(table: Table) -> list[dict[str, str]]:
 
 
 def test_a_run_by_the_papers_protocol_stands_below_its_rows_in_its_own_columns(runs, run) -> None:
-    alone = tables(None)
+    alone = published_tables(None)
     assert [table.name for table in alone] == PAPERS
     assert not any(ours(table) for table in alone)
     run("a", 17.456, **HYDRANTS)
@@ -158,23 +158,30 @@ def test_a_broken_or_foreign_file_is_left_out_with_a_line(runs, run, content, re
     run("good", 20.0)
     (runs / "bad").mkdir()
     (runs / "bad/metrics.json").write_text(content)
-    tree = find(runs)
+    tree = find_results(runs)
     (warning,) = tree.warnings
     assert warning.startswith(f"{runs / 'bad/metrics.json'}: left out, ")
     assert reason in warning
     assert "\n" not in warning
-    assert len(tables(tree)) == len(PAPERS) + 1
+    assert len(published_tables(tree)) == len(PAPERS) + 1
 
 
 def test_a_folder_without_results_is_refused_with_what_makes_them(runs) -> None:
     with pytest.raises(CompleteSplatError, match="completesplat test"):
-        tables(find(runs))
+        published_tables(find_results(runs))
     with pytest.raises(CompleteSplatError, match="no such folder"):
-        find(runs / "nowhere")
+        find_results(runs / "nowhere")
 
 
 def test_hidden_modes_have_a_table_of_their_own_unless_a_protocol_is_missing(runs) -> None:
-    scores = {"coverage": 0.5, "total_variation": 0.25, "sharpness": 1.0, "rejected": 0.125, "scenes": 4, "samples": 32}
+    scores = {
+        "coverage": 0.5,
+        "total_variation": 0.25,
+        "mode_distance": 1.0,
+        "rejected": 0.125,
+        "scenes": 4,
+        "samples": 32,
+    }
     protocol = {"scenes": ["x", "y"], "method": "LatentDiffusion", "samples": 32, "data_fingerprint": "f00d"}
     for name in ("a", "b", "lacking"):
         (runs / name).mkdir()
@@ -182,7 +189,7 @@ def test_hidden_modes_have_a_table_of_their_own_unless_a_protocol_is_missing(run
         (runs / name / "hidden_modes.json").write_text(json.dumps(modes))
         (runs / name / "protocol.json").write_text(json.dumps(protocol))
     (runs / "lacking/protocol.json").unlink()
-    assert "does not say how it was measured" in find(runs).warnings[0]
+    assert "does not say how it was measured" in find_results(runs).warnings[0]
     table = made(runs)["hidden_modes_1"]
     rows = ours(table)
     assert table.title == "Hidden modes, data f00d"
@@ -230,4 +237,4 @@ def test_a_sweep_stands_below_the_papers_rows_by_protocol(runs, job) -> None:
 def test_a_sweep_without_ablations_counts_as_single_runs(runs, job) -> None:
     job("nothing_of_the_paper", 0, 20.0)
     job("nothing_of_the_paper", 1, 21.0)
-    assert [table.name for table in tables(find(runs))] == [*PAPERS, "own_1"]
+    assert [table.name for table in published_tables(find_results(runs))] == [*PAPERS, "own_1"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from completesplat.commands import conf_folder
-from completesplat.results.paper_figures import SIGNS, PublishedTable, parse, published
+from completesplat.results.paper_figures import SIGNS, PublishedTable, parse_cell, printed_rows, published, scored
 from completesplat.results.tables import BLANK, Cell
 
 ENVIRONMENT = re.compile(r"\\begin\{table(\*?)\}.*?\\end\{table\1\}", re.DOTALL)
@@ -46,7 +46,7 @@ def figure(cell: str) -> Cell:
     marks = [mark for mark, pattern in MARKED.items() if pattern.search(cell)]
     for pattern in (re.compile(r"~?\\cite\{[^}]*\}"), *MARKED.values()):
         cell = pattern.sub("", cell)
-    return parse(" ".join([re.sub(r"[{}]", "", cell).replace(r"\#", "#"), *marks]))
+    return parse_cell(" ".join([re.sub(r"[{}]", "", cell).replace(r"\#", "#"), *marks]))
 
 
 def _body(table: str) -> str:
@@ -94,7 +94,7 @@ def differences(table: PublishedTable, paper_text: str) -> list[str]:
     printed = grid(latex, "PSNR") if latex else None
     if printed is None:
         return [*wrong, f"{table.name}: the paper has no table of PSNR labelled {table.label}"]
-    typed = [[column.heading for column in table.columns], *table.rows]
+    typed = [[column.heading for column in table.columns], *printed_rows(table)]
     for row, other in zip_longest(typed, [printed[0], *printed[1]], fillvalue=()):
         pairs = (pair for pair in zip_longest(row, other) if pair[0] != pair[1])
         wrong += [f"{table.name}: {ours}, the paper prints {theirs}" for ours, theirs in pairs]
@@ -112,11 +112,11 @@ def test_the_published_figures_are_typed_as_the_paper_prints_them() -> None:
 
 def test_every_table_is_complete() -> None:
     for known in published():
-        assert all(len(row) == len(known.columns) for row in known.rows)
-        assert all(data_set for *_, data_set in known.scored)
-        text = " ".join(cell.text for row in known.rows for cell in row)
+        assert all(len(row) == len(known.columns) for row in printed_rows(known))
+        assert all(data_set for *_, data_set in scored(known))
+        text = " ".join(cell.text for row in printed_rows(known) for cell in row)
         signs = {name for name, sign in SIGNS.items() if sign in text}
-        assert signs == set(known.legend)
+        assert signs == set(known.get("legend", {}))
     assert len({known.place for known in published()}) == len(published()) == 4
 
 
@@ -126,6 +126,6 @@ def names(*folders: str) -> set[str]:
 
 def test_every_protocol_of_a_table_is_there_and_every_ablation_that_a_sweep_can_name_is_a_row() -> None:
     assert {name for known in published() for name in known.evaluations} <= names("evaluation")
-    (ablations,) = (known for known in published() if known.options)
-    assert set(ablations.options.values()) == {row[0].text for row in ablations.rows}
+    (ablations,) = (known for known in published() if known.get("options"))
+    assert set(ablations.options.values()) == {row[0].text for row in printed_rows(ablations)}
     assert names("ablation") <= set(ablations.options) <= names("ablation", "model")

@@ -18,9 +18,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from completesplat.results.machine import machine
-from completesplat.results.measured import time_cell
-from completesplat.results.sweeps import IDENTITY, SweepRow, figures, summarize, write_summary
-from completesplat.results.tables import SSIM_NOTE, as_markdown, escape, show
+from completesplat.results.measured import Entry, score_rows, time_cell
+from completesplat.results.sweeps import IDENTITY, summarize, write_summary
+from completesplat.results.tables import SSIM_NOTE, Notes, as_markdown, escape, show
 
 FILES = ["summary.csv", "summary.md", "summary.tex"]
 PSNR = "full_novel_psnr"
@@ -97,7 +97,7 @@ def test_naive_predictors_are_averaged(sweep) -> None:
     other = sweep.scored("seed=1", psnr=20.0) / "metrics.json"
     other.write_text(other.read_text().replace("15.0", "17.0"))
     rows = summarize(sweep.folder)[0]
-    assert [(row.seeds, row.steps, row.scenes, row.means[PSNR]) for row in rows[1:]] == [
+    assert [(row.seeds, row.steps, row.scenes, row.scores[PSNR]) for row in rows[1:]] == [
         (None, None, 40, psnr) for psnr in (16, 12)
     ]
 
@@ -144,12 +144,15 @@ def test_jobs_that_differ_in_seed_or_order_alone_make_one_row_with_the_name_of_t
     assert named(sweep) == ["all"]
 
 
-def scored(means: list[Any], column: str = PSNR, naive: int = 0, **changes: Any) -> list[SweepRow]:
-    """One row for each mean; the last `naive` of them without seeds."""
+def scored(means: list[Any], column: str = PSNR, naive: int = 0, **changes: Any) -> list[Entry]:
+    """One entry for each mean; the last `naive` of them are of a naive predictor."""
     scores = [{} if mean is None else {column: mean} for mean in means]
-    seeds = [2] * (len(means) - naive) + [None] * naive
-    return [SweepRow("x", n, 9, 9, **{"upper_bound": False, "means": m, "deviations": {}} | changes)
-            for n, m in zip(seeds, scores, strict=True)]  # fmt: skip
+    kinds = ["model"] * (len(means) - naive) + ["mean_image"] * naive
+    return [Entry("x", each, 9, kind, **changes) for each, kind in zip(scores, kinds, strict=True)]
+
+
+def marks_of(rows: list[Entry], column: str = PSNR) -> list[str]:
+    return [row.cells[0].mark for row in score_rows(rows, [], [(column, None)], Notes(), marked=True)]
 
 
 @pytest.mark.parametrize(
@@ -164,12 +167,12 @@ def scored(means: list[Any], column: str = PSNR, naive: int = 0, **changes: Any)
     ],
 )
 def test_best_and_second_best_follow_the_metrics_direction(column, means, expected) -> None:
-    assert [cells[0].mark for cells in figures(scored(means, column), [column])] == expected
+    assert marks_of(scored(means, column), column) == expected
 
 
 def test_naive_predictors_and_upper_bounds_do_not_compete() -> None:
     rows = [*scored([30.0], upper_bound=True), *scored([20.0, 21.0, 25.0, 21.0], naive=2)]
-    assert [cells[0].mark for cells in figures(rows, [PSNR])] == ["", "second", "best", "", ""]
+    assert marks_of(rows) == ["", "second", "best", "", ""]
 
 
 def test_times_are_in_the_units_of_the_paper() -> None:
@@ -191,7 +194,7 @@ def test_all_files_have_means_deviations_marks_and_remarks(ablations) -> None:
     assert m1[:4] == ["m1", "3", "40", "<ins>20.50 ± 0.66</ins>"]
     assert no_skips[3:5] == ["19.00 ± 0.66", "0.685 ± 0.000"]
     assert full[3:6] == ["**22.50 ± 0.66**", "**0.720 ± 0.000**", "**20.50 ± 0.66**"]
-    assert mean_image == ["mean_image", "", "40", "15.00", "", "", "", ""]
+    assert mean_image == ["mean_image", "", "40", "15.00", "", ""]
     assert copy_reference[3] == "12.00"
     assert r"no\_skips & 3 & 40 & 19.00 $\pm$ 0.66 & " in tex
     assert r"\textbf{22.50 $\pm$ 0.66}" in tex
@@ -237,7 +240,7 @@ def test_jobs_in_nested_folders_are_found(sweep) -> None:
         (sweep.folder / name).rename(sweep.folder / place)
     (sweep.folder / "silent/below").mkdir(parents=True)  # ended before it could write its record
     rows, _ = summarize(sweep.folder)
-    assert (rows[0].seeds, rows[0].means[PSNR]) == (2, 20.5)
+    assert (rows[0].seeds, rows[0].scores[PSNR]) == (2, 20.5)
     assert remarks(sweep)[:2] == ["2 of 4 jobs have finished.", "Not finished: x/2; silent."]
 
 

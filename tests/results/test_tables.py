@@ -5,18 +5,19 @@ import re
 
 import pytest
 
-from completesplat.results.paper_figures import published, tables
-from completesplat.results.runs import find
+from completesplat.results.measured import evaluation_table
+from completesplat.results.paper_figures import printed_rows, published, published_tables
+from completesplat.results.runs import find_results
 from completesplat.results.tables import (
     BLANK,
     SHARPNESS_NOTE,
     SSIM_NOTE,
+    Heading,
     as_latex,
     as_markdown,
     escape,
-    evaluation_table,
+    records_table,
     show,
-    table,
     write_tables,
 )
 
@@ -27,7 +28,7 @@ def written(runs, run, tmp_path):
     whole |= {"protocol_views": "reference: a sequence's first frame; targets: its other frames"}
     run("a", 17.123456, name="co3d", data_set="co3d/hydrant", resolution=128, **whole)
     run("b_100%|", 20.0)
-    made = tables(find(runs))
+    made = published_tables(find_results(runs))
     write_tables(made, tmp_path / "out")
     return made, tmp_path / "out"
 
@@ -73,7 +74,7 @@ def test_all_files_have_the_published_figures_as_printed_and_the_csv_all_digits_
         lines = list(csv.DictReader(file))
     for known in published():
         texts = {line["text"] for line in lines if line["table"] == known.name and line["source"] == "paper"}
-        for cell in (cell for row in known.rows for cell in row):
+        for cell in (cell for row in printed_rows(known) for cell in row):
             assert cell.text in markdown
             assert escape(cell.text) in latex
             assert cell.text in texts or cell.text == BLANK
@@ -96,7 +97,8 @@ def test_latex_prints_special_characters_literally() -> None:
 
 
 def test_missing_entries_of_records_stay_empty(capsys) -> None:
-    shown = table("Title", [("name", "name", ""), ("figure", "figure", ".1f")], [{"name": "[red]"}, {"figure": 1.25}])
+    columns = {"name": Heading("name", figures=False), "figure": Heading("figure", form=".1f")}
+    shown = records_table("Title", [{"name": "[red]"}, {"figure": 1.25}], columns)
     assert [[cell.text for cell in row.cells] for row in shown.rows] == [["[red]", ""], ["", "1.2"]]
     show(shown)
     assert "[red]" in capsys.readouterr().out

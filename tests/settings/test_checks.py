@@ -7,7 +7,7 @@ from support import compose_config, refused
 
 from completesplat.cli import VERBS
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.checks import check_image_size, check_parts, check_verb
+from completesplat.settings.checks import check_image_size, check_parts, check_verb, complete_task
 
 WHOLE, NUMBER = "must be a whole number", "must be a number"
 ODD = [
@@ -67,6 +67,16 @@ def test_a_wrong_value_is_refused_with_the_allowed_values(verb, setting, message
 def test_the_defaults_of_each_verb_pass_the_checks(chosen):
     verb = chosen.partition("_")[0]
     check_verb(verb, compose_config(verb, *([chosen] if "=" in chosen else [])))
+
+
+def test_a_task_takes_the_settings_that_its_function_names_unless_it_states_another_value():
+    report, prepare = compose_config("report", "report_task=depth"), compose_config("data", "data_task=prepare")
+    report.far_degrees, prepare.data.on_bad, prepare.codec = 60, "raise", "png"
+    for config in (report, prepare):
+        complete_task(config)
+        assert not {"out", "verb", "description"} & config.task.keys()
+    assert (report.task.far_degrees, report.task.scenes) == (60, report.scenes)
+    assert (prepare.task.codec, prepare.task.on_bad) == ("png", "raise")
 
 
 def test_stage_2_needs_image_sizes_that_are_multiples_of_32():

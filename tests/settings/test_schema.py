@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, TypedDict
 import pytest
 
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.schema import Entries, Natural, OneOf, Positive, Range, check_settings
+from completesplat.settings.schema import Entries, Natural, Positive, Range, check_settings
 
 
 class Part(TypedDict):
@@ -18,7 +18,7 @@ def task(
     share: Annotated[float, Range(0, 1)],
     flag: bool,
     kind: Literal["a", "b"] | None,
-    words: Annotated[Sequence[Annotated[str, OneOf(("x", "y"))]], Entries(1)],
+    words: Annotated[Sequence[Literal["x", "y"]], Entries(1)],
     workers: Natural | None,
     by_name: Mapping[str, Sequence[Positive]],
     part: Part | Literal[False],

@@ -10,7 +10,7 @@ import torch
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.metrics.proper_scores import energy_score
 from completesplat.scene import SceneBatch, Views
-from completesplat.studies.calibration import energies, plot_calibration, rows
+from completesplat.studies.calibration import calibration_rows, energies, plot_calibration
 from completesplat.studies.samples import SampleRenderer
 
 SIZE, SAMPLES = 32, 8
@@ -42,7 +42,7 @@ class Normal(SampleRenderer):
 
 
 def measured(scale: float, samples: int = SAMPLES):
-    full, hidden = rows(Normal(None, None, 0.5, samples, 0, scale), [scene(0), scene(1)], lambda _: None)
+    full, hidden = calibration_rows(Normal(None, None, 0.5, samples, 0, scale), [scene(0), scene(1)], lambda _: None)
     assert (full["region"], full["scenes"], hidden["region"], hidden["scenes"]) == ("full", 2, "hidden", 2)
     return full, hidden
 
@@ -81,7 +81,7 @@ def test_the_energy_score_does_not_depend_on_the_number_of_samples():
 
 
 def test_samples_without_spread_have_a_figure(tmp_path):
-    results = rows(Normal(None, None, 0.5, 2, 0, 0.0), [scene(0)], lambda _: None)
+    results = calibration_rows(Normal(None, None, 0.5, 2, 0, 0.0), [scene(0)], lambda _: None)
     assert [row["spread"] for row in results] == [0, 0]
     plot_calibration(results, tmp_path / "calibration.png", "title")
     assert imageio.imread(tmp_path / "calibration.png").ndim == 3

@@ -12,7 +12,7 @@ from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch, Views
-from completesplat.studies.depth import color_deviation, deviation, deviations, rows, strips
+from completesplat.studies.depth import color_deviation, depth_rows, depth_strips, deviation, deviations
 from completesplat.studies.samples import SampleRenderer
 from completesplat.tensors import stack
 
@@ -66,7 +66,7 @@ def test_deviation_is_numpys_over_the_samples_that_see_something():
 
 
 def test_a_shift_in_depth_is_its_deviation_in_the_reference_view():
-    free, faithful = rows(renderer(), SETTINGS, [scene()], 90, lambda _: None)
+    free, faithful = depth_rows(renderer(), SETTINGS, [scene()], 90, lambda _: None)
     for name in ("reference", "reference_object"):
         assert free[f"{name}_deviation"] == pytest.approx(0.5, abs=1e-3)
         assert faithful[f"{name}_deviation"] == pytest.approx(0, abs=1e-5)
@@ -104,7 +104,7 @@ def test_hidden_pixels_are_not_measured():
 
 def test_a_row_shows_the_truth_some_samples_from_behind_and_where_all_disagree():
     batch = scene()
-    (row,) = strips(renderer(samples=3), [batch], 0.0, 0.5, shown=2)
+    (row,) = depth_strips(renderer(samples=3), [batch], 0.0, 0.5, shown=2)
     images = torch.stack([cell.image for cell in row])
     assert torch.equal(images[:2], torch.stack([batch.reference.images[0], batch.all_views().images[0, 2]]))
     # From behind, the second sample is nearer: brighter on the scale that both share.

@@ -58,7 +58,7 @@ def measured(modes: list[int], scenes=SCENES):
 
 def test_constructed_predictors_have_their_scores():
     perfect = measured([0, 1, 2, 3]).results(SAMPLES)
-    full = {"coverage": 1, "total_variation": 0, "sharpness": 0, "rejected": 0, "scenes": 2, "samples": SAMPLES}
+    full = {"coverage": 1, "total_variation": 0, "mode_distance": 0, "rejected": 0, "scenes": 2, "samples": SAMPLES}
     assert {name: value for name, value in perfect["model"].items() if "energy" not in name} == full
     # The truth is one of the samples' four modes: less than always another one, and than their mean.
     other, mean = measured([2]).results(SAMPLES)["model"], perfect["mean_predictor"]
@@ -66,11 +66,11 @@ def test_constructed_predictors_have_their_scores():
     assert perfect["model"]["energy_visible"] == pytest.approx(0, abs=1e-12)
     collapsed = measured([2]).results(SAMPLES)["model"]
     assert (collapsed["coverage"], collapsed["total_variation"]) == (1 / MODES, 1 - 1 / MODES)
-    assert (collapsed["sharpness"], collapsed["rejected"]) == (0, 0)
+    assert (collapsed["mode_distance"], collapsed["rejected"]) == (0, 0)
     mean, true = perfect["mean_predictor"], perfect["true_sampler"]
     assert (mean["coverage"], mean["total_variation"], mean["rejected"]) == (0, 1, 1)
-    assert mean["sharpness"] == pytest.approx(1)
-    assert (true["sharpness"], true["rejected"]) == (0, 0)
+    assert mean["mode_distance"] == pytest.approx(1)
+    assert (true["mode_distance"], true["rejected"]) == (0, 0)
     assert 0 < true["total_variation"] < 0.6
 
 

@@ -12,7 +12,7 @@ from completesplat.errors import CompleteSplatError, DataError
 from completesplat.generator import CompleteSplat
 from completesplat.scene import SceneBatch
 from completesplat.studies import noise_levels
-from completesplat.studies.noise_levels import LEVELS, rows, scenes_in_all_modes
+from completesplat.studies.noise_levels import LEVELS, noise_level_rows, scenes_in_all_modes
 
 MODES, SHAPE, DISTANCE = 4, (2, 4, 4), 6.0
 LATENTS = DISTANCE / 2**0.5 * torch.eye(MODES, 32).view(MODES, *SHAPE)  # all at this distance from one another
@@ -38,7 +38,7 @@ def table(monkeypatch: pytest.MonkeyPatch, estimate) -> list[dict[str, float]]:
     model.sampler = Sampler(FlowMatchEulerDiscreteScheduler(num_train_timesteps=1000), steps=20)
     certain = Posterior(LATENTS, torch.full_like(LATENTS, -30.0))
     monkeypatch.setattr(noise_levels, "standardised", lambda model, versions: certain)
-    return rows(model, [scene_batch(), scene_batch()], draws=50, seed=0)
+    return noise_level_rows(model, [scene_batch(), scene_batch()], draws=50, seed=0)
 
 
 def test_an_exact_denoiser_has_the_best_share(monkeypatch):

@@ -12,7 +12,7 @@ from support import compose_config
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from completesplat.commands.plan import counted, untrained
+from completesplat.commands.plan import counted, without_weights
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.optimization import constant
 from completesplat.training.stage import Stage
@@ -104,7 +104,7 @@ def test_a_forward_pass_on_a_gpu_finds_all_tensors_there_and_keeps_what_is_count
     experiment: str, pretended_gpu: None
 ) -> None:
     config = compose_config("plan", f"experiment={experiment}")
-    copied = untrained(config)
+    copied = without_weights(config)
     copied.rasterizer = {"_target_": "completesplat.training.step_counts.StoreOnly", "gpu": True}
     batch, live = 4, LiveMemory()
     with sdpa_kernel(SDPBackend.MATH):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -28,7 +28,7 @@ from completesplat.data.placement import ObjectFraming
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import TooFewFrames, at
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.settings.schema import Natural, OneOf, Positive, Range, Share, Side, check_value, hints_of
+from completesplat.settings.schema import Natural, Positive, Range, Share, Side, check_value, hints_of
 
 MOST_WORKERS = 4  # if data.workers is null
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
@@ -88,7 +88,7 @@ class SceneDataModule(LightningDataModule):
         workers: Annotated[int, Range(0, 256)] | None = 0,
         cache: bool = False,
         latent_cache: str | None = None,
-        on_bad: Annotated[str, OneOf(("skip", "raise"))] = "skip",
+        on_bad: Literal["skip", "raise"] = "skip",
         max_bad_fraction: Share = 0.1,
         allow_changed: bool = False,
         seed: Natural = 0,

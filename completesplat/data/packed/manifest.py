@@ -1,12 +1,11 @@
 """Manifest of a packed store (`manifest.json`, which is written last); the reader of any manifest."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from types import UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TypeVar
 
-from completesplat.data.validation import BadAnnotation, UnreadableFile, at, field, read_json
+from completesplat.data.validation import BadAnnotation, UnreadableFile, at, field, parsed, read_json
 from completesplat.errors import DataError
 
 MANIFEST = "manifest.json"
@@ -98,27 +97,6 @@ def read_as(kind: type[T], path: Path, header: Mapping[str, str | int], remedy: 
                 raise UnreadableFile(f"{key} {stored}, this version reads {readable}: {remedy}")
         manifest: T = parsed(kind, content)
         return manifest
-
-
-def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
-    """Convert a JSON value to `kind`, a dataclass, tuple, dictionary, union or plain type.
-
-    Raises:
-        BadAnnotation: the value has another type (true is no `int`), or a field is missing.
-    """
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin is tuple and type(value) is list:
-        return tuple(parsed(arguments[0], item, name) for item in value)
-    if origin is dict and type(value) is dict:
-        return {key: parsed(arguments[1], item, key) for key, item in value.items()}
-    if isinstance(kind, type) and is_dataclass(kind) and type(value) is dict:
-        hints = get_type_hints(kind)
-        if missing := hints.keys() - value.keys():
-            raise BadAnnotation(f"no {', '.join(sorted(missing))} in {name}")
-        return kind(**{key: parsed(hint, value[key], key) for key, hint in hints.items()})
-    if type(value) in (arguments if origin is UnionType else (kind,)):
-        return value
-    raise BadAnnotation(f"{name} must be {getattr(kind, '__name__', kind)}, not of type {type(value).__name__}")
 
 
 def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSou
 from completesplat.data.validation import at, refused_to, require_file
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import crop_resize
-from completesplat.settings.schema import Natural, OneOf, Positive, Share
+from completesplat.settings.schema import Natural, Positive, Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 
@@ -125,7 +125,7 @@ class RE10KDataModule(SceneDataModule):
         evaluation_gap: Positive | None = None,
         evaluation_index: str | None = None,
         scene_list: str | None = None,
-        crop: Annotated[str, OneOf(("center", "principal"))] = "center",
+        crop: Literal["center", "principal"] = "center",
         near: float = 0.7,
         far: float = 10.0,
         scale: float = 1.0,

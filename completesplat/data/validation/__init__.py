@@ -5,9 +5,11 @@ import os
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import is_dataclass
 from gzip import GzipFile
 from pathlib import Path, PurePath, PureWindowsPath
-from typing import Any, NoReturn, TypeVar
+from types import UnionType
+from typing import Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from jaxtyping import Float
@@ -157,14 +159,34 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
 
 def field(entry: object, key: str, kind: type[T]) -> T:
-    """Return a value of a JSON object, or refuse one that is missing or has another type than `kind`."""
+    """Return a value of a JSON object as `parsed` converts it, or refuse one that is missing."""
+    value: T = parsed(kind, _entry(entry, key), key)
+    return value
+
+
+def _entry(entry: object, key: str) -> object:
     if type(entry) is not dict or key not in entry:
         raise BadAnnotation(f"no {key} in {printable(repr(entry), SHORT)}")
-    value = entry[key]
-    # `isinstance` would take true for an integer.
-    if type(value) is not kind:
-        raise BadAnnotation(f"{key} must be of type {kind.__name__}, not {printable(repr(value), SHORT)}")
-    return value
+    return entry[key]
+
+
+def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
+    """Convert a JSON value to `kind`, a dataclass, tuple, dictionary, union or plain type.
+
+    Raises:
+        BadAnnotation: the value has another type (true is no `int`), or a field is missing.
+    """
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is tuple and type(value) is list:
+        return tuple(parsed(arguments[0], item, name) for item in value)
+    if origin is dict and type(value) is dict:
+        return {key: parsed(arguments[1], item, key) for key, item in value.items()}
+    if isinstance(kind, type) and is_dataclass(kind) and type(value) is dict:
+        return kind(**{key: parsed(hint, _entry(value, key), key) for key, hint in get_type_hints(kind).items()})
+    if type(value) in (arguments if origin is UnionType else (kind,)):
+        return value
+    shown = printable(repr(value), SHORT)
+    raise BadAnnotation(f"{name} must be of type {getattr(kind, '__name__', kind)}, not {shown}")
 
 
 def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:

@@ -106,7 +106,7 @@ def check(
     )
 
 
-def show(findings: Findings) -> None:
+def show_findings(findings: Findings) -> None:
     """Print errors by kind, with the first few of each, and the numbers of usable sequences and frames."""
     console = Console(width=None if Console().is_terminal else 120)
     if findings.refused:
