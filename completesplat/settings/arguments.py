@@ -15,8 +15,11 @@ from completesplat.settings.options import TASKS, did_you_mean, groups, options
 EXPORT = "--export"
 WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--info", "-i", "--config-dir", "-cd")
 """Hydra's flags that take the next argument as their value."""
-ALONE = ("--help", "-h", "--hydra-help", "--version", "--resolve", "--run", "-r", "--multirun", "-m")
-ALONE = (*ALONE, "--shell-completion", "-sc", "--config-path", "-cp", "--experimental-rerun")
+ALONE = (
+    *("--help", "-h", "--hydra-help", "--version", "--resolve", "--run", "-r", "--multirun", "-m"),
+    *("--shell-completion", "-sc", "--config-path", "-cp", "--experimental-rerun"),
+)
+"""Hydra's other flags."""
 INFO, CFG = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"), ("job", "hydra", "all")
 CHOICES = {"--info": INFO, "-i": INFO, "--cfg": CFG, "-c": CFG}
 DASHES = (
