@@ -5,6 +5,7 @@ import os
 import re
 import sys
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
@@ -53,13 +54,7 @@ def launch(verb: str, arguments: list[str]) -> None:
     logging.raiseExceptions = False
     arguments = for_hydra(verb, arguments)
     sweep = any(flag in arguments for flag in SWEEP)
-    if sweep and any(argument.startswith(("--cfg=", "-c=", "--info=", "-i=")) for argument in arguments):
-        raise CompleteSplatError("--cfg and --info show the settings of one run: leave out -m")
-    if jobs.one_of_several() and sweep:
-        message = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
-        raise CompleteSplatError(message)
-    if jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):
-        raise CompleteSplatError("torchrun or srun started several processes of this run: give them one out=DIR")
+    _check_together(arguments, sweep)
     sys.argv = [f"completesplat {verb}", *arguments, *(sweep_arguments(verb, arguments) if sweep else [])]
     failures: list[Exception] = []
 
@@ -77,6 +72,17 @@ def launch(verb: str, arguments: list[str]) -> None:
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=verb)(job)()
     if failures:
         raise failures[0]
+
+
+def _check_together(arguments: Sequence[str], sweep: bool) -> None:
+    """Raise CompleteSplatError if a sweep or a launcher of processes does not go with the arguments."""
+    if sweep and any(argument.startswith(("--cfg=", "-c=", "--info=", "-i=")) for argument in arguments):
+        raise CompleteSplatError("--cfg and --info show the settings of one run: leave out -m")
+    if jobs.one_of_several() and sweep:
+        message = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
+        raise CompleteSplatError(message)
+    if jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):
+        raise CompleteSplatError("torchrun or srun started several processes of this run: give them one out=DIR")
 
 
 def _join_job(verb: str, argument: str) -> None:

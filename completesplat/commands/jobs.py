@@ -188,27 +188,43 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
         return False
     if config["ckpt_path"] != "last":
         raise CompleteSplatError(f"{out} holds a run: continue it with ckpt_path=last, or choose another out=DIR")
-    different = _differences(OmegaConf.to_container(OmegaConf.load(out / CONFIG)), config)
-    if others := {key for key in different if not key.startswith((*MAY_CHANGE, *ENDS))}:
-        other_model = "model._target_" in others
-        # `model` repeats settings from outside it.
-        first = "model" if other_model else min(others, key=lambda key: (key.count("."), key))
+    earlier = OmegaConf.load(out / CONFIG)
+    _refuse_another_run(out, config, earlier, overrides)
+    finished = (out / METRICS).is_file()
+    if finished and _ends(config) != _ends(earlier):
+        _refuse_earlier_end(out, _ends(config), _ends(earlier))
+        return False
+    return finished
+
+
+def _refuse_another_run(out: Path, config: Mapping[str, object], earlier: object, overrides: Sequence[str]) -> None:
+    """Raise CompleteSplatError if a directory's run had settings that a run cannot continue with."""
+    different = _differences(OmegaConf.to_container(earlier), config)
+    others = {key for key in different if not key.startswith((*MAY_CHANGE, *ENDS))}
+    if not others:
+        return
+    other_model = "model._target_" in others
+    # `model` repeats settings from outside it.
+    first = "model" if other_model else min(others, key=lambda key: (key.count("."), key))
+    advice = "choose another out=DIR"
+    if (out / LAST).is_file() and not other_model:
         same = [argument for argument in overrides if not argument.startswith(("out=", "ckpt_path="))]
         again = shlex.join(["completesplat", "fit", *same, f"ckpt_path={out / LAST}", "out=MORE"])
-        continued = (out / LAST).is_file() and not other_model
-        advice = f"continue in another folder: {again}" if continued else "choose another out=DIR"
-        raise CompleteSplatError(f"{out} holds a run with another {first}: {advice}")
-    finished, ends, earlier = (out / METRICS).is_file(), _ends(config), _ends(OmegaConf.load(out / CONFIG))
-    if not finished or ends == earlier:
-        return finished
+        advice = f"continue in another folder: {again}"
+    raise CompleteSplatError(f"{out} holds a run with another {first}: {advice}")
+
+
+def _refuse_earlier_end(out: Path, ends: Mapping[str, Any], earlier: Mapping[str, Any]) -> None:
+    """Raise CompleteSplatError unless a finished run can go on to its new end, which comes after the earlier one."""
     if not (out / LAST).is_file():
         raise CompleteSplatError(f"{out} has no {LAST} to continue from: choose another out=DIR")
-    if 0 <= ends["trainer.max_steps"] <= (steps := json.loads((out / METRICS).read_text())["steps"]):
+    steps = json.loads((out / METRICS).read_text())["steps"]
+    if 0 <= ends["trainer.max_steps"] <= steps:
         raise CompleteSplatError(f"trainer.max_steps={ends['trainer.max_steps']}: {out} has {steps} steps; give more")
-    epochs, before = (end["trainer.max_epochs"] for end in (ends, earlier))
-    if epochs not in (None, -1) and (before in (None, -1) or epochs < before):
+    epochs, before = ends["trainer.max_epochs"], earlier["trainer.max_epochs"]
+    unlimited = (None, -1)
+    if epochs not in unlimited and (before in unlimited or epochs < before):
         raise CompleteSplatError(f"trainer.max_epochs={epochs} may end before the run in {out}: choose another out=DIR")
-    return False
 
 
 def _differences(first: object, second: object, key: str = "") -> set[str]:

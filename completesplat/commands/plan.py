@@ -136,7 +136,8 @@ def seconds_on(config: DictConfig, counts: StepCounts) -> tuple[float, str]:
 def precision(config: DictConfig) -> str:
     """Return Lightning's name of the training's precision; the default is what the GPU supports, not this machine."""
     chosen = str(config.trainer.precision)
-    default = str(config.trainer._get_node("precision")._value()).startswith("${best_precision")
+    unresolved: Any = OmegaConf.to_container(config.trainer)
+    default = str(unresolved["precision"]).startswith("${best_precision")
     return "bf16-mixed" if config.gpu != HERE and (default or chosen.startswith("16")) else chosen
 
 

@@ -24,7 +24,7 @@ from completesplat.data.images.photograph import Photograph, outside_of_box, out
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
-from completesplat.export.prediction import Wanted, write_prediction
+from completesplat.export.prediction import Shot, Wanted, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.files import folder_names, printable, safe_name
 from completesplat.generator import CompleteSplat
@@ -188,7 +188,8 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Wante
     }
     wanted = replace(wanted, background=shown_background(config.background, model))
     rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / safe_name(images[0].stem)
-    write_prediction(folder, views.images[0], [scene], views.cameras[0], rasterizer, model.up, wanted, recorded)
+    shot = Shot(scene, views.cameras[0], model.up)
+    write_prediction(folder, views.images[0], [shot], rasterizer, wanted, recorded)
     print(f"one scene of {len(images)} images, at the posterior's mean: {folder}")
 
 
@@ -231,7 +232,8 @@ def _predict(
     camera = model.camera(photograph)
     if model.background is not None:  # images of objects, whose centre is in the middle of the depth range
         wanted = replace(wanted, pivot_depth=model.middle_depth(model.depth_range_of(photograph)))
-    write_prediction(folder, visible_image, scenes, camera, rasterizer, model.up, wanted, recorded, on_sample)
+    shots = [Shot(scene, camera, model.up) for scene in scenes]
+    write_prediction(folder, visible_image, shots, rasterizer, wanted, recorded, on_sample)
 
 
 def remarks(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]:

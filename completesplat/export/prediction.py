@@ -4,7 +4,7 @@ import json
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -117,13 +117,25 @@ class FileUnits:
         return points / self.scale + torch.tensor(self.origin).sub(torch.tensor(self.offset)).to(points)
 
 
+@dataclass(frozen=True)
+class Shot:
+    """A scene and the camera that it is seen by, both in the world, with the units of its files.
+
+    Attributes:
+        up: direction up in the world, the axis of orbits.
+    """
+
+    scene: Gaussians
+    camera: Cameras
+    up: Float[Tensor, "3"] = field(default_factory=lambda: torch.tensor([0.0, -1.0, 0.0]))
+    units: FileUnits = FileUnits()
+
+
 def write_prediction(
     folder: Path,
     image: Float[Tensor, "3 size size"],
-    scenes: Sequence[Gaussians],
-    reference: Cameras,
+    shots: Sequence[Shot],
     rasterizer: Rasterizer,
-    up: Float[Tensor, "3"],
     wanted: Wanted,
     settings: Mapping[str, Any],
     on_sample: Callable[[], None] = lambda: None,
@@ -131,9 +143,8 @@ def write_prediction(
     """Write `sample_00.ply`, `orbit_00.mp4`, ..., `sheet.png` and `scene.json`.
 
     Args:
-        image, reference: the input image and its camera.
-        scenes: the samples, in the reference camera's frame; broken Gaussians are left out, with a warning.
-        up: direction up in the scene, the axis of the orbits.
+        image: the input image.
+        shots: the samples, all with the image's camera; broken Gaussians are left out, with a warning.
         settings: recorded in `scene.json`; must hold the seed and the image's name.
         on_sample: called after the files of each sample are written.
 
@@ -142,21 +153,21 @@ def write_prediction(
         DiskError: the disk is full, or the folder above `folder` is missing.
     """
     # Refuse samples without intact Gaussians before anything is written.
-    scenes = [cleaned(scene, f"{settings['image']}: sample {i}") for i, scene in enumerate(scenes)]
+    shots = [replace(x, scene=cleaned(x.scene, f"{settings['image']}: sample {i}")) for i, x in enumerate(shots)]
+    scenes, reference = [shot.scene for shot in shots], shots[0].camera
     make_folder(folder)
     views, depths = [], []
     files: dict[str, str] = {}
-    for i, scene in enumerate(scenes):
+    for i, shot in enumerate(shots):
         comments = [*(f"{name} {value}" for name, value in settings.items()), f"sample {i}"]
-        names = f"sample_{i:02}", f"_{i:02}"
-        around, depth, written = write_scene(folder, *names, scene, reference, rasterizer, up, wanted, comments)
+        around, depth, written = write_scene(folder, f"sample_{i:02}", f"_{i:02}", shot, rasterizer, wanted, comments)
         views.append(around)
         depths.append(depth)
         files |= written
         on_sample()
     title = f"{settings['image']}: views around each sample"
     contact_sheet(folder / "sheet.png", title, image, torch.stack(views), torch.stack(depths))
-    recorded = {**settings, "gaussians": [scene.count for scene in scenes], "up": up.tolist()}
+    recorded = {**settings, "gaussians": [scene.count for scene in scenes], "up": shots[0].up.tolist()}
     recorded["colors_clipped"] = [int(beyond_gamut(x.seen_from(reference.centers)).sum()) for x in scenes]
     if "spz" in wanted.formats:
         recorded["left_out_of_spz"] = [int(transparent(scene).sum()) for scene in scenes]
@@ -171,23 +182,18 @@ def write_fitted_scene(
     folder: Path,
     name: str,
     title: str,
-    scene: Gaussians,
-    cameras: Cameras,
+    shot: Shot,
     images: Frames,
     truth: Frames,
     seed: int,
-    units: FileUnits = FileUnits(),
-    up: Sequence[float] = (0.0, -1.0, 0.0),
     more: Mapping[str, str] | None = None,
 ) -> None:
     """Write `scene.ply`, `sheet.png` (true and rendered images of at most 8 views, with PSNR) and `scene.json`.
 
     Args:
         title: heading of the sheet; says what the scene was fitted to.
-        scene: in the world of the cameras.
-        images, truth: rendered and true images of the cameras.
-        units: of the files; an offset is recorded in `scene.json`, and a line says so.
-        up: direction up in the world.
+        shot: the scene and its first view's camera; an offset of its units is recorded, and a line says so.
+        images, truth: rendered and true images of all views.
         more: other files of the scene by purpose, for `scene.json`.
 
     Raises:
@@ -195,14 +201,16 @@ def write_fitted_scene(
     """
     from completesplat.metrics.images import psnr  # `predict` needs no metrics
 
-    stored, reference = units.stored(with_screen_space_dilation(cleaned(scene, name), cameras[0]), cameras[0])
+    units = shot.units
+    dilated = with_screen_space_dilation(cleaned(shot.scene, name), shot.camera)
+    stored, reference = units.stored(dilated, shot.camera)
     write_ply(folder / "scene.ply", stored, [f"scene {name}"])
     indices = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
     rows = [strip(truth[indices].clamp(0, 1), "true"), strip(images[indices].clamp(0, 1), "fitted")]
     scores = psnr(images[indices].clamp(0, 1), truth[indices]).tolist()
     headings = [f"view {i}: {score:.2f} dB" for i, score in zip(indices, scores, strict=True)]
     write_png(folder / "sheet.png", image_sheet(headings, rows, title))
-    settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True, "up": list(up)}
+    settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True, "up": shot.up.tolist()}
     if any(units.offset):
         settings["offset"] = list(units.offset)
         place = ", ".join(f"{coordinate:g}" for coordinate in units.offset)
@@ -215,30 +223,28 @@ def write_scene(
     folder: Path,
     name: str,
     suffix: str,
-    scene: Gaussians,
-    reference: Cameras,
+    shot: Shot,
     rasterizer: Rasterizer,
-    up: Float[Tensor, "3"],
     wanted: Wanted,
     comments: Sequence[str],
-    units: FileUnits = FileUnits(),
 ) -> tuple[Frames, Float[Tensor, "1 height width"], dict[str, str]]:
     """Write a scene's splats (`NAME.ply`, ...) in the units of files, and videos (`orbitSUFFIX.mp4`).
 
     Returns:
         Views around the scene, the first view's depth, and file names by purpose.
     """
+    scene, reference = shot.scene, shot.camera
     pivot = seen_center(rasterizer, scene, reference, wanted.pivot_depth)
     dilated = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
-    stored, camera = units.stored(dilated, reference)
-    view = PageView(camera, units.points(pivot), up, wanted.background)
+    stored, camera = shot.units.stored(dilated, reference)
+    view = PageView(camera, shot.units.points(pivot), shot.up, wanted.background)
     files = write_formats(folder, name, stored, wanted.formats, view, wanted.converter, comments, rasterizer)
     for kind in wanted.videos:
         files[f"{kind}{suffix}"] = f"{kind}{suffix}.mp4"
-        cameras = PATHS[kind](reference, pivot, up, wanted.frames)
+        cameras = PATHS[kind](reference, pivot, shot.up, wanted.frames)
         frames, _ = render_views(rasterizer, scene, cameras, wanted.background)
         write_video(folder / f"{kind}{suffix}.mp4", frames)
-    views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
+    views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, shot.up)
     return views, depths[0], files
 
 

@@ -36,7 +36,8 @@ class Activations(nn.Module):
         outputs = []
         for number, layer in enumerate(self.features, 1):
             images = layer(images)
-            outputs += [images] if number in self.ends else []
+            if number in self.ends:
+                outputs.append(images)
         return outputs
 
 

@@ -1,5 +1,6 @@
 """Content of the folders of runs: results of tests, the jobs of sweeps."""
 
+import itertools
 import json
 import os
 import shlex
@@ -8,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypedDict, cast
 
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
@@ -191,7 +191,7 @@ def _jobs(folder: Path) -> list[Job]:
     jobs = [_job(path, path.relative_to(folder).as_posix()) for path in _job_folders(folder)]
     recorded = [job for job in jobs if job.record]
     known = [job.overrides for job in recorded]
-    waiting = [Job("", overrides) for overrides in map(_pairs, _planned(folder)) if overrides not in known]
+    waiting = [Job("", overrides) for overrides in map(_pairs, planned_jobs(folder)) if overrides not in known]
     # `waiting` also has the jobs that ended before their record, so that many folders without a record are left out.
     silent = [job for job in jobs if not job.record][len(waiting) :]
     return [*recorded, *silent, *waiting]
@@ -206,7 +206,7 @@ def _job_folders(folder: Path) -> Iterator[Path]:
             yield from [job for job in _job_folders(path) if (job / RECORD).is_file()] or [path]
 
 
-def _planned(folder: Path) -> list[list[str]]:
+def planned_jobs(folder: Path) -> list[list[str]]:
     """Return the overrides of all jobs by number.
 
     The list is empty without the `multirun.yaml` that hydra writes when a sweep starts, or if that file does not
@@ -215,11 +215,16 @@ def _planned(folder: Path) -> list[list[str]]:
     if not (folder / PLAN).is_file():
         return []
     arguments = list(OmegaConf.load(folder / PLAN).hydra.overrides.task)
+    values = {}
     try:
-        (jobs,) = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(arguments), None)
+        for override in OverridesParser.create().parse_overrides(arguments):
+            sweep = override.is_sweep_override()
+            texts = list(override.sweep_string_iterator()) if sweep else [override.get_value_element_as_str()]
+            key = override.get_key_element()
+            values[key] = [f"{key}={text}" for text in texts]
     except HydraException:
         return []
-    return jobs
+    return [list(job) for job in itertools.product(*values.values())]
 
 
 def _pairs(overrides: Sequence[str]) -> dict[str, str]:

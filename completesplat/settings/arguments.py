@@ -4,7 +4,6 @@ import os
 import re
 from collections.abc import Sequence
 
-from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
@@ -16,7 +15,13 @@ from completesplat.settings.options import TASKS, did_you_mean, groups, options
 EXPORT = "--export"
 WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--info", "-i", "--config-dir", "-cd")
 """Hydra's flags that take the next argument as their value."""
-FLAGS = {option: action for action in get_args_parser()._actions for option in action.option_strings}
+ALONE = (
+    *("--help", "-h", "--hydra-help", "--version", "--resolve", "--run", "-r", "--multirun", "-m"),
+    *("--shell-completion", "-sc", "--config-path", "-cp", "--experimental-rerun"),
+)
+"""Hydra's other flags."""
+INFO, CFG = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"), ("job", "hydra", "all")
+CHOICES = {"--info": INFO, "-i": INFO, "--cfg": CFG, "-c": CFG}
 DASHES = (
     "settings are key=value without dashes, such as out=DIR, and files are given by their names: "
     "`completesplat predict PHOTO out=DIR`"
@@ -50,7 +55,7 @@ def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
         name, equals, value = argument.partition("=")
         if not name.startswith("-"):
             others.append(argument)
-        elif name in FLAGS and name not in WITH_VALUE:
+        elif name in ALONE:
             flags.append(argument)
         elif name not in (*WITH_VALUE, EXPORT):
             if not equals or not name.startswith("--"):
@@ -60,7 +65,7 @@ def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
             raise CompleteSplatError(f"{name}: lacks its value; give {name} VALUE")
         elif name == EXPORT:
             others.append(f"export={quoted(value)}")
-        elif (choices := FLAGS[name].choices) and value not in choices:  # -i, say, which means an image elsewhere
+        elif value not in CHOICES.get(name, (value,)):  # -i, say, which means an image elsewhere
             raise CompleteSplatError(f"{name} {printable(value, SHORT)}: {DASHES}")
         else:
             flags.append(f"{name}={value}")

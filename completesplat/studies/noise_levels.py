@@ -1,6 +1,7 @@
 """Noise levels at which hidden modes can be told apart, by the denoiser and by the best classifier."""
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -27,10 +28,10 @@ def scenes_in_all_modes(
     """Return the first `count` usable scenes, each in every mode [mode]."""
     versions: list[SceneBatch] = []
     for index in progress(range(len(scenes))):
-        try:
-            versions += [scenes.versions(index)] if len(versions) < count else []
-        except DataError:  # e.g. its reference view shows the mode
-            continue
+        if len(versions) == count:
+            break
+        with suppress(DataError):  # e.g. its reference view shows the mode
+            versions.append(scenes.versions(index))
     if not versions:
         raise CompleteSplatError("no test scene has a hidden part with known modes")
     return versions

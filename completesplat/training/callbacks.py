@@ -5,12 +5,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from statistics import mean
 
 import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
-from lightning.pytorch.profilers import Profiler
 from lightning.pytorch.utilities.types import STEP_OUTPUT
 from rich import get_console
 from rich.progress import TaskID
@@ -22,11 +22,9 @@ from completesplat.data.loading.distributed import gathered, mean_of_processes
 from completesplat.errors import DivergenceError
 from completesplat.scene import Batch
 from completesplat.settings.schema import Positive, Share
-from completesplat.training.stage import Stage, now
+from completesplat.training.stage import Stage
 
 BAD_STEPS = "train/bad_steps"
-FETCHING = "[_TrainingEpochLoop].train_dataloader_next"
-SAVING = "save_checkpoint"
 STATUS = Path("/proc/self/status")
 
 logger = logging.getLogger(__name__)
@@ -198,79 +196,55 @@ def _steps(trainer: Trainer) -> str:
 class Throughput(Callback):
     """Callback that logs speed and memory at the trainer's interval.
 
-    A row covers the steps since the last one. It has `speed/scenes_per_second` of all processes, `speed/data_wait`, the
-    share of the time in which training waited for data, and the values of `memory`; all are means over the processes.
-    The clock stops during validation, while checkpoints are written, and from a row to the next batch. Drawing of
-    images is therefore not counted if its interval is a multiple of the trainer's and this callback comes first.
+    A row has `speed/scenes_per_second` of all processes, `speed/data_wait`, the share of the time in which training
+    waited for data, and the values of `memory`; all are means over the processes. Speeds come from the mean times of a
+    batch and of waiting for one since the last row. Validation, batches before which a checkpoint is written, and what
+    happens between a row and the next batch are left out. There is no `data_wait` if a row has a single batch.
+
+    Lightning's `ThroughputMonitor` does not measure waiting, and makes every batch wait for the GPU.
     """
-
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        self.clock = DataClock(trainer.profiler)  # type: ignore[attr-defined]
-        trainer.profiler = self.clock  # type: ignore[attr-defined]
-        self._forget()
-
-    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        trainer.profiler = self.clock.profiler  # type: ignore[attr-defined]
-
-    def _forget(self) -> None:
-        self.clock.waited, self.clock.saved, self.clock.begin = 0.0, 0.0, None
-        self.scenes, self.paused = 0, 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.step = trainer.global_step
+        self._forget()
+
+    def _forget(self) -> None:
+        self.ended: float | None = None
+        self.waits: list[float] = []
+        self.batches: list[float] = []
+        self.scenes = 0
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
+        self.begun: float | None = time.perf_counter()
+        if self.ended is not None:
+            self.waits.append(self.begun - self.ended)
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: object) -> None:
+        self.begun = None
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.pause = now()
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self.clock.begin is not None:
-            self.paused += now() - self.pause
+        self.ended = None
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
     ) -> None:
-        self.scenes += len(batch.names)
+        self.ended = time.perf_counter()
+        if self.begun is not None:
+            self.batches.append(self.ended - self.begun)
+            self.scenes += len(batch.names)
         stepped, self.step = trainer.global_step != self.step, trainer.global_step
         interval = trainer.log_every_n_steps  # type: ignore[attr-defined]
-        if not stepped or not interval or trainer.global_step % interval or self.clock.begin is None:
+        if not stepped or not interval or trainer.global_step % interval or not self.batches:
             return
-        seconds = now() - self.clock.begin - self.paused - self.clock.saved
-        values = {
-            "speed/scenes_per_second": self.scenes * trainer.world_size / seconds,
-            "speed/data_wait": self.clock.waited / seconds,
-            **memory(pl_module.device),
-        }
+        wait = mean(self.waits) if self.waits else 0.0
+        seconds = mean(self.batches) + wait
+        values = memory(pl_module.device)
+        values["speed/scenes_per_second"] = self.scenes / len(self.batches) * trainer.world_size / seconds
+        if self.waits:
+            values["speed/data_wait"] = wait / seconds
         tensors = {name: torch.tensor(value, device=pl_module.device) for name, value in values.items()}
         pl_module.log_dict(mean_of_processes(tensors), batch_size=len(batch.names))
         self._forget()
-
-
-class DataClock(Profiler):
-    """Profiler that times fetching batches and saving checkpoints, and passes every call on to another profiler."""
-
-    def __init__(self, profiler: Profiler) -> None:
-        super().__init__()
-        self.profiler = profiler
-        self.begin: float | None = None
-        self.waited = self.saved = 0.0
-        for name in ("setup", "describe", "teardown"):
-            setattr(self, name, getattr(profiler, name))
-
-    def start(self, action_name: str) -> None:
-        """Start timing before an action of Lightning."""
-        if action_name in (FETCHING, SAVING):
-            self.since = time.perf_counter()
-        if action_name == FETCHING and self.begin is None:
-            self.begin = self.since
-        self.profiler.start(action_name)
-
-    def stop(self, action_name: str) -> None:
-        """Stop timing after an action of Lightning."""
-        self.profiler.stop(action_name)
-        if action_name == FETCHING:
-            self.waited += time.perf_counter() - self.since
-        elif action_name == SAVING and self.begin is not None:
-            self.saved += time.perf_counter() - self.since
 
 
 def memory(device: torch.device) -> dict[str, float]:

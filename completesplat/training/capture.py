@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,7 +29,7 @@ from completesplat.data.packed.manifest import is_packed
 from completesplat.data.sequences import PosedSequence, shortened
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED
-from completesplat.export.prediction import FileUnits, Wanted, write_fitted_scene, write_scene
+from completesplat.export.prediction import FileUnits, Shot, Wanted, write_fitted_scene, write_scene
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -206,15 +205,15 @@ class CaptureFit(Stage):
         poses = cameras.world_to_camera @ sequence.cameras.world_to_camera[0].to(cameras.world_to_camera)
         placed, up = replace(cameras, world_to_camera=poses), normalize(-poses[:, 1, :3].mean(0), dim=-1)
         self.scene_folder.mkdir(parents=True, exist_ok=True)
-        write = partial(write_scene, self.scene_folder, "scene", "", scene, placed[0], self.rasterizer, up)
-        parts = [replace(wanted, formats=()), *(replace(wanted, formats=[kind], videos=()) for kind in wanted.formats)]
-        files, units = dict[str, str](), FileUnits(sequence.scale, sequence.origin)
-        for part in parts:
+        shot = Shot(scene, placed[0], up, FileUnits(sequence.scale, sequence.origin))
+        files = dict[str, str]()
+        for part in (replace(wanted, formats=()), *(replace(wanted, formats=[x], videos=()) for x in wanted.formats)):
             try:
                 converter = find_splat_transform() if set(part.formats) & set(CONVERTED) else None
-                files |= write(replace(part, converter=converter), [f"scene {name}"], units)[-1]
+                part, comments = replace(part, converter=converter), [f"scene {name}"]
+                files |= write_scene(self.scene_folder, "scene", "", shot, self.rasterizer, part, comments)[-1]
             except CompleteSplatError as error:
                 logger.warning("left out: %s", error)
         title = f"{name}: held-out photos, Gaussians fitted to the {len(self.sequence('train').frames)} others"
-        shown = scene, placed, images[0], truth.images, self.evaluation.scene_seed(name)
-        write_fitted_scene(self.scene_folder, name, title, *shown, units, up.tolist(), files)
+        seed = self.evaluation.scene_seed(name)
+        write_fitted_scene(self.scene_folder, name, title, shot, images[0], truth.images, seed, files)

@@ -20,7 +20,7 @@ from completesplat.baselines.sparse_vae import SparseVAE
 from completesplat.data.loading.distributed import gathered, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.errors import CompleteSplatError
-from completesplat.export.prediction import write_fitted_scene
+from completesplat.export.prediction import Shot, write_fitted_scene
 from completesplat.files import make_folder, safe_name, write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -65,7 +65,7 @@ class PerScene(Stage):
             make_folder(self.scenes_folder)
             make_folder(folder)
             title = f"{name}: fitted to these views"
-            write_fitted_scene(folder, name, title, gaussians[0], cameras, images[0], truth.images, seed)
+            write_fitted_scene(folder, name, title, Shot(gaussians[0], cameras[0]), images[0], truth.images, seed)
         except CompleteSplatError as error:
             logger.warning("%s: %s", folder, error)
 

@@ -5,25 +5,26 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from socket import socketpair
-from typing import Any, cast
+from typing import Any
 
+import lightning
 import torch
 from lightning import Trainer
 from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
 from lightning.fabric.strategies.launchers import subprocess_script as launcher_of_fabric
-from lightning.fabric.strategies.launchers.subprocess_script import _ChildProcessObserver
 from lightning.pytorch.strategies.launchers import subprocess_script as launcher_of_trainers
-from lightning.pytorch.trainer.connectors.signal_connector import _SignalConnector
 
 from completesplat import signals
 from completesplat.signals import Interrupted
 
 LOOK_SECONDS, GRACE_SECONDS = 0.5, 5.0
 """Interval at which a process checks its child processes, and their time to end by themselves."""
+LAUNCHERS: tuple[Any, ...] = (launcher_of_fabric, launcher_of_trainers)
 
 logger = logging.getLogger(__name__)
 
@@ -41,16 +42,12 @@ def stopped_together() -> Iterator[None]:
     def observe(processes: list[subprocess.Popen[bytes]]) -> None:
         if processes:
             started.extend(processes)
-            observers.append(_Observer(os.getpid(), processes))
+            observers.append(_Observer(processes))
             observers[-1].start()
 
-    connector, launchers = cast(Any, _SignalConnector), (launcher_of_fabric, launcher_of_trainers)
-    before = connector.register_signal_handlers, launchers[0]._launch_process_observer
-    connector.register_signal_handlers = lambda self: None
-    for launcher in launchers:
-        launcher._launch_process_observer = observe  # type: ignore[attr-defined]
     try:
-        yield
+        with _observed_by(observe):
+            yield
     except (Interrupted, RuntimeError) as error:
         number = error.signal if isinstance(error, Interrupted) else signals.received()
         if number is None:
@@ -59,12 +56,39 @@ def stopped_together() -> Iterator[None]:
             _end(process, number)
         raise Interrupted(number) from error  # this process may have waited for others that ended earlier
     finally:
-        connector.register_signal_handlers = before[0]
-        for launcher in launchers:
-            launcher._launch_process_observer = before[1]  # type: ignore[attr-defined]
         # Their sockets stay open until here, because Python would write into a file that reuses a closed one's number.
         if observers:
             signal.set_wakeup_fd(-1)
+
+
+@contextmanager
+def _observed_by(observe: Callable[[list[subprocess.Popen[bytes]]], None]) -> Iterator[None]:
+    """Replace Lightning's handlers of signals by none, and its observer of child processes by `observe`.
+
+    Both are private, because Lightning has no public way. Where a release has renamed one of them, Lightning keeps its
+    own behaviour, and a warning says so.
+    """
+    connector: Any = None
+    try:
+        from lightning.pytorch.trainer.connectors.signal_connector import _SignalConnector
+
+        before = _SignalConnector.register_signal_handlers, [x._launch_process_observer for x in LAUNCHERS]
+        connector = _SignalConnector
+    except (ImportError, AttributeError):
+        message = "lightning %s has other names: signals during training are handled in its own way"
+        logger.warning(message, lightning.__version__)
+    if connector is None:
+        yield
+        return
+    connector.register_signal_handlers = lambda self: None
+    for launcher in LAUNCHERS:
+        launcher._launch_process_observer = observe
+    try:
+        yield
+    finally:
+        connector.register_signal_handlers = before[0]
+        for launcher, function in zip(LAUNCHERS, before[1], strict=True):
+            launcher._launch_process_observer = function
 
 
 def _end(process: "subprocess.Popen[bytes]", number: int) -> None:
@@ -77,38 +101,47 @@ def _end(process: "subprocess.Popen[bytes]", number: int) -> None:
             process.send_signal(next_number)
 
 
-class _Observer(_ChildProcessObserver):
-    """Observer that sends this process a signal that ended another; after other failures it acts as Lightning's.
+class _Observer(threading.Thread):
+    """Observer of child processes: if a signal ended one of them, this process gets it; another failure kills all.
 
     While this process waits for another one, Python's handlers do not run. Outside of training the signal then still
     ends it after `GRACE_SECONDS`.
     """
 
-    def __init__(self, main_pid: int, processes: list[subprocess.Popen[bytes]]) -> None:
-        super().__init__(main_pid, processes, LOOK_SECONDS)  # type: ignore[arg-type]
+    def __init__(self, processes: list[subprocess.Popen[bytes]]) -> None:
+        super().__init__(name="child-process-observer", daemon=True)
+        self._processes = processes
         self._signals, self._written = socketpair()
         self._signals.setblocking(False)
         self._written.setblocking(False)
         signal.set_wakeup_fd(self._written.fileno(), warn_on_full_buffer=False)
 
-    def _run(self) -> bool:
-        codes = [process.poll() for process in self._child_processes]
-        theirs = {code - 128 if code > 0 else -code for code in codes if code} & set(signals.ENDING)
-        local = set() if signals.are_kept() else self._received_here() & set(signals.ENDING)
-        if signals.received() is not None:
-            return True
-        if not theirs | local:
-            return super()._run()
-        number = min(theirs | local)
-        if not local:
-            os.kill(self._main_pid, number)
+    def run(self) -> None:
+        while signals.received() is None:
+            codes = [process.poll() for process in self._processes]
+            theirs = {code - 128 if code > 0 else -code for code in codes if code} & set(signals.ENDING)
+            local = set() if signals.are_kept() else self._received_here() & set(signals.ENDING)
+            if theirs | local:
+                return self._pass_on(min(theirs | local), to_this_process=not local)
+            if any(codes):
+                self._kill_children()  # SIGTERM would not end processes that wait for each other
+                os.kill(os.getpid(), signal.SIGKILL)
+            if all(code == 0 for code in codes):
+                return
+            time.sleep(LOOK_SECONDS)
+
+    def _pass_on(self, number: int, to_this_process: bool) -> None:
+        if to_this_process:
+            os.kill(os.getpid(), number)
         time.sleep(GRACE_SECONDS)
         if signals.received() is None:
-            for process in self._child_processes:
-                process.kill()
+            self._kill_children()
             print(f"ended by {signal.Signals(number).name}", file=sys.stderr, flush=True)
             os._exit(128 + number)
-        return True
+
+    def _kill_children(self) -> None:
+        for process in self._processes:
+            process.kill()
 
     def _received_here(self) -> set[int]:
         try:
@@ -132,7 +165,9 @@ def end_training(trainer: Trainer, number: int) -> None:
 
 
 def _requeue(trainer: Trainer, number: int) -> None:
-    environment = trainer._accelerator_connector.cluster_environment
+    # Trainers of one device have no environment; Lightning then takes SLURM's as well.
+    detected = SLURMEnvironment() if SLURMEnvironment.detect() else None
+    environment = getattr(trainer.strategy, "cluster_environment", detected)
     if not isinstance(environment, SLURMEnvironment) or not environment.auto_requeue:
         return
     if number != environment.requeue_signal:

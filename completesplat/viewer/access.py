@@ -7,14 +7,13 @@ This module does not need torch, so that the page opens before torch is imported
 import contextlib
 import io
 import logging
-import re
 import secrets
 from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, quote
+from urllib.parse import parse_qs
 
 import numpy as np
 import viser
@@ -24,9 +23,8 @@ from websockets.http11 import Request, Response
 
 from completesplat.errors import CompleteSplatError
 
-# viser has no settings for these. The page stays as viser made it if another version of viser has other texts.
 TITLE, LOADING = "completesplat", "loading the model or scene"
-ICON, CORRECTIONS = (Path(__file__).with_name(name) for name in ("icon.svg", "corrections.js"))
+HEAD = Path(__file__).with_name("head.html")
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost", "[::1]")
@@ -147,9 +145,5 @@ def tokens(request: Request, port: int) -> list[bytes]:
 
 
 def with_head(page: str) -> str:
-    """Return viser's HTML with our title, icon and corrections, and a line until its program has started."""
-    icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON.read_text())}" />'
-    page = re.sub(r'<link\s+rel="icon"\s+href="[^"]*"\s*/>', icon, page, count=1)
-    page = re.sub(r"<title>[^<]*</title>", f"<title>{TITLE}</title>", page, count=1)
-    page = page.replace('<div id="root"></div>', f'<div id="root">{TITLE}: starting the page</div>', 1)
-    return page.replace("<head>", f"<head><script>{CORRECTIONS.read_text()}</script>", 1)
+    """Return viser's HTML with our title, icon and script at the start of its head; viser has no settings for them."""
+    return page.replace("<head>", f"<head>{HEAD.read_text()}", 1)

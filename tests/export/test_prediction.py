@@ -14,6 +14,7 @@ from completesplat.export.images import color_depth, surface_depth
 from completesplat.export.ply import read_ply
 from completesplat.export.prediction import (
     FileUnits,
+    Shot,
     Wanted,
     contact_sheet,
     write_fitted_scene,
@@ -94,8 +95,8 @@ def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path):
     bright = dataclasses.replace(scene_at(2, 0.9), colors=torch.tensor([[0.2, 0.4, 1.5], [0.0, 0.5, 1.0]]))
     faint = dataclasses.replace(scene_at(2, 0.9), opacities=torch.tensor([0.9, 1e-4]))
     wanted = Wanted(formats=("ply", "spz"), videos=(), converter=SplatTransform(str(install(tmp_path, "converter"))))
-    up, image, settings = torch.tensor([0.0, -1, 0]), torch.zeros(3, 16, 16), {"seed": 0, "image": "a.png"}
-    write_prediction(tmp_path / "a", image, [bright, faint], CAMERA, ReferenceRasterizer(), up, wanted, settings)
+    shots, settings = [Shot(bright, CAMERA), Shot(faint, CAMERA)], {"seed": 0, "image": "a.png"}
+    write_prediction(tmp_path / "a", torch.zeros(3, 16, 16), shots, ReferenceRasterizer(), wanted, settings)
     recorded = strict_json(tmp_path / "a/scene.json")["settings"]
     counted = [recorded[name] for name in ("gaussians", "colors_clipped", "left_out_of_spz")]
     assert counted == [[2, 2], [1, 0], [0, 1]]
@@ -106,8 +107,8 @@ def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path):
 def test_files_have_the_users_coordinates_or_those_less_an_offset_that_scene_json_has(tmp_path, caplog, far, offset):
     places = torch.tensor([[0.25, 0.5, 2.0], [-0.25, 0, 2.0]])
     scene = dataclasses.replace(scene_at(2, 0.9), means=places)
-    images, units = torch.zeros(1, 3, 16, 16), FileUnits(0.5, far)  # exact in float32
-    write_fitted_scene(tmp_path, "a", "a", scene, CAMERA[None], images, images, 0, units)
+    images, shot = torch.zeros(1, 3, 16, 16), Shot(scene, CAMERA, units=FileUnits(0.5, far))  # exact in float32
+    write_fitted_scene(tmp_path, "a", "a", shot, images, images, 0)
     recorded = strict_json(tmp_path / "scene.json")
     assert recorded["settings"].get("offset", [0, 0, 0]) == offset
     assert caplog.text.count("a: too far from its origin for float32: add offset (400000, 5e+06, 300)") == any(offset)

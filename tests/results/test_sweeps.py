@@ -14,11 +14,14 @@ import hydra
 import numpy as np
 import pandas as pd
 import pytest
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from completesplat.results.machine import machine
 from completesplat.results.measured import Entry, score_rows, time_cell
+from completesplat.results.runs import planned_jobs
 from completesplat.results.sweeps import IDENTITY, summarize, write_summary
 from completesplat.results.tables import SSIM_NOTE, Notes, as_markdown, escape, show
 
@@ -255,6 +258,14 @@ def test_jobs_that_have_not_started_are_named_and_a_plan_that_depends_on_files_i
     (sweep.folder / "seed=1").rmdir()
     sweep.plan(["ablation=glob(*)", "seed=0,1"])
     assert remarks(sweep)[0] == "1 of 2 jobs have finished."
+
+
+def test_planned_jobs_are_those_of_hydras_sweeper(sweep) -> None:
+    arguments = ["b=1,2", "a=range(3)", "c=[1,x]", "~d", "+e='f g',h", "b=3,4", "++f=choice({x:1},y)", "out=g"]
+    sweep.plan(arguments)
+    (jobs,) = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(arguments), None)
+    assert len(jobs) == 2 * 3 * 2 * 2
+    assert planned_jobs(sweep.folder) == jobs
 
 
 def test_remarks_name_commits_machine_date_and_commands(sweep) -> None:

@@ -3,11 +3,12 @@
 import os
 
 import pytest
+from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.arguments import behind_dashes, for_hydra
+from completesplat.settings.arguments import ALONE, CHOICES, WITH_VALUE, behind_dashes, for_hydra
 
 DASHES = "settings are key=value without dashes, such as out=DIR, and files are given by their names: `completesplat"
 NAMES = ["a.jpg", "a,b.jpg", "[a].jpg", "{a:1}.jpg", "a=b.jpg", "seed=1.jpg", " (1) .jpg", "it's.jpg", '"a".jpg']
@@ -116,3 +117,10 @@ def test_no_argument_behind_two_dashes_is_a_flag():
         *("-m", "a.png", "./-b.png", "c.png", "./--", "./-m"),
     ]
     assert behind_dashes(["a.png", "-m"]) == ["a.png", "-m"]
+
+
+def test_the_flags_are_hydras():
+    actions = [action for action in get_args_parser()._actions if action.option_strings]
+    assert {*ALONE, *WITH_VALUE} == {name for action in actions for name in action.option_strings}
+    choices = {name: tuple(action.choices) for action in actions if action.choices for name in action.option_strings}
+    assert choices == CHOICES

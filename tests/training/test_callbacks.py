@@ -1,6 +1,7 @@
 """What training does around its steps: random numbers, speed and memory."""
 
 import itertools
+from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -35,7 +36,6 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch) -> Clock:
     made = Clock()
-    monkeypatch.setattr(callbacks, "now", made)
     monkeypatch.setattr(callbacks, "time", SimpleNamespace(perf_counter=made))
     return made
 
@@ -53,24 +53,31 @@ class Sleeper(BoringModel):
         self.clock.nap(self.naps[1])
 
 
-def speeds(module: Sleeper, nap: float = 0, **options) -> list[dict[str, float]]:
+class SlowSaver(Callback):
+    """Writes a checkpoint before the third batch of each four, as `Checkpoints` does, in ten seconds."""
+
+    def on_train_batch_start(self, trainer, pl_module, batch, index) -> None:
+        if index % 4 == 2:
+            trainer.save_checkpoint(Path(trainer.default_root_dir) / "last.ckpt")
+            pl_module.clock.nap(10)
+
+
+def speeds(module: Sleeper, nap: float = 0, others: tuple[Callback, ...] = (), **options) -> list[dict[str, float]]:
     """Return the logged rows of one epoch of eight batches of two scenes. Loading a batch takes `nap` seconds."""
     memory = MagicMock(spec=Logger)
-    surroundings = {"logger": memory, "callbacks": [Throughput()], "log_every_n_steps": 2, "num_sanity_val_steps": 0}
-    trainer = Trainer(max_epochs=1, **surroundings, **QUIET, **options)
-    profiler = trainer.profiler
+    surroundings = {"logger": memory, "callbacks": [Throughput(), *others], "num_sanity_val_steps": 0}
+    trainer = Trainer(max_epochs=1, **surroundings, **QUIET, **{"log_every_n_steps": 2, **options})
     batches = DataLoader(range(8), collate_fn=lambda _: module.clock.nap(nap) or scene_batch())
     trainer.fit(module, batches, DataLoader(range(8)) if "val_check_interval" in options else None)
-    assert trainer.profiler is profiler
     rows = [call.kwargs["metrics"] | {"step": call.kwargs["step"]} for call in memory.log_metrics.call_args_list]
-    return [row for row in rows if "speed/data_wait" in row]
+    return [row for row in rows if "speed/scenes_per_second" in row]
 
 
 def test_waiting_for_data_is_measured(clock):
     """A batch is loaded in one second, and trained on in three."""
     rows = speeds(Sleeper(clock, training=3), nap=1)
     assert [row["step"] for row in rows] == [1, 3, 5, 7]
-    for row in rows[1:]:  # the first batch is loaded before there is a step
+    for row in rows:
         assert row["speed/data_wait"] == pytest.approx(1 / 4)
         assert row["speed/scenes_per_second"] == pytest.approx(2 / 4)
 
@@ -80,6 +87,19 @@ def test_validation_is_not_counted(clock, interval):
     """Five times as long as training, and in the midst of an interval as well as between two."""
     for row in speeds(Sleeper(clock, training=1, validation=5), val_check_interval=interval)[1:]:
         assert row["speed/scenes_per_second"] == pytest.approx(2)
+
+
+def test_writing_checkpoints_is_not_counted(clock, tmp_path):
+    module = Sleeper(clock, training=1)
+    rows = speeds(module, others=(SlowSaver(),), default_root_dir=tmp_path, log_every_n_steps=4)
+    assert (tmp_path / "last.ckpt").is_file()
+    assert [row["speed/scenes_per_second"] for row in rows] == [pytest.approx(2)] * 2
+
+
+def test_rows_of_one_batch_have_its_speed_and_no_wait(clock):
+    rows = speeds(Sleeper(clock, training=2), nap=1, log_every_n_steps=1)
+    assert [row["speed/scenes_per_second"] for row in rows] == [pytest.approx(1)] * 8
+    assert not any("speed/data_wait" in row for row in rows)
 
 
 def test_accumulated_batches_are_counted_and_logged_once(clock):

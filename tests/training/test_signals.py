@@ -12,6 +12,7 @@ from contextlib import suppress
 import pytest
 import torch
 from lightning.fabric.strategies.launchers import subprocess_script as launcher
+from lightning.pytorch.trainer.connectors import signal_connector
 from small_runs import STEPS, Logging, fit, rows
 from support import LIMIT
 
@@ -148,6 +149,26 @@ def test_a_program_ends_whose_workers_nobody_has_ended():
     lines += ["def work():", "    leave_to_parent()", "    ready.set()", f"    time.sleep({2 * LIMIT})"]
     lines += ["forked.Process(target=work, daemon=True).start()", "ready.wait()"]
     subprocess.run([sys.executable, "-c", "\n".join(lines)], timeout=LIMIT, check=True)
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [
+        (signal_connector, "_SignalConnector"),
+        (signal_connector._SignalConnector, "register_signal_handlers"),
+        (launcher, "_launch_process_observer"),
+    ],
+)
+def test_a_lightning_with_other_names_keeps_its_own_behaviour_with_a_warning(owner, name, monkeypatch, caplog):
+    hidden = getattr(owner, name)
+    register = signal_connector._SignalConnector.register_signal_handlers
+    monkeypatch.delattr(owner, name)
+    with stopped_together():
+        assert not hasattr(owner, name)
+        monkeypatch.undo()
+        assert signal_connector._SignalConnector.register_signal_handlers is register
+    assert getattr(owner, name) is hidden
+    assert "its own way" in caplog.text
 
 
 def test_numbers_of_signals_are_written_to_a_socket_that_is_open_and_to_nothing_else():

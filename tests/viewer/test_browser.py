@@ -43,6 +43,8 @@ START = {
     "remove_background": False,
 }
 GREY = 128
+# viser 1.1 gives the square on which it draws splats corners of two numbers, of which three.js measures no sphere.
+KNOWN = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +71,8 @@ def page(tmp_path_factory):
 def open_tab(chromium, address: str, window: dict[str, int] = WINDOW):
     tab = chromium.new_page(viewport=window)
     tab.errors = []
-    tab.on("console", lambda message: message.type == "error" and tab.errors.append(message.text))
+    note = tab.errors.append
+    tab.on("console", lambda message: message.type == "error" and KNOWN not in message.text and note(message.text))
     tab.on("pageerror", lambda error: tab.errors.append(str(error)))
     tab.goto(address)
     assert waited_for(lambda: abs(settled(tab)[-5, 5] - GREY).max() < 3), "the page does not appear"
@@ -239,7 +242,7 @@ def test_a_phone_says_what_it_waits_for(chromium, page, monkeypatch):
     phone = chromium.new_page(viewport={"width": 390, "height": 700})
     phone.set_default_timeout(1000 * LIMIT)
     html = phone.goto(page.server.address).text()
-    assert '<div id="root">completesplat: starting the page</div>' in html  # until viser's program has started
+    assert "completesplat: starting the page" in html  # until viser's program has started
     phone.get_by_text("Drawing the first image").wait_for()
     say(page.server, "drawing from photo.png")
     phone.get_by_text("completesplat: drawing from photo.png").wait_for()
