@@ -2,6 +2,7 @@
 
 import gc
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -35,6 +36,28 @@ def pytest_collection() -> Iterator[None]:
     finally:
         gc.freeze()
         gc.enable()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def config_files_parsed_once() -> Iterator[None]:
+    """Keep what Hydra reads of a config file for all compositions of the process: parsing takes half of their time."""
+    from hydra._internal.core_plugins.file_config_source import FileConfigSource
+
+    read, results = FileConfigSource.load_config, {}
+
+    def load_config(source: FileConfigSource, config_path: str) -> object:
+        path = Path(source.path, source._normalize_file_name(config_path))
+        if not path.is_file():
+            return read(source, config_path)
+        state = path.stat()
+        key = source.provider, source.path, config_path, state.st_ino, state.st_size, state.st_mtime_ns
+        if key not in results:
+            results[key] = pickle.dumps(read(source, config_path))
+        return pickle.loads(results[key])
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(FileConfigSource, "load_config", load_config)
+        yield
 
 
 @pytest.fixture(scope="session")
