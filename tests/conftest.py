@@ -2,6 +2,7 @@
 
 import gc
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -35,6 +36,36 @@ def pytest_collection() -> Iterator[None]:
     finally:
         gc.freeze()
         gc.enable()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_compositions() -> Iterator[None]:
+    """Parse each config file once in a process, and compose a command's config once.
+
+    Hydra composes it a second time to learn `hydra.mode`, which no file of `conf/` sets. Both take half of the time.
+    """
+    from hydra._internal.core_plugins.file_config_source import FileConfigSource
+    from hydra._internal.hydra import Hydra
+
+    read, results, get_mode = FileConfigSource.load_config, {}, Hydra.get_mode
+
+    def mode(self: Hydra, config_name: str | None, overrides: list[str]) -> object:
+        return get_mode(self, config_name, overrides) if any("hydra" in text for text in overrides) else None
+
+    def load_config(source: FileConfigSource, config_path: str) -> object:
+        path = Path(source.path, source._normalize_file_name(config_path))
+        if not path.is_file():
+            return read(source, config_path)
+        state = path.stat()
+        key = source.provider, source.path, config_path, state.st_ino, state.st_size, state.st_mtime_ns
+        if key not in results:
+            results[key] = pickle.dumps(read(source, config_path))
+        return pickle.loads(results[key])
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(FileConfigSource, "load_config", load_config)
+        monkeypatch.setattr(Hydra, "get_mode", mode)
+        yield
 
 
 @pytest.fixture(scope="session")

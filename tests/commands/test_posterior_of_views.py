@@ -19,7 +19,7 @@ SIZES = [*SMALL, "data.targets=2", *ENCODER]
 def runs(built_once):
     def train(folder):
         made(folder / "data", "data", "toy", "kind=minis", "scenes=4", "frames=8", "size=32", "workers=1")
-        fit = ["fit", f"data.root={folder / 'data'}", *SIZES]
+        fit = ["fit", f"data.root={folder / 'data'}", *SIZES, "test=false"]
         made(folder / "var", *fit, "experiment=toy_minis_var")
         stage1 = f"model.autoreconstructor_checkpoint={folder / 'var/checkpoints/last.ckpt'}"
         stage2 = ["experiment=toy_minis_diffusion", stage1, "sampler.steps=2", "conditioning.channels=[8,16]"]

@@ -8,7 +8,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from support import compose_config
+from support import NETWORKS, compose_config
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
@@ -21,6 +21,7 @@ from completesplat.training.steps import Training, synthetic_batch
 
 SIZE, BATCH = 16, 3
 PAPER = ("paper_var_stage1", "paper_var_stage2", "paper_diffusion", "paper_diffusion_masked")
+SLOW = [pytest.param(experiment, marks=pytest.mark.slow) for experiment in PAPER if experiment != "paper_var_stage2"]
 REGISTRY, CUDA, META = "_ZN3c104impl26device_guard_impl_registryE", 1, 14
 
 
@@ -68,7 +69,7 @@ def test_fake_tensors_free_what_real_ones_do() -> None:
     assert forward <= static <= 2 * forward
 
 
-@pytest.mark.parametrize("experiment", [*PAPER[:3], pytest.param(PAPER[3], marks=pytest.mark.slow)])
+@pytest.mark.parametrize("experiment", ["paper_var_stage2", *SLOW])
 def test_a_step_of_the_papers_size_runs_and_takes_no_memory(experiment: str) -> None:
     config = compose_config("plan", f"experiment={experiment}")
     counts = counted(config, config.data.batch_size)
@@ -99,11 +100,17 @@ def on_gpu(config: DictConfig) -> Training:
         return Training(instantiate(config.model, _convert_="all"), "bf16-mixed")
 
 
-@pytest.mark.parametrize("experiment", PAPER[1:3])
+SMALL_DIFFUSION = ("toy_diffusion", "data.image_size=32", *NETWORKS)
+
+
+@pytest.mark.parametrize(
+    "settings", [("paper_var_stage2",), SMALL_DIFFUSION, pytest.param(("paper_diffusion",), marks=pytest.mark.slow)]
+)
 def test_a_forward_pass_on_a_gpu_finds_all_tensors_there_and_keeps_what_is_counted(
-    experiment: str, pretended_gpu: None
+    settings: tuple[str, ...], pretended_gpu: None
 ) -> None:
-    config = compose_config("plan", f"experiment={experiment}")
+    experiment, *sizes = settings
+    config = compose_config("plan", f"experiment={experiment}", *sizes)
     copied = without_weights(config)
     copied.rasterizer = {"_target_": "completesplat.training.step_counts.StoreOnly", "gpu": True}
     batch, live = 4, LiveMemory()

@@ -25,11 +25,10 @@ from completesplat.data.packed.manifest import (
     Split,
     differences,
     is_packed,
-    parsed,
 )
 from completesplat.data.packed.rows import CODECS, SCHEMA, encode_image, to_row
 from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource
-from completesplat.data.validation import TooFewFrames, at, field, read_json, refused_to
+from completesplat.data.validation import TooFewFrames, at, field, parsed, read_json, refused_to
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import atomic_path, write_json
