@@ -107,12 +107,15 @@ class HiddenModeScenes:
         assert front.depths is not None
         assert others.depths is not None
         unseen, _ = hidden_from(front.cameras, front.depths, others.cameras, others.depths)
+        views, region = list(map(targets.index, shown)), regions[shown]
+        # Depth maps leave out edges; but the reference view does not show what differs between the modes.
+        unseen[views] |= region
         true_mode, probabilities = self._modes_of(name)
         return HiddenModes(
             scene=stack([scene]),
-            views=tuple(map(targets.index, shown)),
+            views=tuple(views),
             truths=truths[:, shown],
-            region=regions[shown],
+            region=region,
             probabilities=probabilities,
             unseen=unseen,
             modes=tuple(self.chances),

@@ -26,7 +26,7 @@ def read_text(path: Path) -> tuple[str, list[int], np.ndarray]:
 
 def test_the_folder_says_what_was_made_and_something_else_is_left_alone(rooms, tmp_path):
     description = json.loads((rooms / "toy.json").read_text())
-    assert description == {"format": 2, "scenes": 3, "frames": FRAMES, "size": 18, "seed": 0}
+    assert description == {"format": 3, "scenes": 3, "frames": FRAMES, "size": 18, "seed": 0}
     (tmp_path / "toy_rooms").mkdir()
     (tmp_path / "toy_rooms" / "mine.txt").write_text("mine")
     settings = {"scenes": 2, "frames": 2, "size": 8, "seed": 0, "workers": 1, "progress": False}
