@@ -18,7 +18,8 @@ def test_a_run_is_encoded_as_asked_and_trained_from(command, pipeline, packed_to
     assert "for 4 frames of 2 sequences" in made.out + made.err
     store = LatentCache(cache)
     assert [sequence.stored for sequence in store.sequences.values()] == [(1, 3)] * 2
-    assert (store.arrays["mean"].dtype, store.arrays["condition"].dtype) == ("float16", "uint8")
+    arrays = store.arrays(next(iter(store.sequences)))
+    assert (arrays["mean"].dtype, arrays["condition"].dtype) == ("float16", "uint8")
 
     stage2 = [f"data.root={pipeline.toy}", *SMALL, "experiment=toy_diffusion", "sampler.steps=2", "test=false"]
     stage2 += [f"model.autoreconstructor_checkpoint={checkpoint}", f"data.latent_cache={cache}"]
