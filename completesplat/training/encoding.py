@@ -5,14 +5,14 @@ import logging
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from functools import partial
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 from rich.filesize import decimal
 from rich.progress import track
 from torch import nn
@@ -22,27 +22,28 @@ from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import gathered, processes
 from completesplat.data.loading.latent_cache import (
-    CHECKSUMS,
-    ArrayWriter,
+    FILE,
     CachedSequence,
     LatentCache,
     LatentCacheManifest,
     Origin,
-    row_checksums,
+    Rows,
+    latent_schema,
+    to_row,
     write_manifest,
 )
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.loading.view_selection import spread_around
 from completesplat.data.packed.manifest import MANIFEST
 from completesplat.data.packed.source import PackedSource
+from completesplat.data.packed.writing import UNFINISHED
 from completesplat.data.sequences import PosedSequence, spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
+from completesplat.files import atomic_path
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
-from completesplat.weights import sha256_of
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
-Rows = dict[str, Shaped[np.ndarray, "image _ _ _"]]
 Moments = Float[np.ndarray, "row channel _ _"]
 Sums = Float[np.ndarray, "3 channel"]
 Reference = tuple[PosedSequence, int]
@@ -181,13 +182,11 @@ def _packed(data: SceneDataModule) -> PackedSource:
 def _references(
     source: PackedSource, frames: int | None, sequences: list[CachedSequence], progress: bool
 ) -> Iterator[Reference]:
-    """Yield all references in the order of rows; append each sequence to `sequences` before its references."""
-    rows = 0
+    """Yield all references in the order of frames; append each sequence to `sequences` before its references."""
     for name in track(source.names, "encoding sequences", disable=not progress or processes()[0] > 0):
         sequence = source.read(name)
         places = spread_places(len(sequence.frames), frames)
-        sequences.append(CachedSequence(name, len(sequence.frames), rows, tuple(places)))
-        rows += len(places)
+        sequences.append(CachedSequence(name, len(sequence.frames), tuple(places)))
         yield from ((sequence, place) for place in places)
 
 
@@ -238,21 +237,28 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
 def _write_store(
     out: Path, origin: Origin, blank: Rows, batches: Iterator[tuple[Rows, Sums]], sequences: Sequence[CachedSequence]
 ) -> None:
-    """Write all rows, with the shapes and types of `blank`, then the manifest. Reading `batches` fills `sequences`."""
-    total = np.zeros(())
-    with ExitStack() as files:
-        writers = {
-            name: files.enter_context(ArrayWriter(out / f"{name}.npy", rows.shape[1:], rows.dtype.name))
-            for name, rows in {**blank, CHECKSUMS: row_checksums(blank)}.items()
-        }
+    """Write all sequences, with the shapes of `blank`, then the manifest. Reading `batches` fills `sequences`."""
+    total, written, schema = np.zeros(()), 0, latent_schema(origin)
+    waiting = {name: rows[:0] for name, rows in blank.items()}  # of sequences that are not complete
+    with (
+        atomic_path(out / FILE, f"{FILE}{UNFINISHED}") as unfinished,
+        unfinished.open("wb") as file,
+        pa.ipc.new_stream(file, schema) as writer,
+    ):
         for rows, sums in batches:
             total = total + sums
-            rows[CHECKSUMS] = row_checksums(rows)
-            for name, writer in writers.items():
-                writer.append(rows[name])
-    arrays = {name: writer.described() for name, writer in writers.items()}
-    checksums = sha256_of(out / arrays[CHECKSUMS].file)
-    write_manifest(out, LatentCacheManifest(__version__, origin, *moments(total), arrays, tuple(sequences), checksums))
+            waiting = {name: np.concatenate([values, rows[name]]) for name, values in waiting.items()}
+            for sequence in sequences[written:]:
+                count = len(sequence.stored)
+                if len(waiting["mean"]) < count:
+                    break
+                complete = {name: np.ascontiguousarray(values[:count]) for name, values in waiting.items()}
+                writer.write_batch(to_row(sequence.name, complete, schema))
+                waiting = {name: values[count:] for name, values in waiting.items()}
+                written += 1
+    shapes = {name: rows.shape[1:] for name, rows in blank.items()}
+    size = (out / FILE).stat().st_size
+    write_manifest(out, LatentCacheManifest(__version__, origin, *moments(total), shapes, tuple(sequences), size))
 
 
 def _origin(

@@ -86,7 +86,7 @@ def test_latents_leave_no_half_store(command, pipeline, packed_toys, tmp_path, s
     given += [f"overrides=['data.root={packed_toys}']", f"out={tmp_path / 'latents'}"]
     finished = command("data", *given)
     assert finished.status == 143, finished.err
-    assert not list((tmp_path / "latents").glob("*.npy"))
+    assert not list((tmp_path / "latents").glob("*.arrow*"))
     finished = command(*message(finished, signal.SIGTERM)[1])
     assert finished.status == 0, finished.err
 

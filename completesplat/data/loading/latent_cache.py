@@ -1,53 +1,45 @@
-"""Latent cache on disk: it is written row by row, read memory-mapped, and used as a training set."""
+"""Latent cache on disk: an Arrow file as in a packed store, with one row for each sequence, used as a training set."""
 
 import json
-import os
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from hashlib import sha256
 from pathlib import Path
-from types import TracebackType
 from zlib import crc32
 
 import numpy as np
+import pyarrow as pa
 import torch
-from jaxtyping import Shaped
+from jaxtyping import Shaped, UInt32
 
 from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import TrainingScenes
 from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, read_as
+from completesplat.data.packed.source import OpenShard
 from completesplat.data.sequences import SequenceSource
-from completesplat.data.validation import ChangedFile, MissingFile, UnreadableFile, at, inside, require_file
+from completesplat.data.validation import BadAnnotation, ChangedFile, MissingFile, UnreadableFile, at, require_file
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.files import write_text, writing
+from completesplat.files import write_text
 from completesplat.scene import CachedScene
-from completesplat.weights import sha256_of
 
-HEADER: dict[str, str | int] = {"format": 4, "kind": "latent_cache"}
+HEADER: dict[str, str | int] = {"format": 5, "kind": "latent_cache"}
+Rows = dict[str, Shaped[np.ndarray, "frame ..."]]
+PRECISIONS = {"float32": pa.float32(), "float16": pa.float16()}
+FILE = "latents.arrow"
 ARRAYS = ("mean", "log_variance", "condition")
-CHECKSUMS = "checksum"
-"""Name of the array with the CRC-32 of each row of the others. A row is checked when it is read, because the files may
-have hundreds of gigabytes and each process opens them. This array and the manifest are checked when they are opened."""
+CHECKSUMS = "checksums"
+"""Name of the column with the CRC-32 of each frame. A frame is checked when it is read, because the file may have
+hundreds of gigabytes and each process opens it. The manifest is checked when it is opened."""
 NO_SUM = "0" * 64
-
-
-@dataclass(frozen=True)
-class Array:
-    """One `.npy` file, whose first axis has one row for each encoded image."""
-
-    file: str
-    dtype: str
-    shape: tuple[int, ...]
+ADVICE = "encode the images again"
 
 
 @dataclass(frozen=True)
 class CachedSequence:
-    """Rows of one sequence, which start at `first`, one for each of the frames `stored` (indices in the sequence)."""
+    """Row of one sequence, with values for each of the frames `stored` (indices in the sequence)."""
 
     name: str
     frames: int
-    first: int
     stored: tuple[int, ...]
 
 
@@ -64,21 +56,25 @@ class Origin:
     views: int  # other views that the posterior sees; 0: it sees the reference only
     precision: str
 
+    def __post_init__(self) -> None:
+        if self.precision not in PRECISIONS:
+            raise BadAnnotation(f"precision must be one of {', '.join(PRECISIONS)}")
+
 
 @dataclass(frozen=True)
 class LatentCacheManifest:
     """Manifest of a store, with the sequences of the training set in order, and mean and std of latents by channel.
 
-    `checksums` is the SHA-256 of the array of checksums. `sha256` is that of the manifest with zeros in its place.
+    `shapes` are those of one frame's values. `sha256` is that of the manifest with zeros in its place.
     """
 
     version: str
     origin: Origin
     mean: tuple[float, ...]
     std: tuple[float, ...]
-    arrays: dict[str, Array]
+    shapes: dict[str, tuple[int, ...]]
     sequences: tuple[CachedSequence, ...]
-    checksums: str
+    bytes: int
     sha256: str = NO_SUM
 
 
@@ -88,84 +84,34 @@ def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
     write_text(root / MANIFEST, text.replace(NO_SUM, sha256(text.encode()).hexdigest()))
 
 
-def row_checksums(rows: Mapping[str, Shaped[np.ndarray, "row _ _ _"]]) -> Shaped[np.ndarray, "row 1 1 1"]:
-    """Return one CRC-32 for each row, computed over all arrays in order."""
+def latent_schema(origin: Origin) -> pa.Schema:
+    """Return the columns of a store. Each has one list for each sequence, of the values of all its stored frames."""
+    encodings = pa.large_list(PRECISIONS[origin.precision])
+    conditions = pa.large_list(pa.uint8()) if origin.conditioning is None else encodings
+    columns = dict(zip(ARRAYS, (encodings, encodings, conditions), strict=True))
+    return pa.schema({"name": pa.string(), **columns, CHECKSUMS: pa.large_list(pa.uint32())})
+
+
+def frame_checksums(rows: Rows) -> UInt32[np.ndarray, " frame"]:
+    """Return one CRC-32 for each frame, computed over all arrays in order."""
     content = zip(*(rows[name] for name in ARRAYS), strict=True)
-    sums = [reduce(lambda value, part: crc32(part.tobytes(), value), parts, 0) for parts in content]
-    return np.array(sums, dtype=np.uint32).reshape(-1, 1, 1, 1)
+    return np.array(
+        [reduce(lambda value, part: crc32(part.tobytes(), value), parts, 0) for parts in content], np.uint32
+    )
 
 
-class ArrayWriter:
-    """Context manager that appends rows of the shape `row` to a file, and writes their number into its header at exit.
-
-    After an exception, such as a DiskError because the disk is full, the file is removed.
-    """
-
-    def __init__(self, path: Path, row: tuple[int, ...], dtype: str) -> None:
-        self.path = path
-        self.row = row
-        self.dtype = np.dtype(dtype)
-        self.count = 0
-
-    def __enter__(self) -> "ArrayWriter":
-        with writing(self.path):
-            self.path.unlink(missing_ok=True)  # it may be a link
-            self._file = self.path.open("wb")
-            self._begin = self._write_header()
-        return self
-
-    def append(self, rows: Shaped[np.ndarray, "_ _ _ _"]) -> None:
-        """Append rows of the writer's dtype."""
-        assert (rows.shape[1:], rows.dtype) == (self.row, self.dtype)
-        self.count += len(rows)
-        with writing(self.path):
-            self._file.write(np.ascontiguousarray(rows).data)
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        whole = False
-        try:
-            with writing(self.path), self._file:
-                self._file.seek(0)
-                # The header keeps its size, because NumPy pads it for a first axis of any length.
-                assert self._write_header() == self._begin
-                self._file.flush()
-                os.fsync(self._file.fileno())
-            whole = error is None
-        finally:
-            if not whole:
-                self.path.unlink(missing_ok=True)
-
-    def _write_header(self) -> int:
-        header = {"descr": self.dtype.str, "fortran_order": False, "shape": (self.count, *self.row)}
-        np.lib.format.write_array_header_1_0(self._file, header)
-        return self._file.tell()
-
-    def described(self) -> Array:
-        """Return the manifest's entry of this array."""
-        return Array(self.path.name, self.dtype.name, (self.count, *self.row))
-
-
-def open_array(root: Path, array: Array) -> np.memmap:
-    """Map a stored array into memory without reading it, after checking its shape, dtype and length."""
-    with at(file=root / MANIFEST):
-        path = inside(root, array.file)
-    with at(file=require_file(path)):
-        try:
-            mapped = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, EOFError, OSError) as error:
-            raise UnreadableFile(f"damaged or no NumPy array: encode the images again ({error})") from None
-        if not isinstance(mapped, np.memmap) or mapped.shape != array.shape or mapped.dtype != np.dtype(array.dtype):
-            raise ChangedFile("not the array that the manifest describes: encode the images again")
-        if path.stat().st_size != mapped.offset + mapped.nbytes:
-            raise ChangedFile("longer than it was written: encode the images again")
-        return mapped
+def to_row(name: str, rows: Rows, schema: pa.Schema) -> pa.RecordBatch:
+    """Return the row of a sequence."""
+    columns = [*(rows[array].reshape(-1) for array in ARRAYS), frame_checksums(rows)]
+    lists = [pa.LargeListArray.from_arrays(pa.array([0, len(x)], pa.int64()), pa.array(x)) for x in columns]
+    return pa.RecordBatch.from_arrays([pa.array([name]), *lists], schema=schema)
 
 
 class LatentCache:
     """Latent cache of a training set, open for reading.
 
     `mean` and `std` are statistics by channel of latents drawn from the posteriors of all stored frames.
-    `arrays` are memory-mapped and have one row for each image.
+    The file is memory-mapped.
 
     Raises:
         DataError: the store is unfinished or damaged.
@@ -175,17 +121,23 @@ class LatentCache:
         if not (folder / MANIFEST).is_file():
             raise MissingFile("no finished latent cache: completesplat data latents makes one", str(folder))
         self.folder = folder
-        self.manifest = read_as(LatentCacheManifest, folder / MANIFEST, HEADER, "encode the images again")
+        self.manifest = read_as(LatentCacheManifest, folder / MANIFEST, HEADER, ADVICE)
         text, digest = (folder / MANIFEST).read_text(), self.manifest.sha256
         if sha256(text.replace(digest, NO_SUM).encode()).hexdigest() != digest:
-            raise ChangedFile("its checksum is another: encode the images again", str(folder / MANIFEST))
+            raise ChangedFile(f"its checksum is another: {ADVICE}", str(folder / MANIFEST))
         self.origin = self.manifest.origin
         self.mean, self.std = self.manifest.mean, self.manifest.std
-        self.arrays = {name: open_array(folder, array) for name, array in self.manifest.arrays.items()}
-        checksums = folder / self.manifest.arrays[CHECKSUMS].file
-        if sha256_of(checksums) != self.manifest.checksums:
-            raise ChangedFile("its checksum is another: encode the images again", str(checksums))
         self.sequences = {sequence.name: sequence for sequence in self.manifest.sequences}
+        self._places = {name: place for place, name in enumerate(self.sequences)}
+        with at(file=require_file(folder / FILE)):
+            if (folder / FILE).stat().st_size != self.manifest.bytes:
+                raise ChangedFile(f"another size than it was written with: {ADVICE}")
+            try:
+                self._rows = OpenShard(folder / FILE)
+            except (pa.ArrowException, OSError, ValueError) as error:
+                raise UnreadableFile(f"damaged ({error}): {ADVICE}") from None
+            if not self._rows.schema.equals(latent_schema(self.origin)) or len(self._rows.places) != len(self._places):
+                raise ChangedFile(f"not what the manifest describes: {ADVICE}")
         self.holds_images = self.origin.conditioning is None  # rather than features
 
     def scene(self, name: str, frame: int) -> CachedScene:
@@ -197,15 +149,36 @@ class LatentCache:
         sequence = self.sequences[name]
         if frame not in sequence.stored:
             raise DataError("was not encoded", str(self.folder), name, frame)
-        row = sequence.first + sequence.stored.index(frame)
-        rows = {name: np.array(array[row : row + 1]) for name, array in self.arrays.items()}
-        if row_checksums(rows) != rows[CHECKSUMS]:
-            raise ChangedFile("its checksum is another: encode the images again", str(self.folder), name, frame)
+        place = sequence.stored.index(frame)
+        arrays = self.arrays(name)
+        rows = {name: np.array(array[place : place + 1]) for name, array in arrays.items()}
+        if frame_checksums(rows) != rows[CHECKSUMS]:
+            raise ChangedFile(f"its checksum is another: {ADVICE}", str(self.folder), name, frame)
         mean, log_variance, condition = (torch.from_numpy(rows[array][0].astype(np.float32)) for array in ARRAYS)
         if self.holds_images:
             # The same division as for images that are read from the data set, for bitwise equal results.
             condition = torch.from_numpy(np.divide(rows["condition"][0], 255, dtype=np.float32))
         return CachedScene(mean, log_variance, condition, torch.tensor(frame), name)
+
+    def arrays(self, name: str) -> Rows:
+        """Return the values of all stored frames of a sequence, and their checksums, as they are in the file.
+
+        Raises:
+            DataError: the row is damaged or of another sequence.
+        """
+        with at(file=self.folder / FILE, sequence=name):
+            try:
+                row = self._rows[self._places[name]]
+                row.validate(full=True)  # Without this check, damaged offsets could crash the process.
+                lists = {column: row.column(column)[0].values.to_numpy() for column in (*ARRAYS, CHECKSUMS)}
+                shapes, count = {**self.manifest.shapes, CHECKSUMS: ()}, len(self.sequences[name].stored)
+                arrays = {column: values.reshape(count, *shapes[column]) for column, values in lists.items()}
+                stored_name = row.column("name")[0].as_py()
+            except (pa.ArrowException, OSError, ValueError, LookupError, AttributeError) as error:
+                raise UnreadableFile(f"damaged ({error}): {ADVICE}") from None
+            if stored_name != name:
+                raise ChangedFile(f"another sequence is in its place: {ADVICE}")
+            return arrays
 
     def must_belong_to(self, source: SequenceSource, settings: dict[str, Scalar]) -> None:
         """Refuse a store that was made with other settings or from another data set."""

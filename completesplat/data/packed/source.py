@@ -108,7 +108,7 @@ class PackedSource(SequenceSource):
         self._places = {
             name: (number, row) for number, shard in enumerate(self.shards) for row, name in enumerate(shard.sequences)
         }
-        self._opened: dict[int, _OpenShard] = {}
+        self._opened: dict[int, OpenShard] = {}
         address = root / ADDRESS
         # None: the store was made or copied here.
         self.address = address.read_text() if address.is_file() else None
@@ -131,12 +131,12 @@ class PackedSource(SequenceSource):
                 raise UnreadableFile(f"damaged, or not an Arrow file ({error})") from None
         return from_row(table, str(path), name, self.image_size)
 
-    def _shard(self, number: int, path: Path) -> "_OpenShard":
+    def _shard(self, number: int, path: Path) -> "OpenShard":
         if number not in self._opened:
             shard = self.shards[number]
             if self.address is not None:
                 _fetch(self.address, shard, path)
-            opened = _OpenShard(require_file(path))
+            opened = OpenShard(require_file(path))
             if not opened.schema.equals(SCHEMA):
                 raise UnreadableFile("its columns are not those of a packed store")
             if len(opened.places) != len(shard.sequences):
@@ -168,7 +168,7 @@ class PackedSource(SequenceSource):
         return {**self.__dict__, "_opened": {}}
 
 
-class _OpenShard:
+class OpenShard:
     """Memory-mapped shard, whose rows are record batches that are parsed when they are read.
 
     Arrow's description of a parsed batch takes 8 kB, or half a gigabyte in every process for all RealEstate10K clips.
