@@ -48,7 +48,7 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
 
 def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path) -> None:
     """Write `show.png`: images and cameras of some sequences, evenly spread over a split."""
-    from completesplat.studies.contact_sheet import write_contact_sheet
+    from completesplat.studies.contact_sheet import show as draw
 
     source = _sources(data, [split])[split]
     names = source.names
@@ -56,9 +56,7 @@ def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: P
     sequences = list(_readable(source, chosen))
     if not sequences:
         raise DataError(f"no {split} sequences that can be used", str(data.root))
-    write_contact_sheet(
-        sequences, out / "show.png", images, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences"
-    )
+    draw(sequences, out / "show.png", images, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences")
 
 
 def prepare(

@@ -176,7 +176,7 @@ def _extent(points: Points) -> float:
     return float((points.amax(dim=0) - points.amin(dim=0)).max())
 
 
-def write_contact_sheet(sequences: Sequence[PosedSequence], path: Path, images: int, title: str) -> None:
+def show(sequences: Sequence[PosedSequence], path: Path, images: int, title: str) -> None:
     """Write a PNG with a row for each sequence: some images, and its cameras from above and from the side.
 
     The images are evenly spaced from first to last frame. An unreadable image is a grey cell with the error's kind.
