@@ -25,12 +25,11 @@ from completesplat.data.packed.manifest import (
     Split,
     differences,
     is_packed,
-    parsed,
     write_json,
 )
 from completesplat.data.packed.rows import CODECS, encode_image, schema, to_row
 from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource
-from completesplat.data.validation import TooFewFrames, at, field, read_json, refused_to
+from completesplat.data.validation import TooFewFrames, at, field, parsed, read_json, refused_to
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import atomic_path
