@@ -56,9 +56,7 @@ def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: P
     sequences = list(_readable(source, chosen))
     if not sequences:
         raise DataError(f"no {split} sequences that can be used", str(data.root))
-    write_contact_sheet(
-        sequences, out / "show.png", images, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences"
-    )
+    draw(sequences, out / "show.png", images, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences")
 
 
 def prepare(
