@@ -171,6 +171,23 @@ def test_a_lightning_with_other_names_keeps_its_own_behaviour_with_a_warning(own
     assert "its own way" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("ends", "status"), [("kill -TERM $$", 128 + signal.SIGTERM), ("exit 1", -signal.SIGKILL), ("exit 0", 0)]
+)
+def test_a_process_ends_as_one_that_it_started(ends, status):
+    """While another child works on, it holds the pipe, so that reading it ends with the last process."""
+    work, wait = (3, 5) if status == 0 else (LIMIT, LIMIT)
+    lines = ["import subprocess, time", "from lightning.fabric.strategies.launchers import subprocess_script"]
+    lines += ["from completesplat.signals import ended_by_signals"]
+    lines += ["from completesplat.training.stopping import stopped_together"]
+    lines += ["with stopped_together(), ended_by_signals():"]
+    lines += [f"    commands = 'sleep 1; {ends}', 'exec sleep {work}'"]
+    lines += ["    started = [subprocess.Popen(['sh', '-c', command]) for command in commands]"]
+    lines += ["    subprocess_script._launch_process_observer(started)", f"    time.sleep({wait})"]
+    done = subprocess.run([sys.executable, "-c", "\n".join(lines)], timeout=LIMIT / 3, stdout=subprocess.PIPE)
+    assert done.returncode == status
+
+
 def test_numbers_of_signals_are_written_to_a_socket_that_is_open_and_to_nothing_else():
     """A file that gets a closed socket's number, such as a checkpoint, would get a byte with each signal."""
     with stopped_together():
