@@ -83,12 +83,18 @@ CAPTURES: dict[str, tuple[Callable[[Path], Path], np.ndarray]] = {
 }
 
 
+def first_image(folder: Path) -> torch.Tensor:
+    source = CaptureDataModule(str(folder), image_size=SIZE).source("train")
+    return source.read(source.names[0]).read(0).image.float()
+
+
 @pytest.mark.parametrize("case", CAPTURES)
-def test_a_capture_has_the_cameras_of_its_scene(case: str, tmp_path: Path) -> None:
+def test_a_capture_has_the_cameras_and_images_of_its_scene(case: str, tmp_path: Path) -> None:
     write, shift = CAPTURES[case]
     cameras, expected = read_cameras(write(tmp_path / case)), true_cameras(shift)
     for name, values in expected.items():
         np.testing.assert_allclose(cameras[name], values, atol=1e-6, rtol=0, err_msg=name)
+    assert (first_image(tmp_path / case) - first_image(capture("", tmp_path / "truth"))).abs().mean() < 4
 
 
 def test_statistics_of_cameras_that_are_all_equally_far_are_drawn(command, tmp_path: Path) -> None:
