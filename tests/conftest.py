@@ -28,13 +28,15 @@ Folders = Callable[[str, Callable[[Path], object]], Path]
 def pytest_collection() -> Iterator[None]:
     """Keep the garbage collector from searching all imported objects, now and later: a third of the collection's time.
 
-    For the same reason this file imports what is heavy inside its fixtures.
+    For the same reason this file imports what is heavy inside its fixtures. While tests run, garbage is searched for
+    less often than by default, because commands import hundreds of modules, and a search visits all their objects.
     """
     gc.disable()
     try:
         return (yield)
     finally:
         gc.freeze()
+        gc.set_threshold(50_000, 50, 100)
         gc.enable()
 
 

@@ -100,12 +100,11 @@ def on_gpu(config: DictConfig) -> Training:
         return Training(instantiate(config.model, _convert_="all"), "bf16-mixed")
 
 
-SMALL_DIFFUSION = ("toy_diffusion", "data.image_size=32", *NETWORKS)
+SMALL = ("data.image_size=32", *NETWORKS)
+LARGE = [pytest.param((experiment,), marks=pytest.mark.slow) for experiment in PAPER[1:3]]
 
 
-@pytest.mark.parametrize(
-    "settings", [("paper_var_stage2",), SMALL_DIFFUSION, pytest.param(("paper_diffusion",), marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("settings", [("toy_var", *SMALL), ("toy_diffusion", *SMALL), *LARGE])
 def test_a_forward_pass_on_a_gpu_finds_all_tensors_there_and_keeps_what_is_counted(
     settings: tuple[str, ...], pretended_gpu: None
 ) -> None:

@@ -1,8 +1,6 @@
-"""Meshes of strangers: textures that cannot be read, files outside of the folder, pipes, stray faces."""
+"""Meshes of strangers: files outside of the folder, pipes, stray faces. `test_cases.py` has damaged textures."""
 
-import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import meshes
@@ -40,49 +38,6 @@ def stand_in(tmp_path) -> str:
 def png(path: Path) -> bytes:
     Image.new("RGB", (8, 8), (200, 40, 40)).save(path)
     return path.read_bytes()
-
-
-def with_texture(folder: Path, texture: bytes) -> None:
-    (folder / "t.png").write_bytes(texture)
-    meshes.write_gltf(folder / "a.gltf", "t.png")
-
-
-def damaged(folder: Path) -> None:
-    with_texture(folder, png(folder / "t.png").replace(b"IDAT", b"IDAX"))
-
-
-def cut(folder: Path) -> None:
-    with_texture(folder, png(folder / "t.png")[:60])
-
-
-def pointer(folder: Path) -> None:
-    with_texture(folder, b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 218\n")
-
-
-def ktx2(folder: Path) -> None:
-    meshes.write_gltf(folder / "a.gltf", "t.ktx2")
-    content = json.loads((folder / "a.gltf").read_text())
-    content["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
-    (folder / "a.gltf").write_text(json.dumps(content | {"extensionsUsed": ["KHR_texture_basisu"]}))
-    (folder / "t.ktx2").write_bytes(b"\xabKTX 20\xbb\r\n\x1a\n")
-
-
-@pytest.mark.blender
-@pytest.mark.parametrize(
-    ("write", "reason"),
-    [
-        (damaged, "its texture t.png cannot be read: damaged, or a pointer of Git LFS"),
-        (cut, "its texture t.png cannot be read: damaged, or a pointer of Git LFS"),
-        (pointer, "its texture t.png cannot be read: damaged, or a pointer of Git LFS"),
-        (ktx2, "it has a texture in a format that Blender does not read, such as KTX2"),
-    ],
-)
-@pytest.mark.usefixtures("blender")
-def test_a_texture_that_cannot_be_read_leaves_its_mesh_out(tmp_path, write: Callable[[Path], None], reason):
-    (tmp_path / "meshes").mkdir()
-    write(tmp_path / "meshes")
-    with pytest.raises(DataError, match=f"none of 1 objects can be rendered: {reason}$"):
-        render(str(tmp_path / "meshes"), out=tmp_path / "data", **QUICK)
 
 
 def named_by_obj(folder: Path, texture: str, library: str = "a.mtl") -> None:
