@@ -13,11 +13,10 @@ if TYPE_CHECKING:
     from completesplat.export.ply import write_ply as write_ply
     from completesplat.gaussians import Gaussians as Gaussians
     from completesplat.generator import CompleteSplat as CompleteSplat
-
-__version__ = "0.1.0"
+    from completesplat.version import __version__ as __version__
 
 _PLACES = {"CompleteSplat": "generator", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
-_PLACES |= {"compose": "settings.composition", "instantiate": "commands.fit"}
+_PLACES |= {"compose": "settings.composition", "instantiate": "commands.fit", "__version__": "version"}
 _PLACES |= {"LatentDiffusion": "training.latent_diffusion", "ReconstructionModule": "training.reconstruction"}
 
 

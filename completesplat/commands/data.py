@@ -96,7 +96,7 @@ def latents(
     from lightning import Fabric
 
     from completesplat.autoreconstructor.model import VariationalAutoReconstructor
-    from completesplat.opening import config_of_run
+    from completesplat.run_configs import config_of_run
     from completesplat.training.encoding import encode_training_set
     from completesplat.training.stopping import stopped_together
     from completesplat.weights.checkpoint_reading import load_part

@@ -24,7 +24,7 @@ from completesplat.results.runs import MODEL
 from completesplat.results.tables import Column, evaluation_table, show, table
 from completesplat.settings.schema import Natural, Positive, Range
 from completesplat.training.loggers import wandb_runs
-from completesplat.training.stage import Stage
+from completesplat.training.scoring import Scorer
 from completesplat.training.stopping import stopped_together
 
 Config = Mapping[str, Any]
@@ -66,7 +66,7 @@ def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
     return larger
 
 
-def set_scoring(module: Stage, evaluation: Config) -> None:
+def set_scoring(module: Scorer, evaluation: Config) -> None:
     """Give a model the protocol's metrics; raise CompleteSplatError if it cannot draw several samples."""
     module.evaluation = instantiate(evaluation["scoring"], _convert_="all")
     if module.evaluation.samples > 1 and not module.draws_samples:
@@ -170,7 +170,7 @@ def run_hidden_modes(
         print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
 
 
-def _modes_protocol(evaluation: HiddenModesEvaluation, module: Stage, data: SceneDataModule) -> dict[str, object]:
+def _modes_protocol(evaluation: HiddenModesEvaluation, module: Scorer, data: SceneDataModule) -> dict[str, object]:
     """Return the record of what was measured and how."""
     return {
         "name": evaluation["name"],

@@ -21,7 +21,6 @@ from hydra.types import RunMode
 from hydra.utils import get_method, instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from completesplat import __version__
 from completesplat.commands.imports import importing, postponing
 from completesplat.commands.protocol import git_commit, write_json
 from completesplat.errors import CompleteSplatError
@@ -31,6 +30,7 @@ from completesplat.settings.composition import resolved_settings, use_working_fo
 from completesplat.settings.options import did_you_mean
 from completesplat.settings.schema import check_settings
 from completesplat.signals import Interrupted, ended_by_signals
+from completesplat.version import __version__
 from completesplat.weights import RUN_CHECKPOINT
 
 CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"

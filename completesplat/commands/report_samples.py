@@ -30,7 +30,7 @@ from completesplat.studies import depth as depth_study
 from completesplat.studies import noise_levels
 from completesplat.studies.controls import Tick
 from completesplat.studies.samples import SampleRenderer, first_scenes
-from completesplat.training.stage import Stage
+from completesplat.training.scoring import Scorer
 
 Weights = Annotated[Sequence[Share], Entries(1)]
 
@@ -127,7 +127,7 @@ def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], dict[s
         yield renderer, scenes, settings, lambda text: status.update(f"drawing: {text}")
 
 
-def _opened_stage(run: Run) -> tuple[Stage, SceneDataModule]:
+def _opened_stage(run: Run) -> tuple[Scorer, SceneDataModule]:
     """Return the stage, on a GPU if there is one, and the data."""
     quieten()
     model = run["ckpt"], run["overrides"], run["trust"], run["weights"]

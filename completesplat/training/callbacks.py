@@ -22,7 +22,8 @@ from completesplat.data.loading.distributed import gathered, mean_of_processes
 from completesplat.errors import DivergenceError
 from completesplat.scene import Batch
 from completesplat.settings.schema import Positive, Share
-from completesplat.training.stage import Stage, now
+from completesplat.training.scoring import now
+from completesplat.training.stage import Stage
 
 BAD_STEPS = "train/bad_steps"
 FETCHING = "[_TrainingEpochLoop].train_dataloader_next"

@@ -17,7 +17,6 @@ from rich.filesize import decimal
 from rich.progress import track
 from torch import nn
 
-from completesplat import __version__
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import gathered, processes
@@ -39,6 +38,7 @@ from completesplat.data.sequences import PosedSequence, spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
+from completesplat.version import __version__
 from completesplat.weights import sha256_of
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
