@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from completesplat.export.ply import write_ply as write_ply
     from completesplat.gaussians import Gaussians as Gaussians
     from completesplat.generator import CompleteSplat as CompleteSplat
-
-__version__ = "0.1.0"
+    from completesplat.version import __version__ as __version__
 
 # By default, threads of torch's GNU OpenMP spin while they wait for the next of hundreds of small parallel regions.
 # Beside another busy process they keep the threads that they wait for off the cores. What a user has set (also
@@ -25,7 +24,7 @@ if "torch" not in sys.modules:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _PLACES = {"CompleteSplat": "generator", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
-_PLACES |= {"compose": "settings.composition", "instantiate": "commands.fit"}
+_PLACES |= {"compose": "settings.composition", "instantiate": "commands.fit", "__version__": "version"}
 _PLACES |= {"LatentDiffusion": "training.latent_diffusion", "ReconstructionModule": "training.reconstruction"}
 
 

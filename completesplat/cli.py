@@ -37,7 +37,7 @@ def _run() -> None:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         return _help()
     if arguments[0] == "--version":
-        from completesplat import __version__
+        from completesplat.version import __version__
 
         return print(f"completesplat {__version__}")
     if arguments[0] not in VERBS:

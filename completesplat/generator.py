@@ -15,21 +15,20 @@ from torch import Tensor
 
 from completesplat.autoreconstructor.encoder import Images
 from completesplat.autoreconstructor.model import DepthRange, VariationalAutoReconstructor
-from completesplat.baselines.splatter_image.files import is_published
-from completesplat.baselines.splatter_image.model import PublishedOneAnswer
+from completesplat.baselines.splatter_image.model import PublishedOneAnswer, is_published
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.diffusion.sampling import Sampler, draw_noise, in_parts, with_forward_process
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.opening import locate, read_saved
-from completesplat.opening.parts import PartConfig, build, check_architecture, untrained
+from completesplat.parts import PartConfig, build, check_architecture, read_weights, saved
+from completesplat.run_configs import read_run
 from completesplat.scene import Views
-from completesplat.scene_model import SceneModel, Visible, camera_tensors
+from completesplat.scene_model import SceneModel, Visible
 from completesplat.settings.schema import Natural, Positive, Seed
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import concatenate, in_float32
-from completesplat.weights import first_line
+from completesplat.weights import WEIGHTS_FILE, first_line, locate
 from completesplat.weights.checkpoint_reading import mismatch, not_finite
 
 
@@ -42,10 +41,10 @@ class CompleteSplat(SceneModel):
     Args:
         autoreconstructor, conditioning, denoiser, sampler: configs of the parts.
         image_size: side of the square images, in pixels.
-        training: facts about the training images (`completesplat.opening.parts.TrainingImages`).
+        training: facts about the training images (`completesplat.parts.TrainingImages`).
 
     Raises:
-        WeightsError: a config has a part or an option that weights may not name (`completesplat.opening.parts`).
+        WeightsError: a config has a part or an option that weights may not name (`completesplat.parts`).
     """
 
     latent_mean: Tensor
@@ -63,10 +62,10 @@ class CompleteSplat(SceneModel):
         training: Mapping[str, object] | None = None,
     ) -> None:
         parts = {"autoreconstructor": autoreconstructor, "conditioning": conditioning, "denoiser": denoiser}
-        saved: dict[str, PartConfig] = {name: untrained(part) for name, part in parts.items()}
-        super().__init__(_checked({**saved, "sampler": dict(sampler), "image_size": image_size}, training))
+        super().__init__(_architecture({**parts, "sampler": sampler}, image_size, training))
         # Its weights come from a trained stage, so Stable Diffusion's are not needed.
-        self.autoreconstructor: VariationalAutoReconstructor = build(saved["autoreconstructor"]).requires_grad_(False)
+        frozen: VariationalAutoReconstructor = build(self.architecture["autoreconstructor"])
+        self.autoreconstructor = frozen.requires_grad_(False)
         self.conditioning = build(conditioning)
         self.denoiser = build(denoiser)
         self.sampler: Sampler = build(sampler)
@@ -175,7 +174,7 @@ class CompleteSplat(SceneModel):
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Use another sampler from now on, with the noise schedule and prediction type of training."""
-        config = with_forward_process(sampler, self.architecture["sampler"])
+        config = saved(with_forward_process(sampler, self.architecture["sampler"]))
         check_architecture({**self.architecture, "sampler": config})
         self.sampler = build(config)
         self.architecture["sampler"] = config
@@ -186,16 +185,15 @@ class CompleteSplat(SceneModel):
         """Load what `save_pretrained` wrote or a run trained, in evaluation mode on the CPU; stage 1 is a `OneAnswer`.
 
         Args:
-            path: a name, folder, run, checkpoint or hub id (`completesplat.opening.locate`). Published weights of
-                Splatter Image give a `PublishedOneAnswer`.
+            path: a name of shipped weights, a folder of weights or of a run, a checkpoint, or an id on the Hugging Face
+                hub (`locate`). Published weights of Splatter Image (`is_published`) give a `PublishedOneAnswer`.
 
         Raises:
             WeightsError: files are missing, unreadable, changed, not finite, do not belong together, or name parts that
-                `completesplat.opening.parts` does not allow; or the run's model makes no scene from a photo.
+                `completesplat.parts` does not allow; or the run's model makes no scene from a photo.
         """
         try:
-            file = locate(path)
-            model = PublishedOneAnswer(str(file)) if is_published(file) else _loaded(*read_saved(file))
+            model = _opened(path)
             name = not_finite(model.state_dict())
         except WeightsError:
             raise
@@ -212,37 +210,36 @@ class OneAnswer(SceneModel):
     Args:
         network: config of the network, as in `conf/`.
         image_size: side of the square images, in pixels.
-        training: facts about the training images (`completesplat.opening.parts.TrainingImages`).
+        training: facts about the training images (`completesplat.parts.TrainingImages`).
 
     Raises:
-        WeightsError: the config has a part or an option that weights may not name (`completesplat.opening.parts`).
+        WeightsError: the config has a part or an option that weights may not name (`completesplat.parts`).
     """
 
     def __init__(self, network: PartConfig, image_size: int, training: Mapping[str, object] | None = None) -> None:
-        super().__init__(_checked({"network": untrained(network), "image_size": image_size}, training))
+        super().__init__(_architecture({"network": network}, image_size, training))
         with torch.random.fork_rng(devices=[]):  # initial weights are random; a run's later draws stay the same
             self.network = build(self.architecture["network"])
 
-    @staticmethod
-    def with_trained(
-        architecture: Mapping[str, Any], network: Mapping[str, Tensor], camera: Mapping[str, Any]
-    ) -> "OneAnswer":
-        """Return a trained network's model, with its data's typical camera; raise WeightsError if they do not fit."""
-        model = OneAnswer(**architecture)
-        model.load_state_dict({f"network.{name}": x for name, x in network.items()} | camera_tensors(camera))
-        return model.eval()
+
+def _architecture(
+    parts: Mapping[str, PartConfig], image_size: int, training: Mapping[str, object] | None
+) -> dict[str, Any]:
+    """Return a model's config as weights store it; raise WeightsError for parts that weights may not name."""
+    config: dict[str, Any] = {name: saved(part) for name, part in parts.items()} | {"image_size": image_size}
+    config |= {} if training is None else {"training": dict(training)}
+    check_architecture(config)
+    return config
 
 
-def _checked(architecture: dict[str, Any], training: Mapping[str, object] | None) -> dict[str, Any]:
-    """Return a model's config with the facts about its training images, if they are known, after checking it."""
-    complete = architecture if training is None else {**architecture, "training": dict(training)}
-    check_architecture(complete)
-    return complete
-
-
-def _loaded(architecture: dict[str, Any], tensors: Mapping[str, Tensor]) -> SceneModel:
-    model = (OneAnswer if "network" in architecture else CompleteSplat)(**architecture)
+def _opened(path: Path | str) -> SceneModel:
+    if is_published(path):
+        return PublishedOneAnswer(str(path))
+    file = locate(path)
+    architecture, tensors = (read_weights if file.name == WEIGHTS_FILE else read_run)(file)
+    model: SceneModel = (OneAnswer if "network" in architecture else CompleteSplat)(**architecture)
     if (difference := mismatch(model.state_dict(), tensors)) is not None:
         raise ValueError(difference)
     model.load_state_dict(tensors)
+    model.file = file
     return model

@@ -40,6 +40,7 @@ class SceneModel(nn.Module):
 
     Attributes:
         background: grey value behind the objects in all its training images; None if they show whole scenes.
+        file: file of tensors that it was read from, if it was.
     """
 
     network: ReconstructionModel
@@ -57,6 +58,7 @@ class SceneModel(nn.Module):
         super().__init__()
         self.architecture = architecture
         self.image_size: int = architecture["image_size"]
+        self.file: Path | None = None
         self.background: float | None = (architecture.get("training") or {}).get("background")
         # These are measured on the training set and serve photos of unknown cameras.
         self.register_buffer("fov_degrees", torch.tensor(50.0))

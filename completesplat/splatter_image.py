@@ -198,3 +198,11 @@ def _upstream_variance(group: Group) -> float:
     first = inputs * 0.2**2 * 2 / (inputs + outputs)
     second = CHANNELS * group.gain**2 * 2 / (CHANNELS + group.channels)
     return first * second
+
+
+@torch.no_grad()
+def zeroed(layer: nn.Module) -> nn.Module:
+    """Set all weights of a layer to zero, and return it."""
+    for parameter in layer.parameters():
+        parameter.zero_()
+    return layer

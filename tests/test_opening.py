@@ -10,8 +10,7 @@ import pytest
 from completesplat import weights
 from completesplat.errors import WeightsError
 from completesplat.generator import CompleteSplat
-from completesplat.opening import locate
-from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, shipped, write_sums
+from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, locate, shipped, write_sums
 
 
 @pytest.fixture
@@ -84,7 +83,7 @@ def test_without_a_network_a_name_on_the_hub_is_refused_at_once(name, tmp_path, 
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
     monkeypatch.setattr(time, "sleep", waits.append)
     with pytest.raises(WeightsError, match=r"not to be had from the hub \(.*name resolution"):
-        locate(name)
+        CompleteSplat.from_pretrained(name)
     assert (waits, caplog.text) == ([], "")
 
 
@@ -93,7 +92,7 @@ def test_published_weights_that_the_hubs_copy_lacks_are_named(tmp_path, monkeypa
     with pytest.raises(
         WeightsError, match=r"splatter_image:tables: config_tables\.yaml or model_tables\.pth is not in"
     ):
-        locate("splatter_image:tables")
+        CompleteSplat.from_pretrained("splatter_image:tables")
 
 
 def test_a_name_that_is_too_long_for_a_file_is_refused_in_a_short_line():

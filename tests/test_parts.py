@@ -9,11 +9,12 @@ from collections.abc import Iterator
 from functools import reduce
 
 import pytest
+import torch
 from support import compose_config
 
 from completesplat.errors import WeightsError
 from completesplat.generator import CompleteSplat
-from completesplat.opening.parts import CLASSES, PARTS, check_architecture, settings_of
+from completesplat.parts import CHOICES, PARTS, check_architecture, settings_of
 from completesplat.settings.schema import refused
 from completesplat.weights import CONFIG_FILE, LARGEST_TEXT, SHIPPED, SUMS_FILE
 
@@ -80,7 +81,11 @@ def test_a_configuration_names_nothing_but_parts_of_a_model(folder, trap, place,
 @pytest.mark.parametrize(
     ("place", "value", "reason"),
     [
-        ("denoiser._target_", "mine.Mine", "denoiser names mine.Mine, which is no part of a model; allowed are comp"),
+        (
+            "denoiser._target_",
+            "mine.Mine",
+            "denoiser names mine.Mine, which is no part of a model; allowed are Den",
+        ),
         ("denoiser._target_", "\x1b[2J", r"denoiser names \x1b[2J, which is no part"),
         ("sampler._partial_", True, "sampler._partial_: there is no such setting, but scheduler, steps"),
         ("sampler.steps", "${oc.env:HOME}", "sampler.steps=${oc.env:HOME}: must be a whole number"),
@@ -101,6 +106,23 @@ def test_settings_are_of_their_kinds_and_within_bounds(folder, place, value, rea
     assert message.startswith(f"{folder / CONFIG_FILE}: ")
     assert reason in message
     assert len(message) < 1000
+
+
+def targets(part: dict) -> list[str]:
+    inner = [name for value in part.values() if isinstance(value, dict) for name in targets(value)]
+    return [part["_target_"], *inner] if "_target_" in part else inner
+
+
+def test_weights_name_classes_by_name_and_their_paths_in_other_versions_count_too(folder):
+    assert set(targets(json.loads((folder / CONFIG_FILE).read_text()))) <= PARTS.keys()
+    assert any("completesplat.autoreconstructor." in path for path in targets(SHIPPED_CONFIG))
+    before = CompleteSplat.from_pretrained(folder)
+    for place in ("denoiser", ENCODER, SCHEDULER):
+        part = reduce(dict.__getitem__, place.split("."), before.architecture)
+        change(folder, f"{place}._target_", f"completesplat.moved.elsewhere.{part['_target_']}")
+    after = CompleteSplat.from_pretrained(folder)
+    assert after.architecture == before.architecture
+    assert all(torch.equal(value, after.state_dict()[name]) for name, value in before.state_dict().items())
 
 
 def test_what_is_no_configuration_at_all_is_refused(folder):
@@ -157,9 +179,9 @@ def test_any_value_in_any_place_is_refused_as_weights_are_or_is_of_the_settings_
 
 
 def test_every_setting_of_every_class_is_checked():
-    for kind in CLASSES.values():
+    for kind in PARTS.values():
         for name, hint in settings_of(kind).items():
-            assert name in PARTS or refused(hint, object()), (kind, name)
+            assert name in CHOICES or refused(hint, object()), (kind, name)
 
 
 @pytest.mark.parametrize(
@@ -174,4 +196,4 @@ def test_every_setting_of_every_class_is_checked():
 def test_what_the_configuration_tree_offers_may_be_saved_and_loaded(chosen):
     config = compose_config("fit", "model=latent_diffusion", "autoreconstructor.pretrained=null", *chosen)
     config = config.model.completesplat
-    check_architecture({name: config[name] for name in (*PARTS.keys() & config.keys(), "image_size")})
+    check_architecture({name: config[name] for name in (*CHOICES.keys() & config.keys(), "image_size")})

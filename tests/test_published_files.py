@@ -8,7 +8,7 @@ import torch
 import yaml
 from published_weights import config, write_published
 
-from completesplat.baselines.splatter_image.files import find, is_published, read_tensors
+from completesplat.baselines.splatter_image.model import find, is_published, read_tensors
 from completesplat.errors import WeightsError
 
 

@@ -6,13 +6,16 @@ import sys
 
 import pytest
 import torch
+from hydra.utils import get_object
 from omegaconf import OmegaConf
 from support import compose_config
 
 from completesplat.commands import conf_folder
 from completesplat.commands.jobs import use_working_folder
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.opening import GROUPS, config_of_run
+from completesplat.run_configs import GROUPS, config_of_run
+from completesplat.settings.checks import start_weights
+from completesplat.settings.schema import arguments_of
 
 MINE = """
 import json
@@ -152,6 +155,30 @@ def test_settings_of_the_working_folder_do_not_widen_what_a_run_may_name(run, tm
     name(run, {"_target_": "os.system", "command": "true"})
     with pytest.raises(WeightsError, match="not defined in a module of your own"):
         configuration(run)
+
+
+def test_parts_that_have_moved_are_found_by_their_names(run, elsewhere):
+    """Other versions had them in other modules. A name that is no part stays refused."""
+    before = configuration(run)
+    name(run, before.model._target_.replace("training.", "moved.by."), "model._target_")
+    name(run, "completesplat.moved.Encoder", "model.model.encoder._target_")
+    assert configuration(run) == before
+    for target in ("completesplat.moved.launch", "moved.Encoder"):
+        name(run, target, "model.model.encoder._target_")
+        with pytest.raises(WeightsError, match=f"names {target}, "):
+            configuration(run)
+    targets = {path for group in GROUPS for file in (conf_folder() / group).glob("*.yaml") for path in named_in(file)}
+    assert len({path.rpartition(".")[2] for path in targets}) == len(targets) > 40
+
+
+def named_in(file):
+    return re.findall(r"_target_: (\w[\w.]+)", file.read_text())
+
+
+def test_settings_of_weights_to_start_from_are_declared_by_their_classes():
+    for kind in {get_object(path) for file in conf_folder().glob("*/*.yaml") for path in named_in(file)}:
+        settings = {name for name in arguments_of(kind)[0] if name == "pretrained" or name.endswith("checkpoint")}
+        assert settings == start_weights(kind).keys(), kind
 
 
 def test_what_the_user_changes_may_name_anything_and_what_the_package_offers_needs_no_trust(run, elsewhere):

@@ -10,11 +10,10 @@ from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.trajectories import orbit
 from completesplat.metrics.images import psnr
-from completesplat.opening import locate
 from completesplat.rasterizers.tiled import TiledRasterizer
 from completesplat.tensors import stack
-from completesplat.training.stage import copy_reference, repeat_image
-from completesplat.weights import SHIPPED, SUMS_FILE, shipped
+from completesplat.training.scoring import copy_reference, repeat_image
+from completesplat.weights import SHIPPED, SUMS_FILE, locate, shipped
 
 NAME, COUCHES, FRUITS = "toy_objects", "rendered_couches", "fruits"
 

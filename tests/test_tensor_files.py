@@ -13,7 +13,7 @@ import pytest
 import torch
 from fuzzing import CLEAR, bounded
 
-from completesplat.baselines.splatter_image.files import STATE, read_tensors
+from completesplat.baselines.splatter_image.model import STATE, read_tensors
 from completesplat.data.realestate10k.clips import read_chunk
 from completesplat.errors import CompleteSplatError, TensorFileError
 from completesplat.weights.checkpoint_reading import read_checkpoint, read_tensor_file

@@ -23,14 +23,6 @@ def recompute(block: nn.Module, *inputs: Tensor | None) -> Tensor:
     return output
 
 
-@torch.no_grad()
-def zeroed(layer: nn.Module) -> nn.Module:
-    """Set all weights of a layer to zero, and return it."""
-    for parameter in layer.parameters():
-        parameter.zero_()
-    return layer
-
-
 def vae_encoder(inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, groups: int) -> vae.Encoder:
     """Build the network of Stable Diffusion's VAE encoder; the resolution halves between levels."""
     return vae.Encoder(
@@ -59,6 +51,9 @@ class Encoder(nn.Module):
         first_log_variance: approximate log-variance of the posterior at the start, without pretrained weights. At 0,
             noise of standard deviation 1 hides what the latents encode at first.
     """
+
+    halves_images = True
+    """Whether each level of `channels` but the last halves the sides of what the network gets."""
 
     def __init__(
         self,

@@ -7,9 +7,9 @@ from diffusers.models.autoencoders import vae
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from completesplat.autoreconstructor.encoder import recompute, zeroed
+from completesplat.autoreconstructor.encoder import recompute
 from completesplat.settings.schema import Few, Levels, Width, Widths
-from completesplat.splatter_image import Parameterization, SplatterImage, from_channels, initialize_head
+from completesplat.splatter_image import Parameterization, SplatterImage, from_channels, initialize_head, zeroed
 
 
 class Reconstructor(nn.Module):

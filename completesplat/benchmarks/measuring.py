@@ -7,7 +7,7 @@ from typing import Any
 from completesplat.files import write_json
 from completesplat.results.machine import machine
 from completesplat.results.tables import records_table, show
-from completesplat.training.stage import now
+from completesplat.training.scoring import now
 
 Work = Callable[[], object]
 Row = dict[str, object]  # of a table; its values can be written as JSON

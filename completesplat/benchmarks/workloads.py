@@ -9,7 +9,7 @@ from torch import Tensor
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unproject
 from completesplat.rasterizers import Rasterizer
-from completesplat.training.stage import now
+from completesplat.training.scoring import now
 from completesplat.training.steps import DISTANCE, FOV_DEGREES, cameras_on_orbit
 
 OPACITIES = ("trained", "initial")

@@ -48,7 +48,6 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
 
 def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path) -> None:
     """Write `show.png`: images of some sequences, evenly spread over a split."""
-    from completesplat.studies.contact_sheet import write_contact_sheet
 
     source = _sources(data, [split])[split]
     names = source.names
@@ -56,7 +55,9 @@ def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: P
     sequences = list(_readable(source, chosen))
     if not sequences:
         raise DataError(f"no {split} sequences that can be used", str(data.root))
-    draw(sequences, out / "show.png", images, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences")
+    write_contact_sheet(
+        sequences, out / "show.png", images, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences"
+    )
 
 
 def prepare(
@@ -96,7 +97,7 @@ def latents(
     from lightning import Fabric
 
     from completesplat.autoreconstructor.model import VariationalAutoReconstructor
-    from completesplat.opening import config_of_run
+    from completesplat.run_configs import config_of_run
     from completesplat.training.encoding import encode_training_set
     from completesplat.training.stopping import stopped_together
     from completesplat.weights.checkpoint_reading import load_part

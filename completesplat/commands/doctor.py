@@ -17,10 +17,10 @@ from rich.filesize import decimal
 from rich.table import Table
 from rich.text import Text
 
-from completesplat import __version__
 from completesplat.data.rendered.blender import find_blender
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import write_json
+from completesplat.version import __version__
 from completesplat.weights import SHIPPED, SUMS_FILE, check_folder
 
 EXTRAS = {

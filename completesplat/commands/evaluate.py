@@ -27,7 +27,7 @@ from completesplat.results.tables import records_table, show
 from completesplat.settings.checks import EvaluationSettings, Tested
 from completesplat.settings.schema import Natural, Positive, Range
 from completesplat.training.loggers import wandb_runs
-from completesplat.training.stage import Stage
+from completesplat.training.scoring import Scorer
 from completesplat.training.stopping import stopped_together
 
 Config = Mapping[str, Any]
@@ -69,7 +69,7 @@ def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
     return larger
 
 
-def set_scoring(module: Stage, evaluation: Config) -> None:
+def set_scoring(module: Scorer, evaluation: Config) -> None:
     """Give a model the protocol's metrics; raise CompleteSplatError if it cannot draw several samples."""
     module.evaluation = instantiate(evaluation["scoring"], _convert_="all")
     if module.evaluation.samples > 1 and not module.draws_samples:

@@ -25,9 +25,17 @@ from completesplat.files import write_json
 from completesplat.results.measured import evaluation_table
 from completesplat.results.runs import PLAN, read_record
 from completesplat.results.tables import show
-from completesplat.settings.checks import check_image_size, check_optimizer, check_verb
+from completesplat.settings.checks import (
+    check_image_size,
+    check_optimizer,
+    check_verb,
+    each_part,
+    remove_start_weights,
+)
+from completesplat.settings.schema import start_weights
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs
+from completesplat.training.scoring import Scorer
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
 from completesplat.weights import RUN_WEIGHTS
@@ -35,17 +43,8 @@ from completesplat.weights.checkpoint_reading import check_whole
 
 logger = logging.getLogger(__name__)
 
-OTHER_WEIGHTS = {"pretrained", "checkpoint", "autoreconstructor_checkpoint"}  # settings of weights to start from
-EXAMPLES = {
-    "root": "DIR",
-    "pretrained": "CompVis/stable-diffusion-v1-4, or null for random weights",
-    "checkpoint": "RUN/checkpoints/last.ckpt",
-    "autoreconstructor_checkpoint": "RUN/checkpoints/last.ckpt of stage 1",
-}
-"""Examples of settings that may be missing."""
 
-
-def instantiate(config: DictConfig) -> tuple[SceneDataModule, Stage]:
+def instantiate(config: DictConfig) -> tuple[SceneDataModule, Scorer]:
     """Return the LightningDataModule and the LightningModule of a config that `completesplat.compose` returned.
 
     They are what `completesplat fit` trains. Checkpoints of the model hold its config, which `load_from_checkpoint`
@@ -62,7 +61,8 @@ def instantiate(config: DictConfig) -> tuple[SceneDataModule, Stage]:
     data, module = build(config.data, _convert_="all"), build(config.model, _convert_="all")
     if config.test:
         set_scoring(module, config.evaluation)
-    module.keep_config(config.model)
+    if isinstance(module, Stage):
+        module.keep_config(config.model)
     return data, module
 
 
@@ -89,7 +89,7 @@ def run(config: DictConfig, out: Path) -> None:
         logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, share)
     metrics = {}
     with wandb_runs(loggers, config):
-        if any(parameter.requires_grad for parameter in module.parameters()):
+        if isinstance(module, Stage):
             with _refusing_other_models(checkpoint):
                 trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
             metrics = _logged(trainer)
@@ -122,9 +122,7 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
     if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
     check_whole(Path(path))  # now, because data may be made first
-    for part in (config.autoreconstructor, config.conditioning, config.model):
-        for key in OTHER_WEIGHTS & part.keys():
-            part[key] = None
+    remove_start_weights(config.model)
     return str(path)
 
 
@@ -153,17 +151,20 @@ def refuse_without_effect(config: DictConfig, out: Path) -> None:
 
 def refuse_missing(config: DictConfig) -> None:
     """Raise CompleteSplatError, with an example, for a setting of data or model that is missing or an empty text."""
+    examples = {"root": "DIR"}
+    for _, kind in each_part(config.model):
+        examples |= start_weights(kind)
     missing = [key for part in (config.data, config.model) for key in sorted(OmegaConf.missing_keys(part))]
-    missing += [f"model.{key}" for key in sorted(OTHER_WEIGHTS) if config.model.get(key) == ""]
+    missing += [f"model.{key}" for key in sorted(examples) if config.model.get(key) == ""]
     for key in missing[:1]:
-        raise CompleteSplatError(f"{key} is needed: give {key}={EXAMPLES.get(key.rpartition('.')[2], 'VALUE')}")
+        raise CompleteSplatError(f"{key} is needed: give {key}={examples.get(key.rpartition('.')[2], 'VALUE')}")
 
 
 def _logged(trainer: Trainer) -> dict[str, float]:
     return {name: value.item() for name, value in trainer.callback_metrics.items()}
 
 
-def _test(config: DictConfig, module: Stage, data: SceneDataModule) -> dict[str, float]:
+def _test(config: DictConfig, module: Scorer, data: SceneDataModule) -> dict[str, float]:
     """Score as `completesplat test` does, in the protocol's precision, and return all logged figures."""
     progress = build(OmegaConf.select(config, "callbacks.progress"), _convert_="all")
     settings = {"callbacks": [] if progress is None else [progress], "logger": False, "enable_checkpointing": False}

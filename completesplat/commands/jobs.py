@@ -21,7 +21,6 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from completesplat import __version__
 from completesplat.commands.imports import importing, postponing
 from completesplat.commands.protocol import git_commit
 from completesplat.errors import CompleteSplatError
@@ -30,6 +29,7 @@ from completesplat.settings.checks import check_verb
 from completesplat.settings.composition import resolved_settings, use_working_folder
 from completesplat.settings.options import did_you_mean
 from completesplat.signals import Interrupted, ended_by_signals
+from completesplat.version import __version__
 from completesplat.weights import RUN_CHECKPOINT
 
 CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"

@@ -18,16 +18,16 @@ from hydra.utils import instantiate as build
 from lightning.pytorch.callbacks import WeightAveraging
 from omegaconf import DictConfig, OmegaConf
 
-from completesplat.commands.fit import OTHER_WEIGHTS
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
 from completesplat.files import write_json
 from completesplat.results.tables import Table, records_table, show
 from completesplat.scene import Batch, SceneBatch
-from completesplat.settings.checks import check_image_size, check_optimizer
+from completesplat.settings.checks import check_image_size, check_optimizer, each_part, remove_start_weights
 from completesplat.settings.options import did_you_mean
 from completesplat.training.latent_diffusion import LatentDiffusion
-from completesplat.training.stage import Stage, now
+from completesplat.training.scoring import now
+from completesplat.training.stage import Stage
 from completesplat.training.step_counts import StepCounts, count_step, with_latents
 from completesplat.training.steps import MEBIBYTE, Training, peak_megabytes, synthetic_batch
 
@@ -157,12 +157,12 @@ def without_weights(config: DictConfig) -> DictConfig:
     """Return a copy of a config whose module is built without reading weights and without compiling."""
     config = copy.deepcopy(config)
     OmegaConf.set_struct(config, False)
-    for part in (config.autoreconstructor, config.conditioning, config.model):
-        part.update(dict.fromkeys(OTHER_WEIGHTS & part.keys()))
+    remove_start_weights(config.model)
     config.model.update({key: False for key in ("compile", "channels_last") if key in config.model})
     for entry in filter(None, config.loss.terms.values()):
-        if entry.get("term", {}).get("_target_") == "completesplat.losses.lpips.LearnedPerceptualSimilarity":
-            entry.term = {"_target_": "completesplat.losses.lpips.UntrainedPerceptualSimilarity"}
+        for _, kind in each_part(entry.get("term")):
+            if twin := getattr(kind, "untrained", None):
+                entry.term = {"_target_": f"{twin.__module__}.{twin.__name__}"}
     return config
 
 

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from completesplat import __version__
 from completesplat.results.machine import machine
 from completesplat.results.runs import read_record, typed
+from completesplat.version import __version__
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule

@@ -29,7 +29,7 @@ from completesplat.studies.controls import Tick, controls_rows, controls_strips,
 from completesplat.studies.depth import depth_rows, depth_strips
 from completesplat.studies.noise_levels import noise_level_rows, plot_noise_levels, scenes_in_all_modes
 from completesplat.studies.samples import SampleRenderer, first_scenes
-from completesplat.training.stage import Stage
+from completesplat.training.scoring import Scorer
 
 Weights = Annotated[Sequence[Share], Entries(1)]
 
@@ -126,7 +126,7 @@ def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], Tick]]
         yield renderer, scenes, lambda text: status.update(f"drawing: {text}")
 
 
-def _opened_stage(run: Run) -> tuple[Stage, SceneDataModule]:
+def _opened_stage(run: Run) -> tuple[Scorer, SceneDataModule]:
     """Return the stage, on a GPU if there is one, and the data."""
     quieten()
     model = run["ckpt"], run["overrides"], run["trust"], run["weights"]

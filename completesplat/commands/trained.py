@@ -14,7 +14,7 @@ from completesplat.commands.protocol import checkpoint_facts
 from completesplat.errors import CompleteSplatError, ImageError, WeightsError
 from completesplat.files import printable
 from completesplat.generator import CompleteSplat
-from completesplat.opening import config_of_run, locate
+from completesplat.run_configs import config_of_run
 from completesplat.scene_model import SceneModel, distances_to_shipped
 from completesplat.settings.checks import REMOVE
 from completesplat.weights import AUTO, RUN_CHECKPOINT, sha256_of, shipped
@@ -22,8 +22,7 @@ from completesplat.weights.checkpoint_reading import load_part
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
-    from completesplat.training.scene_files import SceneFiles
-    from completesplat.training.stage import Stage
+    from completesplat.training.scoring import SceneFiles, Scorer
 
 WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no effect"
 
@@ -60,12 +59,10 @@ class Trained:
 
     @cached_property
     def files(self) -> "SceneFiles":
-        """Return the stage that reads `scenes`."""
-        from completesplat.training.scene_files import SceneFiles
+        """Return the scorer that reads `scenes`."""
+        from completesplat.training.scoring import SceneFiles
 
-        rendering = {"rasterizer": instantiate(self.rasterizer, _convert_="all")}
-        if self.data is not None and self.data.get("background") is not None:
-            rendering["background"] = self.data["background"]
+        rendering = self._rendering((self.data or {}).get("background"))
         return SceneFiles(str(self.scenes), self.frame, self.align, self.method, **rendering)
 
     def configuration(self) -> Any:
@@ -93,19 +90,19 @@ class Trained:
             config.data.update(self.model.needed_of_data(config.data))
         return config
 
-    def open(self) -> "tuple[Stage, SceneDataModule]":
+    def open(self) -> "tuple[Scorer, SceneDataModule]":
         """Return the model and the data module; raise the errors of `configuration` and `open_module`."""
         configuration = self.configuration()
         return self.open_module(configuration), instantiate(configuration.data, _convert_="all")
 
-    def open_module(self, configuration: Any) -> "Stage":
-        """Return the stage with its weights and sampler (if given); raise CompleteSplatError if one does not fit."""
-        stage: Stage = self._stage() if self.ckpt is None else instantiate(configuration.model, _convert_="all")
+    def open_module(self, configuration: Any) -> "Scorer":
+        """Return the scorer with its weights and sampler (if given); raise CompleteSplatError if one does not fit."""
+        scorer = self._scorer() if self.ckpt is None else instantiate(configuration.model, _convert_="all")
         if self.ckpt is not None:
-            load_part(stage, self.ckpt, prefix="")
+            load_part(scorer, self.ckpt, prefix="")
         if self.sampler is not None:
-            diffusion_of(stage).replace_sampler(self.sampler)
-        return stage
+            diffusion_of(scorer).replace_sampler(self.sampler)
+        return scorer
 
     def facts(self) -> dict[str, object]:
         """Return `checkpoint_facts`; for weights and files of scenes, path and checksum without facts of training."""
@@ -113,29 +110,26 @@ class Trained:
             return checkpoint_facts(Path(self.ckpt))
         if self.scenes is not None:
             return self.files.facts()
-        file = locate(str(self.weights))
-        return {"checkpoint": {"path": self.weights, "sha256": sha256_of(file), "step": None}, "ema": None}
+        assert self.model.file is not None
+        facts = {"path": self.weights, "sha256": sha256_of(self.model.file), "step": None}
+        return {"checkpoint": facts, "ema": None}
 
-    def _stage(self) -> "Stage":
-        """Return a stage around `scenes` or the model of `weights`; its loss and optimizer are never used."""
+    def _rendering(self, background: object) -> dict[str, Any]:
+        """Return the rasterizer, and the background if it is known."""
+        known = {} if background is None else {"background": background}
+        return {"rasterizer": instantiate(self.rasterizer, _convert_="all")} | known
+
+    def _scorer(self) -> "Scorer":
+        """Return the scorer of `scenes` or of the model of `weights`."""
         if self.scenes is not None:
             return self.files
-        from torch.optim import Adam
+        from completesplat.training.latent_diffusion import DiffusionScorer
+        from completesplat.training.reconstruction import ReconstructionScorer
 
-        from completesplat.losses import WeightedSum
-        from completesplat.losses.terms import MeanSquaredError
-        from completesplat.training.latent_diffusion import LatentDiffusion
-        from completesplat.training.optimization import constant
-        from completesplat.training.reconstruction import ReconstructionModule
-
-        rendering = {"rasterizer": instantiate(self.rasterizer, _convert_="all")}
-        if self.model.background is not None:
-            rendering["background"] = self.model.background
+        rendering = self._rendering(self.model.background)
         if isinstance(self.model, CompleteSplat):
-            return LatentDiffusion(self.model, optimizer=Adam, schedule=constant, **rendering)
-        loss = WeightedSum({"mse": {"weight": 1.0, "term": MeanSquaredError()}})
-        network = self.model.reconstruction_model
-        return ReconstructionModule(network, loss, optimizer=Adam, schedule=constant, **rendering)
+            return DiffusionScorer(self.model, **rendering)
+        return ReconstructionScorer(self.model.reconstruction_model, **rendering)
 
 
 def nearest_weights(images: Sequence[Path], remove_background: bool) -> tuple[str, str]:
@@ -192,9 +186,9 @@ def shown_background(chosen: float | str | None, model: SceneModel | None) -> fl
     return 0.5 if model is None or model.background is None else model.background
 
 
-def diffusion_of(stage: "Stage") -> CompleteSplat:
-    """Return the model of latent diffusion; raise CompleteSplatError if the stage is another one."""
-    model = getattr(stage, "completesplat", None)
+def diffusion_of(scorer: "Scorer") -> CompleteSplat:
+    """Return the model of latent diffusion; raise CompleteSplatError if the scorer has another one."""
+    model = getattr(scorer, "completesplat", None)
     if not isinstance(model, CompleteSplat):
         raise CompleteSplatError("this model has no sampler: a diffusion model is needed, which stage 2 trains")
     return model

@@ -19,7 +19,6 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from completesplat import __version__
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import cleaned, transparent
 from completesplat.export.mesh import VOXELS, Mesh, mesh_of
@@ -31,6 +30,7 @@ from completesplat.geometry.cameras import transform_points
 from completesplat.geometry.harmonics import SH_C0
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.rasterizers import Rasterizer
+from completesplat.version import __version__
 
 FORMATS = ("ply", "splat", "glb", "mesh", "spz", "sog", "html")
 CONVERTED = ("spz", "sog", "html")

@@ -137,12 +137,22 @@ class PerceptualTerm:
     The network is not part of the trained module, so no checkpoint holds it.
     """
 
+    only_for_training = True
+    """Whether a run is opened without this term, because its network's weights may be elsewhere."""
+
     distance: PerceptualDistance
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
         with torch.autocast(prediction.images.device.type, enabled=False):
             pair = (images.flatten(0, 1).float() for images in (prediction.images, truth.images))
             return torch.mean(self.distance(*pair))
+
+
+class UntrainedPerceptualSimilarity(PerceptualTerm):
+    """LPIPS with random weights, to count the work of a step (`completesplat plan`)."""
+
+    def __init__(self) -> None:
+        self.distance = PerceptualDistance(vgg16(), load_heads())
 
 
 class LearnedPerceptualSimilarity(PerceptualTerm):
@@ -152,12 +162,7 @@ class LearnedPerceptualSimilarity(PerceptualTerm):
         vgg_weights, vgg_sha256: see `load_vgg16`; `vgg_sha256=None` accepts any file of the right layout.
     """
 
+    untrained = UntrainedPerceptualSimilarity
+
     def __init__(self, vgg_weights: str, vgg_sha256: str | None = None) -> None:
         self.distance = PerceptualDistance(load_vgg16(vgg_weights, vgg_sha256), load_heads())
-
-
-class UntrainedPerceptualSimilarity(PerceptualTerm):
-    """The same network with random weights, to count the work of a step (`completesplat plan`)."""
-
-    def __init__(self) -> None:
-        self.distance = PerceptualDistance(vgg16(), load_heads())

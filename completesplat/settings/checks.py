@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Annotated, Any, Literal, TypedDict
 
 from hydra.utils import get_object, instantiate
@@ -11,22 +12,22 @@ from omegaconf.errors import OmegaConfBaseException
 
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.options import did_you_mean
-from completesplat.settings.schema import Positive, Range, Seed, Share, arguments_of, check_settings, check_value
+from completesplat.settings.schema import (
+    Positive,
+    Range,
+    Seed,
+    Share,
+    arguments_of,
+    check_settings,
+    check_value,
+    start_weights,
+)
 
 Container = DictConfig | ListConfig
 
 REFERENCE = re.compile(r"\$\{(\w[\w.]*)\}")
 REMOVE = "remove"
 HYDRA_KEYS = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
-# Channels of a network by level; each level but the last halves the sides of the image.
-LEVELS = (
-    "model.completesplat.autoreconstructor.encoder.channels",
-    "model.completesplat.denoiser.channels",
-    "model.model.encoder.channels",
-    "model.model.channels",
-    "model.vae.encoder.channels",
-)
-
 
 Precision = Literal["32-true", "bf16-mixed", "16-mixed", 32, "bf16", 16]
 """Lightning's precisions with weights in float32, which Gaussians and cameras need."""
@@ -175,6 +176,24 @@ def check_parts(config: Container, place: str = "") -> None:
             check_parts(value, key)
 
 
+def each_part(config: object) -> Iterator[tuple[DictConfig, Any]]:
+    """Yield each part of a config, the outer ones first, with the class or function that makes it."""
+    if isinstance(config, DictConfig) and config.get("_target_") is not None:
+        with suppress(Exception):  # building the part reports what cannot be imported
+            yield config, get_object(config._target_)
+    if isinstance(config, DictConfig | ListConfig):
+        names: Any = config if isinstance(config, DictConfig) else range(len(config))
+        for name in [name for name in names if not OmegaConf.is_missing(config, name)]:
+            with suppress(OmegaConfBaseException):  # it refers to something that is missing
+                yield from each_part(config[name])
+
+
+def remove_start_weights(config: DictConfig) -> None:
+    """Set all weights that training starts from to null, in all parts of a config, also where they are missing."""
+    for part, kind in each_part(config):
+        part.update(dict.fromkeys(part.keys() & start_weights(kind)))
+
+
 def part_arguments(config: Container) -> tuple[Mapping[str, object], bool]:
     """Return a part's `arguments_of`, or none if it cannot be imported, because building the part reports that."""
     try:
@@ -197,8 +216,8 @@ def _origin(config: Container, name: Any, place: str) -> str:
 
 def check_image_size(config: DictConfig) -> None:
     """Raise CompleteSplatError if training images cannot be halved as often as the networks halve them."""
-    channels = [OmegaConf.select(config, key, throw_on_missing=False) for key in LEVELS]
-    multiple = 2 ** sum(len(widths) - 1 for widths in channels if widths is not None)
+    halving = [part for part, kind in each_part(config.get("model")) if getattr(kind, "halves_images", False)]
+    multiple = 2 ** sum(len(part.channels) - 1 for part in halving if "channels" in part)
     size = config.data.get("image_size")
     if size is not None and size % multiple:
         near = max(multiple, round(size / multiple) * multiple)

@@ -130,6 +130,11 @@ def arguments_of(target: Callable[..., object] | type) -> tuple[dict[str, object
     return annotations, False
 
 
+def start_weights(kind: object) -> Mapping[str, str]:
+    """Return the settings of weights that training starts from, with examples, as a part's class declares them."""
+    return getattr(kind, "start_weights", {})
+
+
 def refused(annotation: object, value: object) -> list[Refused]:
     """Return the parts of a value that do not fit an annotation, with the reasons."""
     origin, arguments = get_origin(annotation), get_args(annotation)

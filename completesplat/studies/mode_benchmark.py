@@ -22,8 +22,8 @@ from completesplat.scene import SceneBatch
 from completesplat.splatter_image import SplatterImage
 from completesplat.studies.samples import mean_over_scenes
 from completesplat.tensors import concatenate
-from completesplat.training.latent_diffusion import LatentDiffusion
-from completesplat.training.stage import Stage
+from completesplat.training.latent_diffusion import DiffusionScorer
+from completesplat.training.scoring import Scorer
 
 Renders = Float[Tensor, "sample view 3 height width"]
 Predictor = Callable[[SceneBatch, SceneBatch, int], Renders]
@@ -78,7 +78,7 @@ def rungs(model: VariationalAutoReconstructor, samples: int, batch: int, masked:
     return methods
 
 
-def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
+def predictors(module: Scorer, samples: int, batch: int) -> dict[str, Predictor]:
     """Return `model` as it is tested, and the `rungs` of its autoreconstructor, which show where modes are lost.
 
     A posterior that sees views knows the true mode. If the posterior's samples show the modes and the model's do not,
@@ -86,7 +86,7 @@ def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
     computed and rendered `batch` at a time.
     """
     methods: dict[str, Rung] = {"model": lambda scene, other, seed: module.draw(scene, [seed], samples, batch)}
-    frozen = module.completesplat.autoreconstructor if isinstance(module, LatentDiffusion) else None
+    frozen = module.completesplat.autoreconstructor if isinstance(module, DiffusionScorer) else None
     network = frozen or getattr(module, "model", None)
     if isinstance(network, VariationalAutoReconstructor):
         methods |= rungs(network, samples, batch, getattr(module, "masked", False))

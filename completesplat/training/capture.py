@@ -39,7 +39,8 @@ from completesplat.scene import Batch, SceneBatch, Views
 from completesplat.settings.schema import Positive, Range, Share
 from completesplat.tensors import stack
 from completesplat.training.optimization import Schedule, constant
-from completesplat.training.stage import Renders, Stage
+from completesplat.training.scoring import Renders
+from completesplat.training.stage import Stage
 
 REFINED_SHARE = 0.8  # of the run, in which Gaussians move and are added (25,000 of 30,000 steps in 3DGS-MCMC)
 

@@ -17,7 +17,6 @@ from rich.filesize import decimal
 from rich.progress import track
 from torch import nn
 
-from completesplat import __version__
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import gathered, processes
@@ -42,6 +41,7 @@ from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import atomic_path
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
+from completesplat.version import __version__
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 Moments = Float[np.ndarray, "row channel _ _"]

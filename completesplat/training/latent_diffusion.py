@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int64
@@ -18,6 +18,7 @@ from completesplat.generator import CompleteSplat
 from completesplat.scene import CachedScene, SceneBatch
 from completesplat.settings.schema import Natural, Positive, Share
 from completesplat.training.encoding import check_cache
+from completesplat.training.scoring import Scorer
 from completesplat.training.stage import Stage, prepare_network
 from completesplat.weights.checkpoint_reading import load_part
 
@@ -25,7 +26,50 @@ LOSS_BUCKETS = 4
 """Equal ranges of timesteps, for each of which the loss is logged."""
 
 
-class LatentDiffusion(Stage):
+class DiffusionScorer(Scorer):
+    """Scorer of the samples that a latent diffusion model draws.
+
+    Args:
+        **rendering: see `Scorer`.
+    """
+
+    draws_samples = True
+    skip_weight, guidance_weight, color_fits = 1.0, 0.0, 0
+
+    def __init__(self, completesplat: CompleteSplat, **rendering: Any) -> None:
+        super().__init__(**rendering)
+        self.completesplat = completesplat
+
+    @property
+    def method(self) -> str:
+        """Return the name in tables, also for weights that were trained elsewhere."""
+        return LatentDiffusion.__name__
+
+    @property
+    def up(self) -> Float[Tensor, "3"]:
+        """Return the direction up in the reference camera's frame, as measured on the training set."""
+        return self.completesplat.up
+
+    def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int, batch: int | None = None) -> Gaussians:
+        """See `Scorer`; the samples of an image depend on no other image."""
+        return self.reconstruct(scenes, seeds, samples=samples, batch=batch)
+
+    def reconstruct(self, scenes: SceneBatch, seed: int | Sequence[int], **settings: Any) -> Gaussians:
+        """Draw one sample for each reference image, or several by `settings` of `CompleteSplat.generate`."""
+        return self.completesplat.generate(
+            scenes.reference.images,
+            scenes.reference.cameras,
+            scenes.depth_range,
+            skip_weight=self.skip_weight,
+            guidance_weight=self.guidance_weight,
+            color_fits=self.color_fits,
+            visible=scenes.visible,
+            seed=seed,
+            **settings,
+        )
+
+
+class LatentDiffusion(DiffusionScorer, Stage):
     """Train the denoiser and a learned conditioning to predict the noise in latents (paper, Eqs. 2 and 3).
 
     Batches are scenes, or scenes that were encoded beforehand; both train the same.
@@ -46,7 +90,10 @@ class LatentDiffusion(Stage):
         WeightsError: a checkpoint is unusable, or both are given.
     """
 
-    draws_samples = True
+    start_weights: ClassVar = {
+        "autoreconstructor_checkpoint": "RUN/checkpoints/last.ckpt of stage 1",
+        "checkpoint": "RUN/checkpoints/last.ckpt",
+    }
 
     def __init__(
         self,
@@ -63,8 +110,7 @@ class LatentDiffusion(Stage):
         compile: bool = False,
         **rendering_and_optimization: Any,
     ) -> None:
-        super().__init__(**rendering_and_optimization)
-        self.completesplat = completesplat
+        super().__init__(completesplat, **rendering_and_optimization)
         self.autoreconstructor_checkpoint = autoreconstructor_checkpoint
         self.checkpoint = checkpoint
         self.unconditional_probability = unconditional_probability
@@ -80,11 +126,6 @@ class LatentDiffusion(Stage):
         if checkpoint is not None:
             load_part(completesplat, checkpoint, prefix="completesplat.")
         self.memory_format = prepare_network(completesplat.denoiser, channels_last, compile)
-
-    @property
-    def up(self) -> Float[Tensor, "3"]:
-        """Return the direction up in the reference camera's frame, as measured on the training set."""
-        return self.completesplat.up
 
     def save_weights(self, folder: Path) -> None:
         """Write the generator with facts about its training images."""
@@ -193,24 +234,6 @@ class LatentDiffusion(Stage):
             # Lightning would repeat the loss of a quarter in the rows of later steps that have no sample in it.
             for logger in self.loggers:
                 logger.log_metrics(values, step=self.global_step)
-
-    def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int, batch: int | None = None) -> Gaussians:
-        """See `Stage`; the samples of an image depend on no other image."""
-        return self.reconstruct(scenes, seeds, samples=samples, batch=batch)
-
-    def reconstruct(self, scenes: SceneBatch, seed: int | Sequence[int], **settings: Any) -> Gaussians:
-        """Draw one sample for each reference image, or several by `settings` of `CompleteSplat.generate`."""
-        return self.completesplat.generate(
-            scenes.reference.images,
-            scenes.reference.cameras,
-            scenes.depth_range,
-            skip_weight=self.skip_weight,
-            guidance_weight=self.guidance_weight,
-            color_fits=self.color_fits,
-            visible=scenes.visible,
-            seed=seed,
-            **settings,
-        )
 
 
 def losses_by_timestep(errors: Float[Tensor, " n"], timestep: Int64[Tensor, " n"], timesteps: int) -> dict[str, float]:

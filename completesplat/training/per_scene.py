@@ -30,15 +30,16 @@ from completesplat.scene import SceneBatch, Views
 from completesplat.settings.schema import Range
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import stack
-from completesplat.training.stage import Renders, Stage
+from completesplat.training.scoring import Renders, Scorer
+from completesplat.training.stage import Stage
 
 logger = logging.getLogger(__name__)
 
 
-class PerScene(Stage):
+class PerScene(Scorer):
     """Upper bound: Gaussians are fitted to all views of each scene, also to those that they are scored on.
 
-    It has nothing to train; all its work is done in evaluation. `loss` is that of the fit.
+    `loss` is that of the fit.
 
     Args:
         scenes_folder: folder for a folder of each test scene (`write_fitted_scene`); None: no scenes are written.
@@ -109,7 +110,7 @@ class Preoptimized(PerScene):
         self._empty = {}
 
     def test_results(self) -> dict[str, dict[str, Any]]:
-        """Return the results of `Stage` and `empty_pixels`, the mean over the scenes of all processes."""
+        """Return the results of `Scorer` and `empty_pixels`, the mean over the scenes of all processes."""
         results = super().test_results()
         empty = {name: share for shares in gathered(self._empty) for name, share in shares.items()}
         results["model"]["empty_pixels"] = sum(empty.values()) / max(len(empty), 1)
@@ -165,7 +166,7 @@ class FittedScenes:
         return self.folder / f"{key}.safetensors"
 
 
-class PreoptimizedVAE(Preoptimized):
+class PreoptimizedVAE(Preoptimized, Stage):
     """Training and test of a VAE on `Preoptimized`'s Splatter Images.
 
     Before training, Gaussians are fitted to each training sequence and stored in files (`FittedScenes`). Validation
@@ -194,7 +195,7 @@ class PreoptimizedVAE(Preoptimized):
         kl_weight: Annotated[float, Range(0)],
         **preoptimized: Any,
     ) -> None:
-        super().__init__(vae.reconstructor.parameterization, **preoptimized)
+        super().__init__(parameterization=vae.reconstructor.parameterization, **preoptimized)
         self.vae = vae
         self.folder = Path(folder)
         self.normalization_batches = normalization_batches

@@ -4,7 +4,7 @@ import logging
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -12,15 +12,16 @@ from torch import Tensor, nn
 
 from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.baselines.autodecoder import AutoDecoder, Codes, optimize_codes
-from completesplat.baselines.splatter_image.files import write_trained
-from completesplat.baselines.splatter_image.model import PublishedSplatterImage
+from completesplat.baselines.splatter_image.model import PublishedSplatterImage, write_trained
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.generator import OneAnswer
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch, Views
+from completesplat.scene_model import camera_tensors
 from completesplat.splatter_image import SplatterImage
+from completesplat.training.scoring import Scorer
 from completesplat.training.stage import Stage, prepare_network
 from completesplat.weights import CAMERA
 from completesplat.weights.checkpoint_reading import load_part
@@ -28,7 +29,35 @@ from completesplat.weights.checkpoint_reading import load_part
 logger = logging.getLogger(__name__)
 
 
-class ReconstructionModule(Stage):
+class ReconstructionScorer(Scorer):
+    """Scorer of a model of one pass, from an image to its scene.
+
+    Args:
+        model: images -> `Reconstruction`.
+        **rendering: see `Scorer`.
+    """
+
+    def __init__(self, model: nn.Module, **rendering: Any) -> None:
+        super().__init__(**rendering)
+        self.model = model
+
+    @property
+    def method(self) -> str:
+        """Return the class of the reconstruction model."""
+        return type(self.model).__name__
+
+    def forward(self, scenes: SceneBatch) -> Reconstruction:
+        """Return Splatter Images, and posteriors if the model has any."""
+        reconstruction: Reconstruction = self.model(scenes.reference.images)
+        return reconstruction
+
+    def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
+        """Return Gaussians from the posterior's mode; nothing is drawn, so the seed has no effect."""
+        reconstruction: Reconstruction = self(scenes)
+        return reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
+
+
+class ReconstructionModule(ReconstructionScorer, Stage):
     """Reconstruct, render the reference and all targets, compare (paper, Eq. 1).
 
     Args:
@@ -41,6 +70,8 @@ class ReconstructionModule(Stage):
         **rendering_and_optimization: see `Stage`.
     """
 
+    start_weights: ClassVar = {"checkpoint": "RUN/checkpoints/last.ckpt"}
+
     def __init__(
         self,
         model: nn.Module,
@@ -51,8 +82,7 @@ class ReconstructionModule(Stage):
         compile: bool = False,
         **rendering_and_optimization: Any,
     ) -> None:
-        super().__init__(**rendering_and_optimization)
-        self.model = model
+        super().__init__(model, **rendering_and_optimization)
         self.loss = loss
         self.masked = masked
         self.camera: dict[str, float | list[float]] = {}
@@ -73,9 +103,10 @@ class ReconstructionModule(Stage):
         if isinstance(self.model, PublishedSplatterImage):
             return write_trained(folder, self.model.file, self.model.state_dict())
         assert self.config is not None
-        architecture = {"network": self.config["model"]["model"], "image_size": self.data.image_size}
+        trained = {f"network.{name}": tensor for name, tensor in self.model.state_dict().items()}
         try:
-            model = OneAnswer.with_trained(architecture, self.model.state_dict(), self.camera)
+            model = OneAnswer(self.config["model"]["model"], self.data.image_size)
+            model.load_state_dict(trained | camera_tensors(self.camera))
         except WeightsError as error:
             return logger.warning("no weights are written to %s: %s", folder, error)
         model.architecture["training"] = self.data.training_facts()
@@ -104,11 +135,6 @@ class ReconstructionModule(Stage):
         """Add the training set's typical camera."""
         super().on_save_checkpoint(checkpoint)
         checkpoint[CAMERA] = self.camera
-
-    @property
-    def method(self) -> str:
-        """Return the class of the reconstruction model."""
-        return type(self.model).__name__
 
     @property
     def sees_views(self) -> bool:
@@ -175,11 +201,6 @@ class ReconstructionModule(Stage):
         gain = values - self.novel_psnr(self.reconstruct(scenes), others)
         figures = {"val/psnr_posterior": values.mean(), "val/posterior_gain": gain.mean()}
         self.log_dict(figures, prog_bar=True, batch_size=len(values))
-
-    def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
-        """Return Gaussians from the posterior's mode; nothing is drawn, so the seed has no effect."""
-        reconstruction: Reconstruction = self(scenes)
-        return reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
 
 
 class ReconstructorOnly(ReconstructionModule):

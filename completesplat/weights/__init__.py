@@ -30,6 +30,33 @@ def shipped() -> dict[str, Path]:
     return {path.parent.name: path.parent for path in sorted(SHIPPED.glob(f"*/{WEIGHTS_FILE}"))}
 
 
+def locate(weights: Path | str) -> Path:
+    """Return the tensor file that a name, folder, run, checkpoint or hub id stands for.
+
+    A run stands for its final weights or, before they exist, for its newest checkpoint, which may not exist yet either.
+
+    Raises:
+        WeightsError: there is no such folder, a file is missing, or its checksum differs.
+    """
+    name, path = str(weights), Path(weights).expanduser()
+    check_name(name)
+    if name in shipped():
+        path = shipped()[name]
+    elif not os.path.exists(path):
+        path = from_hub(name)
+    elif path.is_file() and path.name != WEIGHTS_FILE:
+        return path
+    elif path.is_file():
+        path = path.parent
+    elif not (path / CONFIG_FILE).is_file():
+        if (path / RUN_WEIGHTS / CONFIG_FILE).is_file():
+            path /= RUN_WEIGHTS
+        elif (path / RUN_CONFIG_FILE).is_file():
+            return path / RUN_CHECKPOINT
+    check_folder(path)
+    return path / WEIGHTS_FILE
+
+
 def check_name(name: str) -> None:
     """Raise WeightsError for a name that is no file or folder here, no shipped weights, and no id for the hub."""
     # `Path.exists` raises if a name is too long.

@@ -14,6 +14,7 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
 from completesplat.gaussians import DirectionalGaussians
 from completesplat.generator import CompleteSplat
+from completesplat.training.stage import Stage
 
 
 def cut_out(path, size=(60, 40)):
@@ -121,6 +122,7 @@ def test_a_test_sees_objects_only_at_their_depths_and_its_figures_stand_apart(co
     config = compose_config("test", *given)
     trained = Trained(None, weights=str(weights), data=config.data, rasterizer=config.rasterizer)
     module, data = trained.open()
+    assert not isinstance(module, Stage)  # nothing is trained, so there is no optimizer
     data.prepare_data()
     data.setup("test")
     scenes = next(iter(data.test_dataloader()))

@@ -20,8 +20,7 @@ from completesplat.results.paper_figures import published_tables
 from completesplat.results.runs import find_results, flat
 from completesplat.results.tables import as_markdown
 from completesplat.scene import SceneBatch
-from completesplat.training.scene_files import SceneFiles
-from completesplat.training.stage import Stage
+from completesplat.training.scoring import SceneFiles, Scorer
 
 SAMPLES = 3
 FEW = [f"evaluation.{few}" for few in ("batch=2", "views=1", "spread_views=2", "shown_samples=2")]
@@ -38,7 +37,7 @@ def model_test(pipeline, built_once):
                 write_ply(folder / f"splats/{name}/sample_{index:02}.ply", sample)
 
         with pytest.MonkeyPatch.context() as monkeypatch:
-            monkeypatch.setattr(Stage, "scene_scored", write)
+            monkeypatch.setattr(Scorer, "scene_scored", write)
             assert call(monkeypatch, "test", f"weights={pipeline.weights}", *toy_data(pipeline, folder / "test")) == 0
 
     return built_once("own_splats", fill)

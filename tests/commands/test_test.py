@@ -14,7 +14,7 @@ from completesplat.data.toy import write_objects
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.results.tables import SSIM_NOTE
-from completesplat.training.stage import Stage
+from completesplat.training.scoring import Scorer
 
 
 @pytest.fixture
@@ -128,13 +128,13 @@ def test_a_larger_size_is_reached_by_upsampling_renders_from_images_of_the_train
     scored, pipeline, tmp_path, monkeypatch
 ):
     shown = []
-    draw = Stage.draw
+    draw = Scorer.draw
 
     def watched(self, scenes, *others):
         shown.append(scenes)
         return draw(self, scenes, *others)
 
-    monkeypatch.setattr(Stage, "draw", watched)
+    monkeypatch.setattr(Scorer, "draw", watched)
     root = tmp_path / "larger"  # its images are larger than both sizes
     write_objects(root, scenes=4, frames=3, size=96, seed=0, workers=1, progress=False)
     described = scored("var", "evaluation.resolution=48", f"overrides=['data.root={root}']")[1]["protocol"]

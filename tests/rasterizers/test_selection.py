@@ -16,11 +16,11 @@ from support import compose_config
 from completesplat.commands import refusal
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.opening import config_of_run
 from completesplat.rasterizers import Rendering, RenderingConstants, cuda, selection
 from completesplat.rasterizers.kernels import compilation
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.tiled import TiledRasterizer
+from completesplat.run_configs import config_of_run
 
 
 @pytest.fixture(autouse=True)

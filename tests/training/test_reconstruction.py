@@ -8,7 +8,7 @@ from support import NETWORKS, compose_config
 from torch.utils.data import DataLoader
 
 from completesplat.training.callbacks import BadSteps
-from completesplat.training.stage import copy_reference, mirror_reference, repeat_image
+from completesplat.training.scoring import copy_reference, mirror_reference, repeat_image
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
 

@@ -2,10 +2,13 @@
 
 Anyone can publish weights and runs. Their configs may name only classes of this list, with plain values as settings:
 nothing else that they name is imported or called, and a model takes no more memory than its weights file holds.
+Weights store a class by its name alone. A path in this package or diffusers stands for the class at its end, so weights
+and runs of earlier versions open when a class has moved.
 """
 
 import inspect
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import NoneType
@@ -18,6 +21,7 @@ from diffusers import (
     FlowMatchEulerDiscreteScheduler,
     UniPCMultistepScheduler,
 )
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import Encoder
@@ -30,12 +34,12 @@ from completesplat.diffusion.denoiser import Denoiser, TextlessStableDiffusion
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import WeightsError
 from completesplat.files import SHORT, printable
-from completesplat.settings.schema import Entries, Range, Share, hints_of, refused
+from completesplat.settings.schema import Entries, Range, Share, hints_of, refused, start_weights
 from completesplat.splatter_image import Parameterization
-from completesplat.weights import read_small
+from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, read_small
 
 # The classes that each setting may name, for settings that are parts of a model.
-PARTS: dict[str, tuple[type, ...]] = {
+CHOICES: dict[str, tuple[type, ...]] = {
     "autoreconstructor": (VariationalAutoReconstructor,),
     "encoder": (Encoder,),
     "reconstructor": (Reconstructor,),
@@ -47,6 +51,8 @@ PARTS: dict[str, tuple[type, ...]] = {
     "sampler": (Sampler,),
     "scheduler": (DDIMScheduler, DPMSolverMultistepScheduler, FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler),
 }
+PARTS: dict[str, type] = {kind.__name__: kind for kinds in CHOICES.values() for kind in kinds}
+PATH = re.compile(r"(?:(?:completesplat|diffusers)\.(?:\w+\.)*)?(\w+)")
 NETWORKS = ("autoreconstructor", "conditioning", "denoiser", "network")
 PartConfig = Mapping[str, object]  # config of a part: `_target_`, and arguments
 
@@ -105,44 +111,50 @@ class SchedulerSettings(TypedDict, total=False):
     shift: Annotated[float, Range(1e-3, 1e3)]
 
 
-def name_of(kind: type) -> str:
-    """Return the name of a class in configs; diffusers exports all of its classes from its top level."""
-    module = "diffusers" if kind.__module__.startswith("diffusers.") else kind.__module__
-    return f"{module}.{kind.__name__}"
-
-
-CLASSES = {name_of(kind): kind for kinds in PARTS.values() for kind in kinds}
+def class_of(part: object) -> Any:
+    """Return the class of `PARTS` that a part's config names, by its name or by a path of any version; None if none."""
+    path = PATH.fullmatch(str(part.get("_target_"))) if isinstance(part, Mapping) else None
+    return None if path is None else PARTS.get(path[1])
 
 
 def settings_of(kind: Any) -> dict[str, Any]:
     """Return the settings that a config may give to a class, with their annotations."""
-    if kind in PARTS["scheduler"]:
+    if kind in CHOICES["scheduler"]:
         parameters = inspect.signature(kind).parameters
         return {name: hint for name, hint in hints_of(SchedulerSettings).items() if name in parameters}
     hints = {name: hint for name, hint in hints_of(kind.__init__).items() if name not in ("return", "sizes")}
     # The weights that training started from are not needed again, and could name any file or address.
-    return hints | dict.fromkeys(hints.keys() & {"pretrained"}, NoneType)
+    return hints | dict.fromkeys(hints.keys() & start_weights(kind), NoneType)
 
 
-def read_architecture(path: Path) -> dict[str, Any]:
-    """Read the `config.json` of weights; raise WeightsError if this fails or `check_architecture` refuses it."""
+def read_weights(file: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return a model's config and its tensors by name from `model.safetensors` and the `config.json` beside it.
+
+    Raises:
+        WeightsError: the config cannot be read, `check_architecture` refuses it, or the tensors do not belong to it.
+    """
+    path = file.with_name(CONFIG_FILE)
     try:
         architecture = json.loads(read_small(path))
     except (ValueError, RecursionError) as error:
         raise WeightsError(f"{path}: not readable as JSON ({error})") from error
     check_architecture(architecture, path)
-    return dict(architecture)
+    architecture, tensors = saved(architecture), load_file(file)
+    check_sizes(architecture, tensors, (WEIGHTS_FILE, CONFIG_FILE))
+    return architecture, tensors
 
 
-def untrained(part: Any) -> Any:
-    """Return a part's config without the weights that training started from, because a checkpoint holds all weights."""
+def saved(part: Any) -> Any:
+    """Return a part's config as weights store it: classes by name, and without weights that training started from."""
     if not isinstance(part, Mapping):
         return part
-    return {key: None if key == "pretrained" else value for key, value in part.items()}
+    kind = class_of(part)
+    settings = {name: None if name in start_weights(kind) else saved(value) for name, value in part.items()}
+    return settings if kind is None else settings | {"_target_": kind.__name__}
 
 
 def check_architecture(architecture: object, file: Path | None = None) -> None:
-    """Raise WeightsError, naming `file`, for the first setting that `PARTS` or the signatures of its classes refuse."""
+    """Raise WeightsError, naming `file`, for the first setting that `CHOICES` or a signature refuses."""
     settings = architecture if isinstance(architecture, Mapping) else {}
     hints = ONE_ANSWER if "network" in settings else DRAWING
     try:
@@ -159,30 +171,30 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
         if name not in hints:
             raise WeightsError(f"{printable(key, SHORT)}: there is no such setting, but {', '.join(hints)}")
         hint = hints[name]
-        if name in PARTS and (value is not None or name != "view_encoder"):
-            _check_part(key, value, PARTS[name])
+        if name in CHOICES and (value is not None or name != "view_encoder"):
+            _check_part(key, value, CHOICES[name])
         elif isinstance(hint, type) and is_typeddict(hint) and isinstance(value, Mapping):
             _check_settings(key, hints_of(hint), value)
-        elif name not in PARTS and (refusals := refused(hint, value)):
+        elif name not in CHOICES and (refusals := refused(hint, value)):
             raise WeightsError(f"{key}={printable(value, SHORT)}: {refusals[0].reason}")
 
 
 def _check_part(place: str, part: object, allowed: Sequence[type]) -> None:
-    target = part.get("_target_") if isinstance(part, Mapping) else part
-    kinds = [kind for kind in allowed if name_of(kind) == target]
-    if not kinds or not isinstance(part, Mapping):
-        names = ", ".join(map(name_of, allowed))
+    kind = class_of(part)
+    if kind not in allowed or not isinstance(part, Mapping):
+        target = part.get("_target_") if isinstance(part, Mapping) else part
+        names = ", ".join(kind.__name__ for kind in allowed)
         raise WeightsError(
             f"{place} names {printable(target, SHORT)}, which is no part of a model; allowed are {names}"
         )
-    settings = {name: value for name, value in part.items() if name != "_target_"}
-    _check_settings(place, settings_of(kinds[0]), settings)
+    _check_settings(place, settings_of(kind), {name: value for name, value in part.items() if name != "_target_"})
 
 
 def build(part: PartConfig) -> Any:
     """Build a part, and the parts in it, from a config that `check_architecture` has accepted."""
     settings = {name: build(value) if isinstance(value, Mapping) else value for name, value in part.items()}
-    return CLASSES[str(settings.pop("_target_"))](**settings)
+    del settings["_target_"]
+    return class_of(part)(**settings)
 
 
 def check_sizes(architecture: Mapping[str, PartConfig], tensors: Mapping[str, Tensor], files: tuple[str, str]) -> None:
