@@ -43,12 +43,12 @@ REASONS = {
     ("settings/checks.py", "_value"): NO_ORIGIN,
     ("settings/composition.py", "_is_avx512_bf16_supported"): "torch does not tell publicly whether a CPU has bfloat16",
     ("tensors.py", "_C"): ONE_OF_TORCH,
+    ("weights/checkpoint_reading.py", "_Unpickler"): "Python's unpickler in Python, whose calls a dry run replaces",
     ("tensors.py", "_nn"): ONE_OF_TORCH,
     ("tensors.py", "_parse_to"): ONE_OF_TORCH,
     ("training/callbacks.py", "_get_train_description"): "the progress bar covers the run, not an epoch",
     ("training/callbacks.py", "_swap_models"): "images of fixed scenes are drawn with the averaged weights",
     ("training/callbacks.py", "_update"): "the progress bar covers the run, not an epoch",
-    ("training/checkpoints.py", "torch.utils._pytree.tree_leaves"): NO_TREES,
     (
         "training/loggers.py",
         "_check_log_dir_exists",

@@ -48,6 +48,7 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
 
 def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path) -> None:
     """Write `show.png`: images of some sequences, evenly spread over a split."""
+    from completesplat.studies.contact_sheet import write_contact_sheet
 
     source = _sources(data, [split])[split]
     names = source.names

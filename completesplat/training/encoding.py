@@ -27,8 +27,8 @@ from completesplat.data.loading.latent_cache import (
     LatentCacheManifest,
     Origin,
     Rows,
+    latent_row,
     latent_schema,
-    to_row,
     write_manifest,
 )
 from completesplat.data.loading.scenes import SceneStore
@@ -253,7 +253,7 @@ def _write_store(
                 if len(waiting["mean"]) < count:
                     break
                 complete = {name: np.ascontiguousarray(values[:count]) for name, values in waiting.items()}
-                writer.write_batch(to_row(sequence.name, complete, schema))
+                writer.write_batch(latent_row(sequence.name, complete, schema))
                 waiting = {name: values[count:] for name, values in waiting.items()}
                 written += 1
     shapes = {name: rows.shape[1:] for name, rows in blank.items()}

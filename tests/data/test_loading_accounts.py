@@ -5,8 +5,10 @@ import pytest
 from lightning import LightningModule, Trainer
 from realestate10k_trees import assert_refusal, epoch, make_clip, module, write_tree
 
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.validation import BadCamera, BadImage
 from completesplat.errors import CompleteSplatError, DataError
+from completesplat.settings.schema import check_value, hints_of
 
 KEYS = [f"c{i}" for i in range(9)]
 
@@ -74,7 +76,7 @@ def test_nothing_that_can_be_read_and_an_unknown_policy_are_errors(tmp_path):
         with pytest.raises(DataError, match="items cannot be read"):
             list(loader)
     with pytest.raises(CompleteSplatError, match=r"data\.on_bad=ignore: choose one of skip, raise"):
-        module(tmp_path, on_bad="ignore")
+        check_value("data.on_bad", hints_of(SceneDataModule.__init__)["on_bad"], "ignore")
 
 
 class Listener(LightningModule):

@@ -6,13 +6,13 @@ from completesplat.data.sequences import MaskedImage
 from completesplat.data.validation import BadImage, OutsidePath
 from completesplat.export.images import GAP, MARGIN
 from completesplat.geometry.cameras import project
-from completesplat.studies.contact_sheet import CELL, CROSS_COLORS, MASK, place_cross, show
+from completesplat.studies.contact_sheet import CELL, CROSS_COLORS, MASK, place_cross, write_contact_sheet
 
 SIZE = 24
 
 
 def sheet_of(sequences, path, images=3, title="title"):
-    show(sequences, path / "show.png", images, title)
+    write_contact_sheet(sequences, path / "show.png", images, title)
     return np.asarray(Image.open(path / "show.png").convert("RGB"))
 
 

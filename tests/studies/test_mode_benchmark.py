@@ -6,7 +6,7 @@ import pytest
 import torch
 from support import tiny_generator
 
-from completesplat.data.hidden_modes import HiddenModes
+from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
@@ -93,11 +93,17 @@ def test_the_figure_shows_the_class_of_each_sample():
 
 
 def test_scenes_of_no_use_are_counted():
-    class Broken(list):
+    class Broken(HiddenModeScenes):
+        def __init__(self, scenes=()):
+            self.scenes = list(scenes)
+
+        def __len__(self):
+            return len(self.scenes)
+
         def __getitem__(self, index):
             if index == 1:
                 raise DataError("broken", sequence="bad")
-            return super().__getitem__(index)
+            return self.scenes[index]
 
         def versions(self, index):
             raise AssertionError("only single modes are wanted")

@@ -7,6 +7,7 @@ from scenes_for_training import scene_batch
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.posterior import Posterior
+from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.generator import CompleteSplat
@@ -61,8 +62,11 @@ def test_timesteps_of_training_and_sampler_are_counted_once_each(monkeypatch):
     assert sum(row["training_share"] for row in result if row["level"] <= 0.5) == pytest.approx(0.5, abs=0.01)
 
 
-class Scenes:
+class Scenes(HiddenModeScenes):
     """Four scenes, of which the second shows its hidden part."""
+
+    def __init__(self) -> None:
+        pass
 
     def __len__(self) -> int:
         return 4

@@ -100,7 +100,7 @@ def frame_checksums(rows: Rows) -> UInt32[np.ndarray, " frame"]:
     )
 
 
-def to_row(name: str, rows: Rows, schema: pa.Schema) -> pa.RecordBatch:
+def latent_row(name: str, rows: Rows, schema: pa.Schema) -> pa.RecordBatch:
     """Return the row of a sequence."""
     columns = [*(rows[array].reshape(-1) for array in ARRAYS), frame_checksums(rows)]
     lists = [pa.LargeListArray.from_arrays(pa.array([0, len(x)], pa.int64()), pa.array(x)) for x in columns]
