@@ -20,7 +20,7 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rendering, RenderingConstants, selection
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.selection import failure
-from completesplat.training import stage
+from completesplat.training import scoring
 
 
 class Broken(ReferenceRasterizer):
@@ -55,7 +55,7 @@ class Clock:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 0.0
         self.turns: list[str] = []
-        for module in (rasterizers, stage):
+        for module in (rasterizers, scoring):
             monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: self.now))
 
     def backend(self, name: str, *seconds: float) -> Backend:

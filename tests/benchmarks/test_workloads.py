@@ -18,7 +18,7 @@ from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers import Rendering
 from completesplat.rasterizers.kernels import drawing
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.training import stage, steps
+from completesplat.training import scoring, steps
 from completesplat.training.steps import FOV_DEGREES, peak_megabytes
 
 
@@ -62,7 +62,7 @@ def test_gradients_of_all_images_are_taken_for_all_parameters() -> None:
 
 def test_the_first_figure_is_the_forward_pass_and_the_second_both(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(stage, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(scoring, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     def passes(seconds: float) -> None:
         now[0] += seconds

@@ -166,7 +166,8 @@ def test_too_long_a_message_is_refused_when_it_is_announced(server):
 def test_a_viser_without_our_checks_is_not_served(monkeypatch):
     """A future viser may call another function than the replaced one."""
     serve = websockets.asyncio.server.serve
-    other = SimpleNamespace(asyncio=SimpleNamespace(server=SimpleNamespace(serve=serve)))
+    served = SimpleNamespace(server=SimpleNamespace(serve=serve))
+    other = SimpleNamespace(asyncio=served, exceptions=websockets.exceptions)  # handlers of other tests may still end
     monkeypatch.setattr(_infra, "websockets", other)
     ports = []
     stop = access.GuardedServer.stop
