@@ -18,11 +18,11 @@ from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.turntable import TurntableSettings, import_turntables
 from completesplat.data.images.files import (
-    FORMATS,
     MOST_PIXELS,
     check_sums,
     image_files,
     opened,
+    photo_formats,
     refused_as_bad,
     save_image,
     stored_size,
@@ -100,7 +100,7 @@ def _copy_photos(folder: Path, images: Path) -> None:
 
     Photos of folders below are written into folders, each the photos of one camera.
     """
-    formats = _photo_formats()
+    formats = photo_formats()
     photos = _photos_in(folder, formats)
     # COLMAP lists pairs with a space between.
     folders = sorted({photo.parent for photo in photos})
@@ -130,16 +130,6 @@ def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
         advice = "" if "HEIF" in formats else '; HEIC needs: pip install "completesplat[heic]"'
         logger.warning("left out: %d files of other formats: %s%s", len(others), shortened(others), advice)
     return photos
-
-
-def _photo_formats() -> tuple[str, ...]:
-    """Return the formats of photos, with that of HEIC where pillow-heif is installed."""
-    try:
-        import pillow_heif
-    except ImportError:
-        return FORMATS
-    pillow_heif.register_heif_opener()
-    return *FORMATS, "HEIF"
 
 
 def _split_video(video: Path, images: Path, frames: int) -> None:

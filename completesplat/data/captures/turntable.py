@@ -24,11 +24,11 @@ from completesplat.data.captures.turn_checks import Turn, examine, write_sheet
 from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.files import (
     EIGHT_BIT_MODES,
-    FORMATS,
     check_sums,
     image_files,
     opened,
     over_grey,
+    photo_formats,
     refused_as_bad,
     save_image,
 )
@@ -135,7 +135,7 @@ def _folders_of_photos(root: Path) -> dict[str, Path]:
         raise MissingFile("no such folder", str(root))
     folders: dict[str, Path] = {}
     for path in (root, *sorted(root.rglob("*/"))):
-        if image_files(path) and not {*path.parents} & {*folders.values()}:
+        if image_files(path, photo_formats()) and not {*path.parents} & {*folders.values()}:
             folders[path.relative_to(root).as_posix() if path != root else root.resolve().name] = path
     if not folders:
         raise MissingFile("no photos there, nor in its folders", str(root))
@@ -154,7 +154,7 @@ def _write_turn(folder: Path, count: int | None, out: Path, settings: TurntableS
         BadImage: photos have several sizes, or a mask is empty or fills its photo.
         DataError: the turn does not close.
     """
-    paths = image_files(folder)
+    paths = image_files(folder, photo_formats())
     if (fewest := min(len(paths), count or len(paths))) < FEWEST_PHOTOS:
         raise TooFewFrames(f"{fewest} photo{'s'[: fewest != 1]}; a turn needs at least {FEWEST_PHOTOS}")
     places = dict(enumerate(paths)) if count is None else _numbered(paths, count)
@@ -207,7 +207,7 @@ def _numbered(paths: Sequence[Path], count: int) -> dict[int, Path]:
 def _read_photo(path: Path, background: str | None) -> Photo:
     """Read a photo, upright and at most 512 pixels wide and high, and find its object."""
     with refused_as_bad(str(path)):
-        with opened(path, FORMATS) as stored:
+        with opened(path, photo_formats()) as stored:
             if stored.mode not in EIGHT_BIT_MODES:
                 raise ImageError(f"colour mode {stored.mode} is not supported")
             check_sums(stored, path)

@@ -87,6 +87,16 @@ def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height w
     return torch.from_numpy(depth * np.float32(scale_adjustment))[None]
 
 
+def photo_formats() -> tuple[str, ...]:
+    """Return the formats of photos, with that of HEIC where pillow-heif is installed."""
+    try:
+        import pillow_heif
+    except ImportError:
+        return FORMATS
+    pillow_heif.register_heif_opener()
+    return *FORMATS, "HEIF"
+
+
 def image_files(folder: Path, formats: Sequence[str] = FORMATS) -> list[Path]:
     """Return the files in a folder whose suffix is that of an image, `r_2` before `r_10`, without hidden ones."""
     suffixes = {suffix for suffix, kind in Image.registered_extensions().items() if kind in formats}
