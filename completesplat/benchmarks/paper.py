@@ -2,8 +2,7 @@
 
 import gc
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -94,12 +93,12 @@ def run(
         scenes: SceneBatch = next(iter(loaded.train_dataloader())).to(torch.device(device))
         # One stage after the other, so that the memory of one is not counted for the other.
         for config in (stage1, stage2):
-            torch.manual_seed(seed)
-            module: Stage = instantiate(config, _convert_="all").to(device)
             for way in ways:
                 status.update(f"timing {way.name}")
+                torch.manual_seed(seed)
+                module: Stage = instantiate(config, _convert_="all").to(device)
                 rows += rows_of(module, scenes, way, samples, training, repeats)
-            del module
+                del module
     work = {"image_size": loaded.image_size, "batch": loaded.batch_size, "samples": samples, "steps": steps}
     if is_as_in_the_paper(work, channels):
         rows = [row | {"paper_ms": figure.paper_ms, "aim_ms": figure.aim_ms} for figure, row in _with_figures(rows)]
@@ -126,12 +125,12 @@ def rows_of(module: Stage, scenes: SceneBatch, way: Way, samples: int, training:
     out with CUDA graphs, because the two do not work together.
     """
     results: list[Row] = []
-    with compiled(networks(module), way):
-        for name, work in works_of(module, scenes, way.precision, samples).items():
-            if name.endswith("_step") and (not training or way.compile == "reduce-overhead"):
-                continue
-            results.append({"name": name, "way": way.name} | measured(work, repeats, module.device))
-            gc.collect()
+    compile_networks(networks(module), way)
+    for name, work in works_of(module, scenes, way.precision, samples).items():
+        if name.endswith("_step") and (not training or way.compile == "reduce-overhead"):
+            continue
+        results.append({"name": name, "way": way.name} | measured(work, repeats, module.device))
+        gc.collect()
     return results
 
 
@@ -150,19 +149,12 @@ def measured(work: Work, repeats: int, device: torch.device) -> Row:
     return {"ms": statistics.median(times), **memory}
 
 
-@contextmanager
-def compiled(networks: list[nn.Module], way: Way) -> Iterator[None]:
-    """Within the context, let these networks compile on their first call."""
-    before = [network._compiled_call_impl for network in networks]
+def compile_networks(networks: list[nn.Module], way: Way) -> None:
+    """Let these networks compile on their first call, if the way says so."""
     if way.compile is not None:
         torch.compiler.reset()
         for network in networks:
             network.compile(mode=way.compile)
-    try:
-        yield
-    finally:
-        for network, call in zip(networks, before, strict=True):
-            network._compiled_call_impl = call
 
 
 def networks(module: Stage) -> list[nn.Module]:
