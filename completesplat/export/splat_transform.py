@@ -1,6 +1,7 @@
 """Export by npm's `@playcanvas/splat-transform`: file formats, and a page with a viewer."""
 
 import json
+import logging
 import math
 import os
 import shutil
@@ -18,16 +19,17 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
-from completesplat.files import atomic_path
+from completesplat.files import atomic_path, write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
-from completesplat.geometry.trajectories import orbit
 
 PROGRAM = "splat-transform"
 PACKAGE = "@playcanvas/splat-transform@2.7.1"
 LIMIT_SECONDS = 600
 WIDEST_WINDOW, LARGEST_FOV = 16 / 9, 120.0
-TURN_SECONDS, KEYS = 20, 12
+IN_A_ROOM = b"const isObjectExperience = !bbox.containsPoint(resetCamera.position);"
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,21 @@ def write_page(path: Path, gaussians: Gaussians, view: PageView, converter: Spla
         scene, settings = Path(folder) / "scene.ply", Path(folder) / "settings.json"
         write_ply(scene, gaussians.transform(turn))
         settings.write_text(json.dumps(viewer_settings(view, turn)))
-        converter.convert(scene, path, ["--viewer-settings", str(settings)])
+        html = Path(folder) / "page.html"
+        converter.convert(scene, html, ["--viewer-settings", str(settings)])
+        write_bytes(path, around_the_target(html.read_bytes()))
+
+
+def around_the_target(page: bytes) -> bytes:
+    """Make the page's camera turn about its target, even within the bounding box of the scene.
+
+    The viewer assumes that a camera within the bounding box stands in a room, and turns it on the spot. Far Gaussians
+    of our scenes extend the box behind the photo's camera. The viewer has no option for this.
+    """
+    if IN_A_ROOM not in page:
+        log.warning("this version of %s may turn the page's camera on the spot, not about the object", PROGRAM)
+    page = page.replace(IN_A_ROOM, b"const isObjectExperience = true;")
+    return page.replace(b"<title>SuperSplat Viewer</title>", b"<title>completesplat</title>")
 
 
 def upright(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
@@ -118,32 +134,30 @@ def upright(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
 
 
 def viewer_settings(view: PageView, turn: Float[Tensor, "4 4"]) -> dict[str, Any]:
-    """Return the viewer's settings (version 1 of its schema), with a full turn of the camera about the pivot.
+    """Return the viewer's settings (version 2 of its schema).
 
     The viewer turns a file by 180 degrees about z, so that +y points up, before it places the camera. Its field of view
     belongs to the window's longer side; it is wide enough for the shorter side to hold what the photo shows.
     """
-    around = orbit(view.reference, view.pivot, view.up, KEYS).centers
-    points = torch.cat([around, view.pivot[None]])
+    points = torch.stack([view.reference.centers, view.pivot])
     flip = torch.tensor([-1.0, -1.0, 1.0], dtype=points.dtype, device=points.device)
-    *positions, target = (transform_points(turn, points) * flip).tolist()
+    position, target = (transform_points(turn, points) * flip).tolist()
     half = max(view.reference.image_size) / 2 / view.reference.intrinsics[0, 0].item()
     fov = min(LARGEST_FOV, math.degrees(2 * math.atan(half * WIDEST_WINDOW)))
-    track = {
-        "name": "turn",
-        "target": "camera",
-        "duration": TURN_SECONDS,
-        "frameRate": 1,
-        "loopMode": "repeat",
-        "interpolation": "spline",
-        "smoothness": 1,
-        "keyframes": {
-            "times": [TURN_SECONDS * key / KEYS for key in range(KEYS)],
-            "values": {"position": [x for position in positions for x in position], "target": target * KEYS},
-        },
-    }
     return {
-        "camera": {"position": positions[0], "target": target, "fov": fov, "startAnim": "animTrack"},
+        "version": 2,
+        "tonemapping": "none",
+        "highPrecisionRendering": False,
         "background": {"color": [view.background] * 3},
-        "animTracks": [track],
+        "postEffectSettings": {
+            "sharpness": {"enabled": False, "amount": 0},
+            "bloom": {"enabled": False, "intensity": 1, "blurLevel": 2},
+            "grading": {"enabled": False, "brightness": 0, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
+            "vignette": {"enabled": False, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
+            "fringing": {"enabled": False, "intensity": 0.5},
+        },
+        "animTracks": [],
+        "cameras": [{"initial": {"position": position, "target": target, "fov": fov}}],
+        "annotations": [],
+        "startMode": "default",
     }

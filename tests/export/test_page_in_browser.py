@@ -12,7 +12,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export import splat_transform
 from completesplat.export.images import to_bytes
 from completesplat.export.splat_transform import LARGEST_FOV, PageView, upright, viewer_settings, write_page
-from completesplat.gaussians import Gaussians
+from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -27,6 +27,13 @@ PIVOT = torch.tensor([0.1, 0.1, 3.0])
 REFERENCE = Cameras(torch.eye(4), pinhole(50, 64), (64, 64))
 
 
+def room() -> Gaussians:
+    """The balls within far walls, which reach behind the camera."""
+    balls, far = scene(), torch.tensor([[-9.0, 0, -9], [9, 0, -9], [-9, 0, 9], [9, 0, 9], [0, -9, 0], [0, 9, 0]])
+    walls = Gaussians(far, far.new_tensor([[1.0, 0, 0, 0]] * 6), far * 0 + 0.5, far[:, 0] * 0 + 0.9, far * 0 + 0.5)
+    return concatenate([balls, walls])
+
+
 def scene() -> Gaussians:
     """Balls of different colours to the right, to the left, above, and one half hidden by the one on the right."""
     means = torch.tensor([[0.7, 0.0, 3.0], [-0.7, 0.1, 3.0], [0.0, -0.7, 3.0], [0.9, 0.2, 4.0]])
@@ -36,7 +43,7 @@ def scene() -> Gaussians:
 
 
 def our_image(view: PageView) -> torch.Tensor:
-    fov = viewer_settings(view, upright(UP))["camera"]["fov"]
+    fov = viewer_settings(view, upright(UP))["cameras"][0]["initial"]["fov"]
     assert fov < LARGEST_FOV
     focal = WIDTH / 2 / math.tan(math.radians(fov) / 2)
     intrinsics = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
@@ -45,14 +52,21 @@ def our_image(view: PageView) -> torch.Tensor:
     return torch.from_numpy(to_bytes(image).copy()).float() / 255
 
 
-def screenshot(path, requests: list[str]) -> torch.Tensor:
-    """The page at rest."""
+def screenshot(path, requests: list[str], drag: int = 0) -> torch.Tensor:
+    """The page at rest, after it was dragged to the right by so many pixels."""
     with playwright.sync_playwright() as started:
         options = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
         browser = started.chromium.launch(executable_path=CHROMIUM, args=options)
         page = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT}, offline=True).new_page()
         page.on("request", lambda request: requests.append(request.url))
         page.goto(f"{path.as_uri()}?noanim&webgl&noui", timeout=180_000)
+        if drag:
+            page.locator("canvas").first.wait_for()
+            page.wait_for_timeout(5000)
+            page.mouse.move(WIDTH / 2, HEIGHT / 2)
+            page.mouse.down()
+            page.mouse.move(WIDTH / 2 + drag, HEIGHT / 2, steps=8)
+            page.mouse.up()
         screenshot = torch.zeros(HEIGHT, WIDTH, 3)
         for _ in range(60):
             page.wait_for_timeout(1000)
@@ -78,3 +92,22 @@ def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path):
     # So does no other way up, nor the mirror image.
     for other in (theirs.flip(0), theirs.flip(1), theirs.flip(0, 1)):
         assert (other - ours).abs().mean() > 0.01
+
+
+def test_dragging_turns_the_page_s_camera_about_the_object_also_within_walls(tmp_path):
+    try:
+        converter = splat_transform.find_splat_transform()
+    except CompleteSplatError as error:
+        pytest.skip(str(error))
+    write_page(tmp_path / "scene.html", room(), PageView(REFERENCE, PIVOT, UP, 0.25), converter)
+    before, after = (screenshot(tmp_path / "scene.html", [], drag) for drag in (0, 150))
+    for color in torch.eye(3):  # the balls around the pivot
+        assert abs(place(before, color) - place(after, color)) < 0.1
+    assert (before - after).abs().mean() > 0.001  # walls, and what is before what
+
+
+def place(screenshot: torch.Tensor, color: torch.Tensor) -> float:
+    """The mean column, as a share of the width, of what is nearly of this colour."""
+    seen = ((screenshot - color).abs() < 0.45).all(-1)
+    assert seen.any()
+    return seen.nonzero()[:, 1].float().mean().item() / WIDTH
