@@ -23,7 +23,6 @@ REASONS = {
         "baselines/autodecoder.py",
         "_load_from_state_dict",
     ): "makes room for a checkpoint's codes before they are compared",
-    ("benchmarks/paper.py", "_compiled_call_impl"): "torch has no way to undo Module.compile",
     ("commands/__init__.py", "logging.raiseExceptions"): "documented: no reports of logging's own errors",
     ("commands/__init__.py", "sys.argv"): DURING_JOB,
     ("commands/imports.py", "_disable_dynamo"): "diffusers' functions stay excluded from compilation, as by torch's",
