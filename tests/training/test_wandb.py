@@ -53,7 +53,9 @@ def run(pipeline, tmp_path_factory):
         with pytest.MonkeyPatch.context() as monkeypatch:
             monkeypatch.delenv("WANDB_MODE", raising=False)
             monkeypatch.chdir(out.parent)
-            given = tests[kind] if kind in tests else ["fit", *fit_settings(pipeline, kind)]
+            # Only rows of two batches have the wait between them.
+            fit = ["fit", *fit_settings(pipeline, kind), "trainer.log_every_n_steps=2"]
+            given = tests.get(kind, fit)
             assert call(monkeypatch, *given, "logger=wandb", f"out={out}") == 0
         return (*offline_runs(out), out)
 

@@ -39,7 +39,7 @@ def test_bytes_depend_on_the_seed_and_not_on_the_workers(tmp_path):
         write_objects(tmp_path / name, scenes=3, frames=2, size=16, seed=seed, workers=workers, progress=False)
         trees[name] = files_of(tmp_path / name)
     assert trees["one"] == trees["two"]
-    first_frames = [path for path in trees["one"] if path.endswith("frame000001.jpg")]
+    first_frames = [path for path in trees["one"] if path.endswith("images/frame000001.jpg")]
     assert len(first_frames) == 3
     assert not {trees["one"][path] for path in first_frames} & set(trees["other"].values())
 
