@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from completesplat.generator import CompleteSplat as CompleteSplat
     from completesplat.version import __version__ as __version__
 
-# By default, threads of torch's GNU OpenMP spin while they wait for the next of hundreds of small parallel regions.
-# Beside another busy process they keep the threads that they wait for off the cores. What a user has set (also
-# GOMP_SPINCOUNT, which libgomp prefers) stays. torch reads it when it is loaded.
+# By default, threads of torch's GNU OpenMP spin for milliseconds while they wait for the next of hundreds of small
+# parallel regions. Beside another busy process they keep the threads that they wait for off the cores; without spinning,
+# regions on free cores begin late. torch reads this when it is loaded; what a user has set stays.
 if "torch" not in sys.modules:
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 _PLACES = {"CompleteSplat": "generator", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
 _PLACES |= {"compose": "settings.composition", "instantiate": "commands.fit", "__version__": "version"}

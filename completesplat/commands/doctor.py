@@ -106,7 +106,7 @@ def check_device() -> Iterator[Finding]:
     from completesplat.results.machine import machine
 
     yield Finding("CPU", "yes", f"{machine()['processor']}, {os.cpu_count()} cores")
-    waits = [f"{name}={os.environ[name]}" for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT") if name in os.environ]
+    waits = [f"{name}={os.environ[name]}" for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY") if name in os.environ]
     yield Finding("threads", "yes", f"{torch.get_num_threads()} of torch's; {', '.join(waits)}")
     for index in range(torch.cuda.device_count()):
         free, total = map(decimal, torch.cuda.mem_get_info(index))

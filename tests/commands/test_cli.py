@@ -46,17 +46,17 @@ def test_an_output_that_cannot_be_written_is_one_line(arguments, unbuffered, tmp
 
 
 @pytest.mark.processes
-@pytest.mark.parametrize("given", [None, "active"])
+@pytest.mark.parametrize("given", [None, "7"])
 @pytest.mark.parametrize("user", ["completesplat.CompleteSplat", "from completesplat.cli import main; main()"])
-def test_torch_is_loaded_with_threads_that_wait_without_spinning(user, given):
+def test_torch_is_loaded_with_threads_that_spin_briefly(user, given):
     """The setting counts at the moment when torch is loaded, so a new process prints it there and ends."""
     program = "import os, sys; sys.argv = ['completesplat', 'doctor']; import completesplat\n"
     program += "class Watch:\n    def find_spec(self, name, *_):\n        if name == 'torch':\n"
-    program += "            print('torch with', os.environ.get('OMP_WAIT_POLICY'), flush=True); os._exit(0)\n"
+    program += "            print('torch with', os.environ.get('GOMP_SPINCOUNT'), flush=True); os._exit(0)\n"
     program += f"sys.meta_path.insert(0, Watch())\n{user}"
-    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    environment |= {} if given is None else {"OMP_WAIT_POLICY": given}
-    assert f"torch with {given or 'passive'}" in python(program, env=environment).splitlines()
+    environment = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
+    environment |= {} if given is None else {"GOMP_SPINCOUNT": given}
+    assert f"torch with {given or 3000}" in python(program, env=environment).splitlines()
 
 
 def test_help_shows_all_verbs_and_the_settings_of_each(command):
