@@ -225,12 +225,7 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = M
     """
     records = {model if name == MODEL else name: flat(entry) for name, entry in results.items()}
     first = next(iter(records.values()))
-    pairs = [(f"object_novel_{name}", f"full_novel_{name}") for name in ("psnr", "ssim")]
-    masked = any(record.get(name) != record.get(whole) for record in records.values() for name, whole in pairs)
-    # Without masks, every pixel is the object's; with them, sharpness is the object's. More columns are too wide.
-    apart = ("full_novel_sharpness", "object_novel_lpips") if masked else "object"
-    names = [name for name in SHOWN if any(name in record for record in records.values())]
-    names = [name for name in names if not name.startswith(apart)]
+    names = _evaluated(list(records.values()))
     entries = []
     for label, scores in records.items():
         bound = " (upper bound)" if scores.get(UPPER_BOUND) else ""
@@ -243,6 +238,16 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = M
     remarks = [f"{label}: fitted to {views}." for label, views in fitted.items() if views]
     title = f"{first['scenes']:.0f} scenes, {first['views']:.0f} novel views"
     return Table(title, title, headings, rows, [*remarks, SSIM_NOTE, SHARPNESS_NOTE])
+
+
+def _evaluated(records: Sequence[Scores]) -> list[str]:
+    """Return the names of the scores in the table, fewer than there are: more columns are too wide."""
+    pairs = [(f"object_novel_{name}", f"full_novel_{name}") for name in ("psnr", "ssim")]
+    masked = any(record.get(name) != record.get(whole) for record in records for name, whole in pairs)
+    # Without masks, every pixel is the object's; with them, sharpness is the object's.
+    apart = ("full_novel_sharpness", "object_novel_lpips") if masked else "object"
+    present = [name for name in SHOWN if any(name in record for record in records)]
+    return [name for name in present if not name.startswith(apart)]
 
 
 def mode_tables(runs: Sequence[Result]) -> list[Table]:
