@@ -22,6 +22,15 @@ READABLE_SIDE = 144
 GAP, LINE, MARGIN = 6, 20, 12
 INK, PAPER = "black", "white"
 NOTHING, OPAQUE = 0.5, 0.5
+# From far to near. Lightness rises steadily, so that a greyscale copy shows the same order.
+STOPS = [
+    [0.05, 0.03, 0.20],
+    [0.30, 0.08, 0.45],
+    [0.62, 0.18, 0.45],
+    [0.90, 0.40, 0.25],
+    [0.98, 0.70, 0.20],
+    [1.00, 0.98, 0.70],
+]
 
 
 def to_bytes(images: Colors) -> UInt8[np.ndarray, "*batch height width 3"]:
@@ -127,10 +136,12 @@ def color_depth(depth: Maps) -> tuple[Colors, tuple[float, float]]:
 
 def ramp(values: Maps) -> Colors:
     """Return colours for values from 0 (dark) to 1 (bright); clamp other values."""
-    from matplotlib import colormaps
-
-    colors = torch.from_numpy(colormaps["inferno"](values.clamp(0, 1).squeeze(-3).cpu().numpy())[..., :3])
-    return colors.to(values).movedim(-1, -3)
+    position = values.clamp(0, 1) * (len(STOPS) - 1)
+    stops = torch.tensor(STOPS, dtype=values.dtype, device=values.device)
+    lower = position.floor().clamp(max=len(STOPS) - 2)
+    index = lower.long().squeeze(-3)
+    mix = (position - lower).squeeze(-3)[..., None]
+    return torch.lerp(stops[index], stops[index + 1], mix).movedim(-1, -3)
 
 
 def color_normals(normals: Colors) -> Colors:

@@ -56,7 +56,6 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
         DiskError: the disk is full.
     """
     import imageio.v2 as imageio
-    from imageio_ffmpeg import count_frames_and_secs
 
     if len(frames) == 0 or Path(path).suffix != ".mp4":
         raise ValueError(f"{path}: a video needs at least one frame and a name that ends in .mp4")
@@ -71,5 +70,18 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
                 padded = torch.nn.functional.pad(large[None], (0, wide % 2, 0, tall % 2), mode="replicate")[0]
                 writer.append_data(to_bytes(padded))  # type: ignore[attr-defined]
         # ffmpeg is another process, and imageio does not pass on its errors.
-        if count_frames_and_secs(temporary)[0] != len(frames):
+        if not _is_whole(temporary):
             raise RuntimeError(f"{path}: was not written to its end")
+
+
+def _is_whole(path: Path) -> bool:
+    """Return whether an `.mp4` ends where its last box does, and has an index of its frames (ISO/IEC 14496-12, 4.2)."""
+    content, at, kinds = path.read_bytes(), 0, set()
+    while at + 8 <= len(content):
+        length, kind = int.from_bytes(content[at : at + 4]), content[at + 4 : at + 8]
+        length = int.from_bytes(content[at + 8 : at + 16]) if length == 1 else length
+        if length < 8:
+            return False
+        kinds.add(kind)
+        at += length
+    return at == len(content) and b"moov" in kinds
