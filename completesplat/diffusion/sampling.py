@@ -22,7 +22,7 @@ Part = TypeVar("Part")
 logger = logging.getLogger(__name__)
 
 SMALL = 20_000_000
-"""Parameters of a denoiser below which one thread computes a sample about as fast as several (`bench threads`)."""
+"""Parameters of a denoiser below which samples are drawn side by side (notebooks/experiments.md)."""
 PART = 4
 """Samples that one thread draws at a time with a small denoiser."""
 
