@@ -128,7 +128,7 @@ class CompleteSplat(SceneModel):
             steps: denoising steps; by default the sampler's number.
             seed: seed of all noise, or one for each image, whose samples then do not depend on the other images.
             visible: 0 where an image is hidden; hidden pixels have no influence.
-            color_fits: rounds in which colours are fitted to the image (`fit_colors`); 0 in the paper.
+            color_fits: rounds of fitting to the image (`fit_front`); 0 in the paper.
             batch: the largest number of latents at a time, which changes only the rounding of float32; all by default,
                 or fewer if a GPU's memory does not suffice.
             on_step: called after each denoiser call of each batch with its number, the timestep, the estimated scenes.
