@@ -33,7 +33,7 @@ _rasterizer = cache(auto)
 
 
 class SceneModel(nn.Module):
-    """Base class of models from photos to scenes: `CompleteSplat`, which samples, `OneAnswer`, `PublishedOneAnswer`.
+    """Base class of models from photos to scenes: `CompleteSplat` (samples), `DeterministicModel`, `PublishedModel`.
 
     Args:
         architecture: the config that is written beside the weights; it has `image_size`.

@@ -11,12 +11,12 @@ from diffusers import DDIMScheduler
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from completesplat.diffusion.guidance import Denoise, Features, Latents, guided_noise
+from completesplat.diffusion.guidance import Conditioning, Denoise, Latents, guided_noise
 from completesplat.diffusion.objective import clean_estimate, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.schema import Range
 
-Part = TypeVar("Part")
+T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 OnStep = Callable[[int, int, Tensor], None]
@@ -43,7 +43,7 @@ class Sampler:
         self,
         denoise: Denoise,
         noise: Latents,
-        conditioning: Features,
+        conditioning: Conditioning,
         guidance_weight: float = 0.0,
         steps: int | None = None,
         on_step: OnStep | None = None,
@@ -137,7 +137,7 @@ def draw_noise(
     return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(number)) for number in seeds])
 
 
-def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None) -> list[Part]:
+def in_parts(draw: Callable[[slice], T], count: int, most: int | None = None) -> list[T]:
     """Call `draw` for all of `count` samples in order, at most `most` at a time (None: all at once).
 
     If a GPU's memory does not suffice, log a warning and draw with parts of half the size.
@@ -145,7 +145,7 @@ def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None)
     Raises:
         torch.cuda.OutOfMemoryError: a single sample does not fit.
     """
-    parts: list[Part] = []
+    parts: list[T] = []
     start, size = 0, min(count if most is None else most, count)
     while start < count:
         try:
