@@ -63,7 +63,7 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
     assert settings["samples"] == 1
     model = CompleteSplat.from_pretrained(weights)
     assert isinstance(model, PublishedModel)
-    scene = model(image, color_fits=2)[0]
+    scene = model(image, color_fits=20)[0]
     stored, center = read_ply(folder / "sample_00.ply"), torch.zeros(3)
     assert isinstance(stored, DirectionalGaussians)
     torch.testing.assert_close(stored.seen_from(center).colors, scene.seen_from(center).colors, atol=1e-4, rtol=0)
