@@ -15,13 +15,13 @@ from torch import Tensor
 
 from completesplat.autoreconstructor.encoder import Images
 from completesplat.autoreconstructor.model import DepthRange, VariationalAutoReconstructor
-from completesplat.baselines.splatter_image.model import PublishedOneAnswer, is_published
+from completesplat.baselines.splatter_image.model import PublishedModel, is_published
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.diffusion.sampling import PART, Sampler, draw_noise, in_parts, one_thread_each, with_forward_process
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.parts import PartConfig, build, check_architecture, read_weights, saved
+from completesplat.parts import PartConfig, build, check_architecture, read_weights, stored_config
 from completesplat.run_configs import read_run
 from completesplat.scene import Views
 from completesplat.scene_model import SceneModel, Visible
@@ -178,7 +178,7 @@ class CompleteSplat(SceneModel):
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Use another sampler from now on, with the noise schedule and prediction type of training."""
-        config = saved(with_forward_process(sampler, self.architecture["sampler"]))
+        config = stored_config(with_forward_process(sampler, self.architecture["sampler"]))
         check_architecture({**self.architecture, "sampler": config})
         self.sampler = build(config)
         self.architecture["sampler"] = config
@@ -186,11 +186,11 @@ class CompleteSplat(SceneModel):
     @staticmethod
     @in_float32()
     def from_pretrained(path: Path | str) -> SceneModel:
-        """Load what `save_pretrained` wrote or a run trained, in evaluation mode on the CPU; stage 1 is a `OneAnswer`.
+        """Load a saved or trained model in evaluation mode on the CPU; stage 1 gives a `DeterministicModel`.
 
         Args:
             path: a name of shipped weights, a folder of weights or of a run, a checkpoint, or an id on the Hugging Face
-                hub (`locate`). Published weights of Splatter Image (`is_published`) give a `PublishedOneAnswer`.
+                hub (`locate`). Published weights of Splatter Image (`is_published`) give a `PublishedModel`.
 
         Raises:
             WeightsError: files are missing, unreadable, changed, not finite, do not belong together, or name parts that
@@ -208,7 +208,7 @@ class CompleteSplat(SceneModel):
         return model.eval()
 
 
-class OneAnswer(SceneModel):
+class DeterministicModel(SceneModel):
     """Model of one pass from a photo to its scene: stage 1 at its posterior's mode, or the baseline Splatter Image.
 
     Args:
@@ -230,7 +230,7 @@ def _architecture(
     parts: Mapping[str, PartConfig], image_size: int, training: Mapping[str, object] | None
 ) -> dict[str, Any]:
     """Return a model's config as weights store it; raise WeightsError for parts that weights may not name."""
-    config: dict[str, Any] = {name: saved(part) for name, part in parts.items()} | {"image_size": image_size}
+    config: dict[str, Any] = {name: stored_config(part) for name, part in parts.items()} | {"image_size": image_size}
     config |= {} if training is None else {"training": dict(training)}
     check_architecture(config)
     return config
@@ -238,10 +238,10 @@ def _architecture(
 
 def _opened(path: Path | str) -> SceneModel:
     if is_published(path):
-        return PublishedOneAnswer(str(path))
+        return PublishedModel(str(path))
     file = locate(path)
     architecture, tensors = (read_weights if file.name == WEIGHTS_FILE else read_run)(file)
-    model: SceneModel = (OneAnswer if "network" in architecture else CompleteSplat)(**architecture)
+    model: SceneModel = (DeterministicModel if "network" in architecture else CompleteSplat)(**architecture)
     if (difference := mismatch(model.state_dict(), tensors)) is not None:
         raise ValueError(difference)
     model.load_state_dict(tensors)

@@ -33,7 +33,7 @@ _rasterizer = cache(auto)
 
 
 class SceneModel(nn.Module):
-    """Base class of models from photos to scenes: `CompleteSplat`, which samples, `OneAnswer`, `PublishedOneAnswer`.
+    """Base class of models from photos to scenes: `CompleteSplat` (samples), `DeterministicModel`, `PublishedModel`.
 
     Args:
         architecture: the config that is written beside the weights; it has `image_size`.
@@ -252,8 +252,8 @@ def distance_to_training(photograph: Photograph, architecture: Mapping[str, Any]
 def distances_to_shipped(image: ImageLike, remove_background: bool = False) -> dict[str, float]:
     """Return the distances of an image from the training images of the weights in the package, the nearest first.
 
-    They depend on the resolution, so the image, which is read once, is resized for each model. Weights of objects on one
-    background are left out if the image's border does not show it.
+    They depend on the resolution, so the image, which is read once, is resized for each model. Weights of objects on
+    one background are left out if the image's border does not show it.
 
     Raises:
         CompleteSplatError: as `read_photograph`.

@@ -33,7 +33,7 @@ VIEWS = 100
 MEGABYTE = 1e6
 
 
-class Figure(NamedTuple):
+class Duration(NamedTuple):
     """Durations in ms of one kind of work: the paper's on an A100, and our aim on a newer GPU."""
 
     text: str
@@ -42,19 +42,19 @@ class Figure(NamedTuple):
 
 
 FIGURES = {
-    "reconstruct": Figure("encode and reconstruct an image", 15.7, 5),  # Table 2, "Ours - AutoReconstructor"
-    "sample": Figure("draw a sample", 2_700, 500),  # Table 2, "Ours - Diffusion single sample"
-    "samples": Figure("draw all samples at once", 54_000, 2_000),  # Table 2, "20-best oracle"
-    "render": Figure("render 100 views of a scene", 29.1, 5),  # Table 2; the paper does not say how many views
-    "stage1_step": Figure("training step of stage 1", None, None),
-    "stage2_step": Figure("training step of stage 2", 157, None),  # supplement: 1,100,000 steps in 2 days
+    "reconstruct": Duration("encode and reconstruct an image", 15.7, 5),  # Table 2, "Ours - AutoReconstructor"
+    "sample": Duration("draw a sample", 2_700, 500),  # Table 2, "Ours - Diffusion single sample"
+    "samples": Duration("draw all samples at once", 54_000, 2_000),  # Table 2, "20-best oracle"
+    "render": Duration("render 100 views of a scene", 29.1, 5),  # Table 2; the paper does not say how many views
+    "stage1_step": Duration("training step of stage 1", None, None),
+    "stage2_step": Duration("training step of stage 2", 157, None),  # supplement: 1,100,000 steps in 2 days
 }
 # The paper's durations are shown beside ours only for the same work.
 PAPERS_WORK = {"image_size": 128, "batch": 32, "samples": 20, "steps": 50}
 PAPERS_CHANNELS = {"encoder": [128, 256, 512, 512], "denoiser": [320, 640, 1280, 1280]}
 
 
-class Way(NamedTuple):
+class ComputeMode(NamedTuple):
     """Precision of the networks and mode of `torch.compile`; None does not compile them."""
 
     name: str
@@ -62,11 +62,11 @@ class Way(NamedTuple):
     compile: Literal["default", "reduce-overhead"] | None = None  # the latter records CUDA graphs
 
 
-WAYS = (
-    Way("float32", "32-true"),
-    Way("bfloat16", "bf16-mixed"),
-    Way("bfloat16, compiled", "bf16-mixed", "default"),
-    Way("bfloat16, CUDA graphs", "bf16-mixed", "reduce-overhead"),
+COMPUTE_MODES = (
+    ComputeMode("float32", "32-true"),
+    ComputeMode("bfloat16", "bf16-mixed"),
+    ComputeMode("bfloat16, compiled", "bf16-mixed", "default"),
+    ComputeMode("bfloat16, CUDA graphs", "bf16-mixed", "reduce-overhead"),
 )
 
 
@@ -87,7 +87,7 @@ def run(
             "device=cuda: no GPU is available; measure with device=cpu, which takes minutes with "
             "autoreconstructor=tiny conditioning=learned denoiser=tiny"
         )
-    ways = [way for way in WAYS if compile or way.compile is None]
+    ways = [way for way in COMPUTE_MODES if compile or way.compile is None]
     quieten()
     rows: list[Row] = []
     with TemporaryDirectory(prefix="bench_", dir=out) as folder, Console(stderr=True).status("building") as status:
@@ -111,7 +111,7 @@ def run(
     report(out / "paper.json", results, {title.format(**work): named}, device)
 
 
-def _with_figures(rows: Sequence[Row]) -> list[tuple[Figure, Row]]:
+def _with_figures(rows: Sequence[Row]) -> list[tuple[Duration, Row]]:
     """Return each row with its figure; the ways of doing one kind of work stand next to each other."""
     return [(figure, row) for name, figure in FIGURES.items() for row in rows if row["name"] == name]
 
@@ -122,7 +122,7 @@ def is_as_in_the_paper(work: Mapping[str, int], channels: Mapping[str, Sequence[
 
 
 def rows_of(
-    module: Stage, scenes: SceneBatch, way: Way, samples: int, training: bool, repeats: int, busy: int = 0
+    module: Stage, scenes: SceneBatch, way: ComputeMode, samples: int, training: bool, repeats: int, busy: int = 0
 ) -> list[Row]:
     """Return a row for each kind of work: median ms and, on a GPU, torch's peak memory in MB, weights included.
 
@@ -134,12 +134,12 @@ def rows_of(
     for name, work in works_of(module, scenes, way.precision, samples).items():
         if name.endswith("_step") and (not training or way.compile == "reduce-overhead"):
             continue
-        results.append({"name": name, "way": way.name} | measured(work, repeats, module.device, busy))
+        results.append({"name": name, "way": way.name} | time_and_memory(work, repeats, module.device, busy))
         gc.collect()
     return results
 
 
-def measured(work: Work, repeats: int, device: torch.device, busy: int = 0) -> Row:
+def time_and_memory(work: Work, repeats: int, device: torch.device, busy: int = 0) -> Row:
     """Return the median time, alone and beside busy processes, and on a GPU the peak memory; or why the work failed."""
     try:
         for _ in range(WARM_UP):
@@ -155,7 +155,7 @@ def measured(work: Work, repeats: int, device: torch.device, busy: int = 0) -> R
         first = (str(error).strip().splitlines() or [""])[0]
         return {"not_measured": f"{type(error).__name__}: {first}"}
     memory = {"memory_mb": torch.cuda.max_memory_allocated(device) / MEGABYTE} if device.type == "cuda" else {}
-    return row | memory
+    return {**row, **memory}
 
 
 @contextmanager
@@ -171,7 +171,7 @@ def busy_processes(count: int) -> Iterator[None]:
             process.wait()
 
 
-def compile_networks(networks: list[nn.Module], way: Way) -> None:
+def compile_networks(networks: list[nn.Module], way: ComputeMode) -> None:
     """Let these networks compile on their first call, if the way says so."""
     if way.compile is not None:
         torch.compiler.reset()

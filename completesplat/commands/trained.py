@@ -28,7 +28,7 @@ WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no 
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainedModel:
     """A model with its data: a run's checkpoint, weights, or files of scenes that any program wrote.
 
     `conf/test.yaml` explains the arguments; with `ckpt`, those of its run replace `data` and `rasterizer`.

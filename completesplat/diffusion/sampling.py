@@ -13,12 +13,12 @@ from diffusers import DDIMScheduler
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from completesplat.diffusion.guidance import Denoise, Features, Latents, guided_noise
+from completesplat.diffusion.guidance import Conditioning, Denoise, Latents, guided_noise
 from completesplat.diffusion.objective import clean_estimate, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.schema import Range
 
-Part = TypeVar("Part")
+T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 SMALL = 20_000_000
@@ -50,7 +50,7 @@ class Sampler:
         self,
         denoise: Denoise,
         noise: Latents,
-        conditioning: Features,
+        conditioning: Conditioning,
         guidance_weight: float = 0.0,
         steps: int | None = None,
         on_step: OnStep | None = None,
@@ -163,7 +163,7 @@ def one_thread_each(denoiser: nn.Module, device: torch.device) -> Iterator[int]:
         torch.set_num_threads(before)
 
 
-def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None, threads: int = 0) -> list[Part]:
+def in_parts(draw: Callable[[slice], T], count: int, most: int | None = None, threads: int = 0) -> list[T]:
     """Call `draw` for all of `count` samples in order, at most `most` at a time (None: all at once).
 
     If a GPU's memory does not suffice, log a warning and draw with parts of half the size.
@@ -174,7 +174,7 @@ def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None,
     Raises:
         torch.cuda.OutOfMemoryError: a single sample does not fit.
     """
-    parts: list[Part] = []
+    parts: list[T] = []
     start, size = 0, min(count if most is None else most, count)
     if threads > 1 and size < count:
         with ThreadPoolExecutor(threads) as pool:
@@ -195,12 +195,12 @@ def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None,
     return parts
 
 
-def _with_modes_of_this_thread(draw: Callable[[slice], Part]) -> Callable[[slice], Part]:
+def _with_modes_of_this_thread(draw: Callable[[slice], T]) -> Callable[[slice], T]:
     """Return a function that another thread can call: torch keeps gradients, inference and autocast for each thread."""
     grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
     cast = torch.get_autocast_dtype("cpu"), torch.is_autocast_enabled("cpu")
 
-    def in_modes(part: slice) -> Part:
+    def in_modes(part: slice) -> T:
         torch.set_num_threads(1)
         with torch.autocast("cpu", *cast), torch.inference_mode(inference), torch.set_grad_enabled(grad):
             return draw(part)

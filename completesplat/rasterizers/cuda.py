@@ -13,7 +13,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.rotations import normalize_quaternion
-from completesplat.rasterizers import Rendering, RenderingConstants, as_seen, require_float32
+from completesplat.rasterizers import Rendering, RenderingConstants, require_float32, with_view_colors
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
 
 DEVICE = "cuda"
@@ -66,7 +66,7 @@ class CudaRasterizer:
         self._near_plane = float(np.nextafter(np.float32(self.constants.near_plane), np.float32(np.inf)))
         self._rasterization = gsplat.rasterization
 
-    @as_seen
+    @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Render scenes [batch] from cameras [batch view]; CPU tensors are copied to the GPU and the images back."""
         home = gaussians.means.device

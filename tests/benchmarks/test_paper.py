@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from support import compose_config, strict_json
 
 from completesplat.benchmarks import paper
-from completesplat.benchmarks.paper import FIGURES, WAYS, compile_networks, is_as_in_the_paper, measured
+from completesplat.benchmarks.paper import COMPUTE_MODES, FIGURES, compile_networks, is_as_in_the_paper, time_and_memory
 from completesplat.settings.checks import complete_task
 
 CHANNELS = "channels=[8,8,16,16]"
@@ -61,7 +61,7 @@ def test_the_work_is_the_papers_unless_something_is_changed():
 def test_networks_are_compiled_in_the_way_s_mode(monkeypatch):
     modes = []
     monkeypatch.setattr(torch, "compile", lambda call, mode: modes.append(mode) or call)
-    for way in WAYS:
+    for way in COMPUTE_MODES:
         network = torch.nn.Linear(1, 1)
         compile_networks([network], way)
         assert (network._compiled_call_impl is not None) == (way.compile is not None)
@@ -72,7 +72,7 @@ def test_failing_work_has_the_reason_in_its_row():
     def fail() -> None:
         raise RuntimeError("out of memory\nand a long story")
 
-    assert measured(fail, 1, torch.device("cpu")) == {"not_measured": "RuntimeError: out of memory"}
+    assert time_and_memory(fail, 1, torch.device("cpu")) == {"not_measured": "RuntimeError: out of memory"}
 
 
 def children() -> int:
@@ -86,7 +86,7 @@ def test_work_is_measured_beside_busy_processes_which_end_with_it():
     def work() -> None:
         busy.append(children())
 
-    row = measured(work, 2, torch.device("cpu"), busy=3)
+    row = time_and_memory(work, 2, torch.device("cpu"), busy=3)
     assert busy == [0] * (paper.WARM_UP + 2) + [3] * 2
     assert row["times"] == row["busy_ms"] / row["ms"]
     assert children() == 0

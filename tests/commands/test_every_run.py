@@ -13,11 +13,11 @@ from omegaconf import OmegaConf
 from PIL import Image
 from support import SMALL, compose_config, strict_json
 
-from completesplat.commands.trained import Trained
+from completesplat.commands.trained import TrainedModel
 from completesplat.commands.view import setting_of_path
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
-from completesplat.generator import CompleteSplat, OneAnswer
+from completesplat.generator import CompleteSplat, DeterministicModel
 from completesplat.weights import CONFIG_FILE, SUMS_FILE
 
 QUICK = [*SMALL, "callbacks.images=null"]
@@ -63,9 +63,9 @@ def test_a_prediction_of_stage_one_gives_one_answer(command, pipeline, tmp_path)
 @pytest.mark.parametrize("run", ["var", "splatter"], indirect=True)
 def test_scenes_of_stage_one_are_those_that_its_test_scores(pipeline, run):
     model = CompleteSplat.from_pretrained(run)
-    assert isinstance(model, OneAnswer)
+    assert isinstance(model, DeterministicModel)
     assert not model.draws_samples
-    module, data = Trained(str(run / "checkpoints/last.ckpt"), [f"data.root={pipeline.toy}"], trust=True).open()
+    module, data = TrainedModel(str(run / "checkpoints/last.ckpt"), [f"data.root={pipeline.toy}"], trust=True).open()
     data.setup("test")
     batch = next(iter(data.test_dataloader()))
     with torch.no_grad():

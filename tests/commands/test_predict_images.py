@@ -15,10 +15,10 @@ from fake_converter import calls, install
 from PIL import Image
 from support import compose_config, some_gaussians, strict_json
 
-from completesplat.commands.predict import find_images, remarks, run, unusual_field_of_view, wanted_files
+from completesplat.commands.predict import find_images, output_files, photo_warnings, run, unusual_field_of_view
 from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.generator import CompleteSplat
 
 QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
@@ -26,7 +26,7 @@ QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
 
 def draw(model: CompleteSplat, photograph: Photograph, visible: object, **settings: object) -> list[Gaussians]:
     """In place of the networks, which other tests run: a few splats in the photograph's colour."""
-    scene = concatenate([some_gaussians(1)[0]] * 10)
+    scene = merge_gaussians([some_gaussians(1)[0]] * 10)
     place = torch.linspace(-0.5, 0.5, 20)
     means = torch.stack([place, place.sin(), place + 3], dim=-1)
     return [replace(scene, means=means, colors=photograph.image.mean((1, 2)).expand(20, 3).contiguous())]
@@ -158,11 +158,11 @@ def test_one_warning_says_that_the_weights_were_not_trained_with_hidden_parts(
 def test_a_photo_unlike_the_training_images_gets_a_warning(tiny_weights, tmp_path):
     model = model_with(tiny_weights, picture_mean=[1.0, 0, 0, 0, 0, 0, 0, 0], picture_std=[0.1] * 8)
     red, blue = (model.read(save(tmp_path / f"{color}.png", color), 15) for color in ("red", "blue"))
-    fov, unlike = remarks(blue, model, whole=True)
+    fov, unlike = photo_warnings(blue, model, whole=True)
     assert "field of view is 15" in fov
     assert unlike.startswith("colours, contrast or detail lie 5.0 standard deviations from the training images'")
-    assert len(remarks(red, model, whole=True)) == len(remarks(blue, model, whole=False)) == 1
-    assert len(remarks(blue, model_with(tiny_weights), whole=True)) == 1  # nothing is known of the training
+    assert len(photo_warnings(red, model, whole=True)) == len(photo_warnings(blue, model, whole=False)) == 1
+    assert len(photo_warnings(blue, model_with(tiny_weights), whole=True)) == 1  # nothing is known of the training
 
 
 def test_shipped_weights_that_are_nearer_to_a_photo_are_named(tiny_weights, tmp_path, monkeypatch):
@@ -175,11 +175,11 @@ def test_shipped_weights_that_are_nearer_to_a_photo_are_named(tiny_weights, tmp_
         (folders[name] / "config.json").write_text(json.dumps({"image_size": 24, "training": training}))
     monkeypatch.setattr("completesplat.scene_model.shipped", lambda: folders)
     blue, red = (model.read(save(tmp_path / f"{color}.png", color)) for color in ("blue", "red"))
-    (unlike,) = remarks(blue, model, whole=True)
+    (unlike,) = photo_warnings(blue, model, whole=True)
     assert unlike.endswith("; weights=blues were trained on images that are nearer (0.0)")
-    assert remarks(red, model, whole=True) == []
+    assert photo_warnings(red, model, whole=True) == []
     monkeypatch.setattr("completesplat.scene_model.shipped", lambda: {"reds": folders["reds"]})
-    (unlike,) = remarks(blue, model, whole=True)
+    (unlike,) = photo_warnings(blue, model, whole=True)
     near, elsewhere = unlike.partition("expect little of it in the scenes; ")[2].split("; ", 1)
     assert near == "weights=reds were trained on images that are nearer (4.8)"  # but not near
     for name in (
@@ -282,7 +282,7 @@ def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_pat
         config = compose_config("predict", images, "weights=nowhere", setting, *video)
         with pytest.raises(CompleteSplatError, match=re.escape(message)):
             run(config, tmp_path)
-    only_videos = wanted_files(compose_config("predict", "image=a.png", "formats=[]"))
+    only_videos = output_files(compose_config("predict", "image=a.png", "formats=[]"))
     assert (only_videos.formats, only_videos.videos) == ((), ("orbit",))
 
 

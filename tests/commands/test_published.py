@@ -8,8 +8,8 @@ from PIL import Image
 from published_weights import write_published
 from support import SMALL, compose_config, strict_json
 
-from completesplat.baselines.splatter_image.model import PublishedOneAnswer
-from completesplat.commands.trained import Trained
+from completesplat.baselines.splatter_image.model import PublishedModel
+from completesplat.commands.trained import TrainedModel
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
 from completesplat.gaussians import DirectionalGaussians
@@ -27,7 +27,7 @@ def cut_out(path, size=(60, 40)):
 
 def test_a_cut_out_object_lies_on_what_the_weights_know_as_large_as_in_training(tmp_path):
     image = cut_out(tmp_path / "a.png")
-    of_objects = PublishedOneAnswer(str(write_published(tmp_path / "objects", "objaverse", size=40)))
+    of_objects = PublishedModel(str(write_published(tmp_path / "objects", "objaverse", size=40)))
     photograph = of_objects.read(image)
     assert (photograph.fov_degrees, photograph.fov_source) == (pytest.approx(49.1343, abs=1e-3), "default")
     orange = photograph.image[2] < 0.5
@@ -37,7 +37,7 @@ def test_a_cut_out_object_lies_on_what_the_weights_know_as_large_as_in_training(
     assert abs(rows.float().mean() - 19.5) <= 1
     assert abs(columns.float().mean() - 19.5) <= 1
     assert photograph.image[:, 0, 0].tolist() == [1, 1, 1]
-    of_captures = PublishedOneAnswer(str(write_published(tmp_path / "captures", "hydrants", size=40)))
+    of_captures = PublishedModel(str(write_published(tmp_path / "captures", "hydrants", size=40)))
     seen = of_captures.read(image, 60)
     assert (seen.fov_degrees, seen.fov_source) == (60, "given")
     assert seen.image[:, 0, 0].tolist() == [0, 0, 0]  # the central square, its left border cuts the object
@@ -62,7 +62,7 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
     assert not {"sampler", "steps"} & settings.keys()
     assert settings["samples"] == 1
     model = CompleteSplat.from_pretrained(weights)
-    assert isinstance(model, PublishedOneAnswer)
+    assert isinstance(model, PublishedModel)
     scene = model(image, color_fits=40)[0]
     stored, center = read_ply(folder / "sample_00.ply"), torch.zeros(3)
     assert isinstance(stored, DirectionalGaussians)
@@ -120,7 +120,7 @@ def test_a_test_sees_objects_only_at_their_depths_and_its_figures_stand_apart(co
     assert metrics["protocol"]["checkpoint"]["path"] == str(weights)
     assert metrics["model"]["full"]["novel"]["psnr"] > 0
     config = compose_config("test", *given)
-    trained = Trained(None, weights=str(weights), data=config.data, rasterizer=config.rasterizer)
+    trained = TrainedModel(None, weights=str(weights), data=config.data, rasterizer=config.rasterizer)
     module, data = trained.open()
     assert not isinstance(module, Stage)  # nothing is trained, so there is no optimizer
     data.prepare_data()

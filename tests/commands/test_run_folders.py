@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from support import SMALL, strict_json
 
 from completesplat.commands import jobs
-from completesplat.commands.jobs import alone_in
+from completesplat.commands.jobs import hold_job_lock
 from completesplat.data.toy import write_objects
 from completesplat.errors import CompleteSplatError
 from completesplat.files import atomic_path
@@ -81,7 +81,7 @@ def test_a_lock_that_is_no_file_is_refused(tmp_path, kind):
         lock.symlink_to(target)
     if kind == "link":
         target.write_text("kept")
-    with pytest.raises(CompleteSplatError, match=r"run/\.lock: is a link or a folder"), alone_in(lock.parent):
+    with pytest.raises(CompleteSplatError, match=r"run/\.lock: is a link or a folder"), hold_job_lock(lock.parent):
         pass
     assert (target.read_text() == "kept") if kind == "link" else not target.exists()
 

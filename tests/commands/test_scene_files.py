@@ -17,7 +17,7 @@ from completesplat.export.ply import read_ply, write_ply
 from completesplat.gaussians import Gaussians
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.results.paper_figures import published_tables
-from completesplat.results.runs import find_results, flat
+from completesplat.results.runs import find_results, flat_scores
 from completesplat.results.tables import as_markdown
 from completesplat.scene import SceneBatch
 from completesplat.training.scoring import SceneFiles, Scorer
@@ -57,7 +57,7 @@ def test_samples_score_the_same_from_files_as_from_the_model(command, pipeline, 
     assert files["model"]["seconds"].keys() == {"rendering"}
     assert list(ours) == list(files)
     for row in ours:
-        expected, actual = (flat(scores[row]) for scores in (ours, files))
+        expected, actual = (flat_scores(scores[row]) for scores in (ours, files))
         assert expected.keys() == actual.keys()
         for name in expected:
             if "seconds" not in name:

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from support import compose_config, strict_json
 
 from completesplat.commands.evaluate import scored_data
-from completesplat.commands.trained import Trained
+from completesplat.commands.trained import TrainedModel
 from completesplat.data.toy import write_objects
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError, DataError
@@ -184,9 +184,9 @@ def test_either_a_checkpoint_or_weights_are_scored():
         ({"ckpt": "a", "data": {"root": "DIR"}}, "a checkpoint's data are its run's"),
     ):
         with pytest.raises(CompleteSplatError, match=message):
-            Trained(**given).configuration()
+            TrainedModel(**given).configuration()
 
 
 def test_a_sampler_for_a_model_without_samples_is_refused(pipeline):
     with pytest.raises(CompleteSplatError, match="a diffusion model is needed"):
-        Trained(str(pipeline.var / "checkpoints/last.ckpt"), sampler={"steps": 2}).open()
+        TrainedModel(str(pipeline.var / "checkpoints/last.ckpt"), sampler={"steps": 2}).open()

@@ -14,7 +14,7 @@ from support import LIMIT
 from viewer_scenes import balls
 from written_commands import ROOT
 
-from completesplat.commands.jobs import alone_in
+from completesplat.commands.jobs import hold_job_lock
 from completesplat.commands.view import newest_scenes, scenes_in, setting_of_path, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
@@ -92,7 +92,7 @@ def test_a_run_is_watched_while_a_process_is_at_work_in_it(tmp_path):
     assert setting_of_path(run) == {"weights": str(run)}
     (run / ".lock").touch()
     assert setting_of_path(run) == {"weights": str(run)}
-    with alone_in(run):
+    with hold_job_lock(run):
         assert setting_of_path(run) == {"watch": str(run)}
         assert (run / ".lock").read_text().split()[0] == str(os.getpid())  # as it was
     assert setting_of_path(run) == {"weights": str(run)}

@@ -8,7 +8,15 @@ import torch
 from kornia import enhance
 from torch import Tensor
 
-from completesplat.data.loading.augmentation import HUE, BoxMasks, CameraJitter, ColorJitter, augment, changed, mirrored
+from completesplat.data.loading.augmentation import (
+    HUE,
+    BoxMasks,
+    CameraJitter,
+    ColorJitter,
+    augment,
+    jittered,
+    mirrored,
+)
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, pixel_rays, project
 from completesplat.scene import SceneBatch, Views
@@ -157,7 +165,7 @@ def test_changes_in_any_order_are_kornias() -> None:
         tall = torch.cat([*images], dim=1)
         for change in order:
             tall = functions[change](tall, factors[change] * (math.pi / 3 if change == HUE else 1)).clamp(0, 1)
-            images = changed(images, int(change), factors[change])
+            images = jittered(images, int(change), factors[change])
         torch.testing.assert_close(torch.cat([*images], dim=1), tall, atol=1e-5, rtol=0)
 
 

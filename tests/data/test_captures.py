@@ -285,8 +285,8 @@ def test_a_missing_frame_costs_one_resolved_path(tmp_path, monkeypatch):
     content = json.loads((tmp_path / "transforms.json").read_text())
     content["frames"] += [content["frames"][0] | {"file_path": f"gone/{number}"} for number in range(50)]
     (tmp_path / "transforms.json").write_text(json.dumps(content))
-    resolved, inside = [], transforms_json.inside
-    monkeypatch.setattr(transforms_json, "inside", lambda *given: resolved.append(given) or inside(*given))
+    resolved, path_below = [], transforms_json.path_below
+    monkeypatch.setattr(transforms_json, "path_below", lambda *given: resolved.append(given) or path_below(*given))
     assert len(read_transforms(tmp_path / "transforms.json").frames) == 6
     assert len(resolved) <= 6 + 50
 

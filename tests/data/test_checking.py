@@ -9,15 +9,15 @@ from support import strict_json
 from torch import Tensor
 
 from completesplat.data.validation import ChangedFile, MissingFile
-from completesplat.data.validation.audit import Findings, check, show_findings
+from completesplat.data.validation.audit import AuditReport, check, show_findings
 from completesplat.data.validation.processes import map_in_processes
 
 
-def check_quietly(**sources: Source) -> Findings:
+def check_quietly(**sources: Source) -> AuditReport:
     return check(sources, workers=1, progress=False)
 
 
-def places(findings: Findings) -> set[tuple[str, str | None, int | None]]:
+def places(findings: AuditReport) -> set[tuple[str, str | None, int | None]]:
     return {(error.kind, error.sequence, error.frame) for error in findings.refused}
 
 

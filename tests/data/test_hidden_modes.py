@@ -13,7 +13,7 @@ from completesplat.data.hidden_modes import DIFFERENCE
 from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS, render_frame
 from completesplat.data.toy.raytracing import trace
-from completesplat.data.toy.writing import draw
+from completesplat.data.toy.writing import draw_category
 from completesplat.data.validation import BadAnnotation
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
@@ -131,7 +131,7 @@ def traced_unseen(toy, reference: int, frame: int, size: int) -> torch.Tensor:
 def test_what_the_reference_hides_is_what_no_ray_from_its_camera_meets(toy_root: Path) -> None:
     (scenes, module), described = scenes_of(toy_root), json.loads((toy_root / "toy_objects/toy.json").read_text())
     scene, name = scenes[0], module.store("test").names[0]
-    toy = draw("toy_objects", described["seed"], int(name.split("_")[0]), described["frames"], np.ones(3))
+    toy = draw_category("toy_objects", described["seed"], int(name.split("_")[0]), described["frames"], np.ones(3))
     sequence = module.source("test").read(name)
     views = [
         view

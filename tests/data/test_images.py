@@ -13,7 +13,7 @@ from PIL import Image, ImageCms, ImageFile
 
 from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.exif import ORIENTATION
-from completesplat.data.images.files import decode, read_depth
+from completesplat.data.images.files import decode_image, read_depth
 from completesplat.data.validation import BadImage, MissingFile
 from completesplat.errors import DataError
 
@@ -84,7 +84,7 @@ def test_the_pixels_are_those_of_the_file(name, tmp_path):
     content, mode, expected = RIGHT[name]
     (tmp_path / "a.jpg").write_bytes(content)
     for source in (content, tmp_path / "a.jpg"):
-        image = decode(source, name, mode, expected.shape[:2])
+        image = decode_image(source, name, mode, expected.shape[:2])
         assert image.mode == mode
         assert np.array_equal(np.asarray(image), expected)
 
@@ -103,7 +103,7 @@ def test_the_pixels_are_those_of_the_file(name, tmp_path):
     ids=["progressive_jpeg", "cmyk_jpeg", "mpo_of_two", "jpeg_orientation_8"],
 )
 def test_lossy_files_are_read_to_within_their_loss(content, expected):
-    assert np.abs(np.asarray(decode(content, "a", "RGB")).astype(int) - expected).max() <= 4
+    assert np.abs(np.asarray(decode_image(content, "a", "RGB")).astype(int) - expected).max() <= 4
 
 
 @pytest.fixture
@@ -114,10 +114,10 @@ def ramp(tmp_path):
 
 
 def test_a_whole_pixel_crop_without_resizing_is_a_slice(ramp, tmp_path):
-    pixels = cut_square(decode(ramp, str(ramp), "L", (20, 30)), Square(7, 3, 10), 10)
+    pixels = cut_square(decode_image(ramp, str(ramp), "L", (20, 30)), Square(7, 3, 10), 10)
     assert np.array_equal(pixels[0].numpy(), 4 * np.arange(7, 17) + 5 * np.arange(3, 13)[:, None])
     Image.fromarray(DEEP).save(tmp_path / "mask.png")
-    square = cut_square(decode(tmp_path / "mask.png", "mask.png", "L", (6, 8)), Square(1, 0, 6), 6)
+    square = cut_square(decode_image(tmp_path / "mask.png", "mask.png", "L", (6, 8)), Square(1, 0, 6), 6)
     assert np.array_equal(square[0].numpy(), EIGHT[:, 1:7])
 
 
@@ -125,7 +125,7 @@ def test_a_whole_pixel_crop_without_resizing_is_a_slice(ramp, tmp_path):
 def test_a_subpixel_crop_of_a_linear_image_keeps_to_the_plane(ramp, mode):
     """Pixel centres of the crop lie at left + (i + 0.5) side / size of the file, whose centres lie at i + 0.5."""
     left, top, side, size = 6.3, 2.6, 15.0, 12
-    pixels = cut_square(decode(ramp, str(ramp), mode, (20, 30)), Square(left, top, side), size).numpy()
+    pixels = cut_square(decode_image(ramp, str(ramp), mode, (20, 30)), Square(left, top, side), size).numpy()
     centers = (np.arange(size) + 0.5) * side / size - 0.5
     expected = 4 * (left + centers)[None, :] + 5 * (top + centers)[:, None]
     assert pixels.shape == (3 if mode == "RGB" else 1, size, size)
@@ -203,26 +203,26 @@ def test_a_bad_image_is_refused_by_name(name, tmp_path, monkeypatch):
     path.write_bytes(content)
     if "megapixels" in name:
         monkeypatch.setattr(ImageFile.ImageFile, "load", lambda self: pytest.fail("decoded"))
-    refuse(lambda: decode(path, str(path), mode, (24, 32)), str(path), part)
-    refuse(lambda: decode(content, "frame 7 of x", mode, (24, 32)), "frame 7 of x", part)
+    refuse(lambda: decode_image(path, str(path), mode, (24, 32)), str(path), part)
+    refuse(lambda: decode_image(content, "frame 7 of x", mode, (24, 32)), "frame 7 of x", part)
 
 
 def test_places_without_a_usable_file_are_refused(tmp_path):
     (tmp_path / "ring.png").symlink_to("ring.png")
     for place in (tmp_path / "none.png", tmp_path, tmp_path / "ring.png", tmp_path / ("n" * 300)):
-        refuse(lambda place=place: decode(place, str(place), "RGB"), str(place), "no such file", MissingFile)
+        refuse(lambda place=place: decode_image(place, str(place), "RGB"), str(place), "no such file", MissingFile)
     with (tmp_path / "sparse.png").open("wb") as file:
         file.truncate(10**12)
-    refuse(lambda: decode(tmp_path / "sparse.png", "sparse", "RGB"), "sparse", "bytes")
+    refuse(lambda: decode_image(tmp_path / "sparse.png", "sparse", "RGB"), "sparse", "bytes")
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RecursionError("deep"), KeyError("x"), struct.error("short")])
 def test_whatever_a_decoder_raises_is_a_data_error(monkeypatch, error):
     monkeypatch.setattr(ImageFile.ImageFile, "load", Mock(side_effect=error))
-    refuse(lambda: decode(saved(RGB, "BMP"), "name", "RGB"), "name", "cannot be decoded")
+    refuse(lambda: decode_image(saved(RGB, "BMP"), "name", "RGB"), "name", "cannot be decoded")
     monkeypatch.undo()
     monkeypatch.setattr(ImageFile, "LOAD_TRUNCATED_IMAGES", True)
-    refuse(lambda: decode(cut(saved(RGB)), "name", "RGB"), "name", "LOAD_TRUNCATED_IMAGES")
+    refuse(lambda: decode_image(cut(saved(RGB)), "name", "RGB"), "name", "LOAD_TRUNCATED_IMAGES")
 
 
 DEPTH = np.array([[0.0, 0.5, 1.25], [3.0, 65504.0, 2.0**-14]], dtype=np.float16)

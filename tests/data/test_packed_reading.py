@@ -16,7 +16,7 @@ from packed_sequences import SIZE, ListedSource, make_sequence, smooth_image
 from PIL import Image
 
 from completesplat.data.packed.manifest import is_packed, read_manifest, settings_must_match
-from completesplat.data.packed.rows import EncodedImage, decode, encode, from_row, to_row
+from completesplat.data.packed.rows import EncodedImage, decode_square, encode, from_row, to_row
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import prepare
 from completesplat.data.sequences import PosedSequence, SequenceSource
@@ -214,7 +214,7 @@ def test_bytes_that_are_not_the_image_are_refused_with_their_place() -> None:
             sequence.read(1)
         assert (caught.value.file, caught.value.sequence, caught.value.frame) == ("shard.arrow", "s", 13)
     flipped = image[:-20] + bytes([image[-20] ^ 1]) + image[-19:]
-    assert decode(flipped, 3, SIZE, SIZE).shape == (3, SIZE, SIZE)
+    assert decode_square(flipped, 3, SIZE, SIZE).shape == (3, SIZE, SIZE)
     row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedImage(image, None)] * 2)
     read = from_row(change(row, "images", [image, flipped]), "shard.arrow", "s").read
     read(0)

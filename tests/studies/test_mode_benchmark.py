@@ -14,7 +14,7 @@ from completesplat.losses import WeightedSum
 from completesplat.losses.terms import MeanSquaredError
 from completesplat.rasterizers import Rendering
 from completesplat.scene import SceneBatch, Views
-from completesplat.studies.mode_benchmark import measure, predictors, usable
+from completesplat.studies.mode_benchmark import measure, predictors, usable_scenes
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 
@@ -109,10 +109,10 @@ def test_scenes_of_no_use_are_counted():
             raise AssertionError("only single modes are wanted")
 
     scenes = Broken([SCENES[0], None, SCENES[1]])
-    assert usable(scenes, None) == (SCENES, ["bad: broken"])
-    assert usable(scenes, 1) == (SCENES[:1], [])
+    assert usable_scenes(scenes, None) == (SCENES, ["bad: broken"])
+    assert usable_scenes(scenes, 1) == (SCENES[:1], [])
     with pytest.raises(CompleteSplatError, match="no test scene can be used"):
-        usable(Broken(), None)
+        usable_scenes(Broken(), None)
 
 
 def flat(gaussians: Gaussians, cameras: Cameras) -> Rendering:

@@ -10,7 +10,7 @@ import torch
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.metrics.images import PSNR_LIMIT, psnr
 from completesplat.studies.controls import PAPER, grid, plot_controls
-from completesplat.studies.samples import near, object_psnr
+from completesplat.studies.samples import near_reference, object_psnr
 
 
 def test_object_pixels_alone_count():
@@ -35,7 +35,7 @@ def test_near_is_an_angle_between_optical_axes():
         return Cameras(poses, pinhole(60, 8).repeat(len(degrees), 1, 1), (8, 8))
 
     targets = turned(10, 54, 56, 100, 190, 340, -30)
-    assert near(turned(10)[0], targets, 45).tolist() == [True, True, False, False, False, True, True]
+    assert near_reference(turned(10)[0], targets, 45).tolist() == [True, True, False, False, False, True, True]
 
 
 def read(path) -> np.ndarray:

@@ -21,9 +21,9 @@ from completesplat.rasterizers.reference import ReferenceRasterizer
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
-from completesplat.viewer.access import say, start_server  # noqa: E402
+from completesplat.viewer.access import show_status, start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
-from completesplat.viewer.page import Page, Saver, write_page  # noqa: E402
+from completesplat.viewer.page import Page, Saver, write_viewer_page  # noqa: E402
 from completesplat.viewer.splat_view import SplatView  # noqa: E402
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")  # which GitHub's machines have
@@ -244,7 +244,7 @@ def test_a_phone_says_what_it_waits_for(chromium, page, monkeypatch):
     html = phone.goto(page.server.address).text()
     assert "completesplat: starting the page" in html  # until viser's program has started
     phone.get_by_text("Drawing the first image").wait_for()
-    say(page.server, "drawing from photo.png")
+    show_status(page.server, "drawing from photo.png")
     phone.get_by_text("completesplat: drawing from photo.png").wait_for()
     waiting.set()
     phone.get_by_text("Drawing the first image").wait_for(state="detached")
@@ -253,7 +253,7 @@ def test_a_phone_says_what_it_waits_for(chromium, page, monkeypatch):
 
 def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):
     page.show([balls_sample()])
-    write_page(page.server, tmp_path / "page.html")
+    write_viewer_page(page.server, tmp_path / "page.html")
     offline = open_tab(chromium, f"file://{tmp_path / 'page.html'}")
     seen = settled(offline)
     expected = ours(*seen.shape[:2], shrink=3)

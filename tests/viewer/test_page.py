@@ -17,7 +17,7 @@ from viewer_scenes import balls_sample
 
 from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.formats import write_splat
-from completesplat.export.images import to_bytes
+from completesplat.export.images import to_pixels
 from completesplat.export.mesh import Mesh
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -151,7 +151,7 @@ def test_a_thumbnail_is_the_view_of_the_reference_camera(page):
     image = page.saver.thumbnail(replace(sample, reference=wide), 48)
     assert image.shape == (32, 48, 3)
     rendering = ReferenceRasterizer()(sample.gaussians[None], sample.reference[None][None]).over(0.5)
-    ours = to_bytes(rendering[0, 0]).reshape(32, 2, 32, 2, 3).mean((1, 3))
+    ours = to_pixels(rendering[0, 0]).reshape(32, 2, 32, 2, 3).mean((1, 3))
     assert abs(image[:, :32] - ours).mean() < 6
 
 

@@ -9,20 +9,20 @@ from support import refused
 from completesplat.data.toy import write_objects, write_rooms
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.data.toy.object_scene import render_frame
-from completesplat.data.toy.writing import draw
+from completesplat.data.toy.writing import draw_category
 from completesplat.errors import DataError
 
 LIGHT = (1.0, 0.75, 0.5)
 
 
 def test_the_light_colours_what_it_falls_on_and_nothing_else():
-    white, lit = (draw("toy_minis", 0, 1, 2, np.array(light)) for light in ((1.0, 1.0, 1.0), LIGHT))
+    white, lit = (draw_category("toy_minis", 0, 1, 2, np.array(light)) for light in ((1.0, 1.0, 1.0), LIGHT))
     (image, coverage, depth), (other, *geometry) = (render_frame(scene, 1, 24) for scene in (white, lit))
     assert np.array_equal([coverage, depth], geometry)
     np.testing.assert_allclose(other[coverage == 1], image[coverage == 1] * LIGHT)
     assert np.array_equal(other[coverage == 0], image[coverage == 0])  # the dome
     np.testing.assert_allclose(lit.point_colors, white.point_colors * LIGHT)
-    ground = draw("toy_objects", 0, 1, 2, np.array(LIGHT)), draw("toy_objects", 0, 1, 2, np.ones(3))
+    ground = draw_category("toy_objects", 0, 1, 2, np.array(LIGHT)), draw_category("toy_objects", 0, 1, 2, np.ones(3))
     lowest, expected = (render_frame(scene, 1, 24)[0][-1] for scene in ground)
     np.testing.assert_allclose(lowest, expected * LIGHT)
 

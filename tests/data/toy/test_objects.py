@@ -12,7 +12,7 @@ from PIL import Image
 from completesplat.data.co3d.annotations import camera_from_viewpoint
 from completesplat.data.toy import write_objects
 from completesplat.data.toy.module import ToyObjectsDataModule
-from completesplat.data.toy.object_scene import CHANCES, PATCH_COLORS, draw_mini, draw_scene, render_frame
+from completesplat.data.toy.object_scene import CHANCES, PATCH_COLORS, draw_mini, draw_object_scene, render_frame
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import pixel_centers, project, unproject
 
@@ -100,7 +100,7 @@ def test_masks_are_soft_mass_is_their_sum_and_the_hidden_attribute_is_recorded(t
 
 
 def test_both_families_and_all_patch_colors_occur():
-    scenes = [draw_scene(np.random.default_rng([0, index]), frames=2) for index in range(12)]
+    scenes = [draw_object_scene(np.random.default_rng([0, index]), frames=2) for index in range(12)]
     assert {scene.family for scene in scenes} == {"bear", "hydrant"}
     assert {scene.patch_color for scene in scenes} == set(PATCH_COLORS)
 
