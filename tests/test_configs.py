@@ -95,14 +95,13 @@ STARTS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("kind", "stage"), [(k, s) for k in ("paper", "toy") for s in STARTS if f"{k}_{s}" in options("experiment")]
-)
-def test_an_experiment_asks_for_its_data_and_for_what_it_starts_from(kind, stage):
-    config = compose_config("fit", f"experiment={kind}_{stage}")
-    missing = OmegaConf.missing_keys(config.data) | OmegaConf.missing_keys(config.model)
-    missing |= {f"model.{key}" for key, value in OmegaConf.to_container(config.model).items() if value == ""}
-    assert missing == {STARTS[stage]} | (set() if kind == "toy" else {"data.root"})
+def test_an_experiment_asks_for_its_data_and_for_what_it_starts_from():
+    kinds = [experiment.partition("_") for experiment in options("experiment")]
+    for kind, stage in [(kind, stage) for kind, _, stage in kinds if kind in ("paper", "toy") and stage in STARTS]:
+        config = compose_config("fit", f"experiment={kind}_{stage}")
+        missing = OmegaConf.missing_keys(config.data) | OmegaConf.missing_keys(config.model)
+        missing |= {f"model.{key}" for key, value in OmegaConf.to_container(config.model).items() if value == ""}
+        assert missing == {STARTS[stage]} | (set() if kind == "toy" else {"data.root"})
 
 
 def test_a_paper_experiment_draws_on_the_gpu_and_saves_by_the_clock():
@@ -164,21 +163,19 @@ def test_the_papers_diffusion(data):
     assert masked.model.autoreconstructor_checkpoint is None
 
 
+ONE_IMAGE = ["posterior=image", "conditioning.channels=[8,8,16,16]"]  # as the pipeline's stage 1 with its four levels
+TOYS = [option for option in options("experiment") if re.match("toy_(?!minis)", option)]  # see test_posterior_of_views
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(  # minis: test_posterior_of_views
-    "experiment", [option for option in options("experiment") if re.match("toy_(?!minis)", option)]
-)
+@pytest.mark.parametrize("experiment", TOYS)
 def test_every_toy_experiment_trains_on_one_batch(experiment, pipeline: Path, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     settings = [f"data.root={pipeline.toy}", *SMALL, "trainer.max_steps=1"]
     var, diffusion = (run / "checkpoints/last.ckpt" for run in (pipeline.var, pipeline.diffusion))
     settings += {
         "toy_diffusion": [f"model.autoreconstructor_checkpoint={var}", "sampler.steps=2"],
-        # On the pipeline's stage 1, which has four levels and sees one image.
-        "toy_views_diffusion": [
-            *(f"model.autoreconstructor_checkpoint={var}", "posterior=image", "conditioning.channels=[8,8,16,16]"),
-            "sampler.steps=2",
-        ],
+        "toy_views_diffusion": [f"model.autoreconstructor_checkpoint={var}", "sampler.steps=2", *ONE_IMAGE],
         "toy_diffusion_masked": [f"model.checkpoint={diffusion}", "sampler.steps=2"],
         "toy_var_stage2": [f"model.checkpoint={var}", "ablation=no_lpips"],
         "toy_var_masked": [f"model.checkpoint={var}"],

@@ -23,10 +23,8 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def sets(toy_root: Path, rooms: Path) -> dict[str, list[str]]:
-    return {
-        "objects": ["data=toy_objects", f"data.root={toy_root}", "data.image_size=16"],
-        "rooms": ["data=toy_rooms", f"data.root={rooms}", "data.image_size=16"],
-    }
+    roots = {"objects": toy_root, "rooms": rooms}
+    return {kind: [f"data=toy_{kind}", "data.image_size=16", f"data.root={root}"] for kind, root in roots.items()}
 
 
 def test_toy_objects_are_written_where_asked(command, tmp_path):
@@ -69,29 +67,34 @@ def test_hydras_other_ways_of_logging_work(sets, option, tmp_path):
 
 
 def test_splits_are_some_of_the_three(tmp_path):
-    given = ["data_task=check", f"data.root={tmp_path}"]
-    assert refused("data", *given, "splits=[x]") == "splits=['x']: choose one of train, val, test"
-    assert refused("data", *given, "splits=[]") == "splits=[]: must not be empty"
-    assert refused("data", "data_task=show", given[1], "split=x") == "split=x: choose one of train, val, test"
+    for task, setting, message in (
+        ("check", "splits=[x]", "splits=['x']: choose one of train, val, test"),
+        ("check", "splits=[]", "splits=[]: must not be empty"),
+        ("show", "split=x", "split=x: choose one of train, val, test"),
+    ):
+        assert refused("data", f"data_task={task}", f"data.root={tmp_path}", setting) == message
 
 
 def test_prepared_data_pass_the_check_until_a_bit_flips_and_are_not_prepared_again(command, sets, tmp_path):
-    kind, store, out = "rooms", tmp_path / "store", tmp_path / "check"
-    settings = [*(s for s in sets[kind] if not s.startswith("data.root")), f"data.root={store}"]
+    store = tmp_path / "store"
+    settings = [*sets["rooms"][:2], f"data.root={store}"]
+
+    def checked():
+        command.succeeds("data", "check", *settings, "workers=1", "out=check")
+        return strict_json(tmp_path / "check/check.json")
+
     made = []
     for _ in range(2):
-        assert command("data", "prepare", *sets[kind], "workers=1", f"out={store}").status == 0
+        command.succeeds("data", "prepare", *sets["rooms"], "workers=1", f"out={store}")
         made.append({path: path.stat().st_mtime_ns for path in store.glob("*.arrow")})
     assert made[0] == made[1]
     assert "prepared already" in refused("data", "data_task=prepare", *settings)
-    assert command("data", "check", *settings, "workers=1", f"out={out}").status == 0
-    assert strict_json(out / "check.json")["refused"] == []
+    assert checked()["refused"] == []
     shard = next(store.glob("train-*.arrow"))
     content = bytearray(shard.read_bytes())
     content[len(content) // 2] ^= 1
     shard.write_bytes(content)
-    assert command("data", "check", *settings, "workers=1", f"out={out}").status == 0
-    results = strict_json(out / "check.json")
+    results = checked()
     assert any(entry["file"] == str(shard) for entry in results["refused"])
     assert "changed file" in results["counts"]
 

@@ -44,6 +44,7 @@ def test_stage_two_keeps_stage_ones_weights_and_measures_its_latents(pipeline):
     assert stage2["completesplat.up"][1] < -0.5  # the toy cameras stand upright
 
 
+PRETRAINED = "CompVis/stable-diffusion-v1-4, or null for random weights"
 SCORED = ["evaluation.resolution=48", "+evaluation.data.evaluation_targets=1", "seed=4"]
 
 
@@ -51,14 +52,11 @@ def test_a_fit_has_the_scores_of_a_test_of_its_checkpoint(command, pipeline, tmp
     """In the test's precision, with the protocol's changes to the data, and at its resolution."""
     fit = ["trainer.precision=bf16-mixed", "trainer.max_steps=1", f"data.root={pipeline.toy}"]
     run = tmp_path / "run"
-    trained = command("fit", "experiment=toy_var", *SMALL, *fit, *SCORED, f"out={run}")
-    assert trained.status == 0, trained.err
-    checkpoint = run / "checkpoints/last.ckpt"
-    tested = command("test", f"ckpt={checkpoint}", *SCORED, "trainer.accelerator=cpu", f"out={tmp_path / 'scores'}")
-    assert tested.status == 0, tested.err
+    command.succeeds("fit", "experiment=toy_var", *SMALL, *fit, *SCORED, f"out={run}")
+    typed = [f"ckpt={run / 'checkpoints/last.ckpt'}", *SCORED, "trainer.accelerator=cpu", f"out={tmp_path / 'scores'}"]
+    command.succeeds("test", *typed)
     ours, theirs = strict_json(run / "metrics.json")["test"], strict_json(tmp_path / "scores/metrics.json")
     assert shlex.split(ours["protocol"]["command"])[:2] == ["completesplat", "fit"]
-    typed = [f"ckpt={checkpoint}", *SCORED, "trainer.accelerator=cpu", f"out={tmp_path / 'scores'}"]
     assert shlex.split(theirs["protocol"]["command"]) == ["completesplat", "test", *typed]
     for scores in (ours, theirs):
         del scores["protocol"]["command"]
@@ -78,22 +76,17 @@ def test_a_protocol_that_does_not_fit_is_refused_before_training(toy_root, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("experiment", "place", "asked"),
+    ("given", "place", "asked"),
     [
-        (
-            "paper_var_stage1",
-            "autoreconstructor.pretrained",
-            "CompVis/stable-diffusion-v1-4, or null for random weights",
-        ),
+        ("paper_var_stage1 data=toy_objects", "autoreconstructor.pretrained", PRETRAINED),
         ("toy_var_masked", "model.checkpoint", "RUN/checkpoints/last.ckpt"),
         ("paper_diffusion", "data.root", "DIR"),
         ("toy_diffusion", "model.autoreconstructor_checkpoint", "RUN/checkpoints/last.ckpt of stage 1"),
     ],
 )
-def test_a_missing_setting_is_asked_for(experiment, place, asked):
-    given = ["data=toy_objects"] if place == "autoreconstructor.pretrained" else []
+def test_a_missing_setting_is_asked_for(given, place, asked):
     with pytest.raises(CompleteSplatError) as caught:
-        refuse_missing(compose_config("fit", f"experiment={experiment}", *given))
+        refuse_missing(compose_config("fit", *f"experiment={given}".split()))
     assert str(caught.value) == f"{place} is needed: give {place}={asked}"
 
 
@@ -101,9 +94,8 @@ def test_a_checkpoint_that_is_missing_or_cut_off_is_refused_before_data_are_made
     damaged = tmp_path / "damaged.ckpt"
     damaged.write_bytes((pipeline.var / "checkpoints/last.ckpt").read_bytes()[:-100])
     for path, reason in ((tmp_path / "nowhere.ckpt", "no such checkpoint"), (damaged, "not a readable checkpoint")):
-        finished = command("fit", f"ckpt_path={path}", f"data.root={tmp_path / 'new'}", "data.make=true", *SMALL)
-        assert finished.status == 2
-        assert finished.err.startswith(f"error: {path}: {reason}")
+        refused = command.refuses("fit", f"ckpt_path={path}", f"data.root={tmp_path / 'new'}", "data.make=true", *SMALL)
+        assert refused.startswith(f"{path}: {reason}")
     assert not (tmp_path / "new").exists()
 
 
@@ -112,9 +104,7 @@ def test_a_checkpoint_that_is_missing_or_cut_off_is_refused_before_data_are_made
 def test_a_run_without_callbacks_or_loggers_is_trained_and_scored(command, toy_root, tmp_path, left_out):
     given = [setting for setting in SMALL if not setting.startswith(("callbacks", "trainer.max_steps"))]
     given += ["experiment=toy_var", f"data.root={toy_root}", "trainer.max_steps=1", left_out, f"out={tmp_path / 'run'}"]
-    given += [] if left_out == "~callbacks" else ["callbacks.images=null"]
-    finished = command("fit", *given)
-    assert finished.status == 0, finished.err
+    command.succeeds("fit", *given, *([] if left_out == "~callbacks" else ["callbacks.images=null"]))
     metrics = strict_json(tmp_path / "run/metrics.json")
     assert (metrics["steps"], metrics["test"]["model"]["scenes"]) == (1, 1)
     assert (tmp_path / "run/metrics.csv").is_file() == (left_out != "~logger")

@@ -20,8 +20,7 @@ def test_stage1_starts_from_a_vae_tests_on_unseen_sequences_and_resumes_without_
     fit += [f"autoreconstructor.encoder.{name}" for name in ("channels=[8,8,16,16]", "layers_per_block=1")]
     fit += ["autoreconstructor.encoder.norm_groups=4"]
 
-    trained = command(*fit, f"out={run}", f"autoreconstructor.pretrained={tmp_path / 'vae'}")
-    assert trained.status == 0, trained.err
+    command.succeeds(*fit, f"out={run}", f"autoreconstructor.pretrained={tmp_path / 'vae'}")
     results = strict_json(run / "metrics.json")
     protocol = results["test"]["protocol"]
     assert results["steps"] == 2
@@ -30,5 +29,5 @@ def test_stage1_starts_from_a_vae_tests_on_unseen_sequences_and_resumes_without_
     assert data.source("test").names == list(LISTS["test"])
     assert not set(data.source("train").names) & set(data.source("test").names)
     resume = [f"ckpt_path={run / 'checkpoints/last.ckpt'}", "trainer.max_steps=3", "test=false"]
-    assert command(*fit, *resume, f"out={tmp_path / 'more'}").status == 0
+    command.succeeds(*fit, *resume, f"out={tmp_path / 'more'}")
     assert strict_json(tmp_path / "more/metrics.json")["steps"] == 3

@@ -13,8 +13,7 @@ SMALL = ["experiment=toy_diffusion", "data.image_size=32", *NETWORKS]
 @pytest.mark.slow
 def test_a_plan_is_printed_and_written_and_a_sweep_ends_in_a_total(command, tmp_path):
     mine = "+gpus.mine={bfloat16: 1e-3, float32: 1, memory: 0.01, bandwidth: 1}"
-    swept = command("plan", "-m", *SMALL, "gpu=a100,mine", mine, f"out={tmp_path}")
-    assert swept.status == 0, swept.err
+    swept = command.succeeds("plan", "-m", *SMALL, "gpu=a100,mine", mine, f"out={tmp_path}")
     a100, mine = (strict_json(tmp_path / f"gpu-{name}/plan.json") for name in ("a100", "mine"))
     assert "total" in swept.out
     assert "8,000" in swept.out  # steps of both

@@ -9,8 +9,7 @@ from support import refused, strict_json
 def report(command, pipeline, tmp_path):
     def run(task: str, *settings: str):
         given = [f"ckpt={pipeline.diffusion / 'checkpoints/last.ckpt'}", "scenes=1", "samples=2", *settings]
-        finished = command("report", task, *given, f"out={tmp_path / 'out'}")
-        assert finished.status == 0, finished.err
+        finished = command.succeeds("report", task, *given, f"out={tmp_path / 'out'}")
         return finished.out, strict_json(tmp_path / f"out/{task}.json")
 
     return run

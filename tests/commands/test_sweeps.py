@@ -45,11 +45,8 @@ def test_a_job_is_named_by_what_is_swept_plainly_and_like_no_other():
 
 
 def test_a_sweep_has_no_one_config_to_show(command):
-    finished = command("fit", "-m", "experiment=toy_var", "seed=0,1", "--cfg", "job")
-    assert (finished.status, finished.err) == (
-        2,
-        "error: --cfg and --info show the settings of one run: leave out -m\n",
-    )
+    refused = command.refuses("fit", "-m", "experiment=toy_var", "seed=0,1", "--cfg", "job")
+    assert refused == "--cfg and --info show the settings of one run: leave out -m"
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +61,7 @@ def whole(toy_root, tmp_path_factory) -> Path:
 def test_a_sweep_that_is_started_again_repeats_no_finished_job(command, toy_root, whole):
     jobs = [whole / "seed-0", whole / "seed-1"]
     before = (jobs[0] / LAST).stat().st_mtime_ns
-    again = command(*settings(toy_root), "seed=0,1", f"out={whole}")
-    assert again.status == 0
+    again = command.succeeds(*settings(toy_root), "seed=0,1", f"out={whole}")
     assert again.out.count("finished before, not repeated") == 1
     assert (jobs[0] / LAST).stat().st_mtime_ns == before
     assert (jobs[1] / "metrics.json").is_file()
@@ -80,23 +76,27 @@ def test_a_job_that_fails_does_not_stop_the_others(command, tmp_path):
     assert {path.parent.name for path in tmp_path.glob("sweep/*/toy_*")} == {"size-16"}
 
 
-def test_a_finished_run_is_not_overwritten_and_not_repeated(whole):
+def test_a_finished_run_is_not_overwritten_and_not_repeated_even_with_other_numbers_of_processes(whole):
     job = whole / "seed-0"
     config = OmegaConf.to_container(OmegaConf.load(job / "config.yaml"))
     assert config["ckpt_path"] == "last"
-    assert is_finished(job, config)
-    with pytest.raises(CompleteSplatError, match="continue it with ckpt_path=last"):
-        is_finished(job, config | {"ckpt_path": None})
-    with pytest.raises(CompleteSplatError, match="with another seed"):
-        is_finished(job, config | {"seed": 5})
+    trainer = config["trainer"]
+    for same in (config, config | {"trainer": trainer | {"devices": 2, "num_nodes": 3, "strategy": "ddp"}}):
+        assert is_finished(job, same)
+    for other, message in (
+        ({"ckpt_path": None}, "continue it with ckpt_path=last"),
+        ({"seed": 5}, "with another seed"),
+        ({"trainer": trainer | {"precision": "64-true"}}, r"with another trainer\.precision"),
+    ):
+        with pytest.raises(CompleteSplatError, match=message):
+            is_finished(job, config | other)
     assert not is_finished(whole, config)
 
 
 @pytest.mark.parametrize(("name", "value"), [("LOCAL_RANK", "0"), ("SLURM_STEP_NUM_TASKS", "2")])
 def test_a_sweep_is_not_started_by_each_process_of_a_launcher(command, monkeypatch, name, value):
     monkeypatch.setenv(name, value)
-    refused = command("fit", "-m", "experiment=toy_var", "seed=0,1")
-    assert (refused.status, "start it once" in refused.err) == (2, True)
+    assert "start it once" in command.refuses("fit", "-m", "experiment=toy_var", "seed=0,1")
 
 
 def in_a_process_of_its_own(arguments: list[str], folder: Path) -> None:
@@ -151,9 +151,9 @@ def test_the_second_part_of_stage_one_is_swept_from_the_jobs_of_the_first(comman
     monkeypatch.setattr("completesplat.losses.lpips.load_vgg16", lambda weights, sha256: load_vgg16(str(vgg)))
     shared = [f"data.root={toy_root}", *SMALL, "callbacks.images=null", "ablation=full,no_lpips", "seed=choice(0)"]
     one, two = tmp_path / "PART1", tmp_path / "TABLE"
-    assert command("fit", "-m", "experiment=toy_var", *shared, "test=false", f"out={one}").status == 0
+    command.succeeds("fit", "-m", "experiment=toy_var", *shared, "test=false", f"out={one}")
     start = f"model.checkpoint={one}/ablation-${{hydra:runtime.choices.ablation}}+seed-${{seed}}/{LAST}"
-    assert command("fit", "-m", "experiment=toy_var_stage2", *shared, start, f"out={two}").status == 0
+    command.succeeds("fit", "-m", "experiment=toy_var_stage2", *shared, start, f"out={two}")
 
     jobs = ["ablation-full+seed-0", "ablation-no_lpips+seed-0"]
     first, second = ([weights(sweep / job) for job in jobs] for sweep in (one, two))
@@ -163,12 +163,3 @@ def test_the_second_part_of_stage_one_is_swept_from_the_jobs_of_the_first(comman
         assert any(not torch.equal(value, first[0][name]) for name, value in trained.items())
     assert any(not torch.equal(value, second[1][name]) for name, value in second[0].items())
     assert len((two / "summary.csv").read_text().splitlines()) >= 3
-
-
-def test_a_run_goes_on_with_another_number_of_processes(whole, tmp_path):
-    job = whole / "seed-0"
-    config = OmegaConf.to_container(OmegaConf.load(job / "config.yaml"))
-    others = {"devices": 2, "num_nodes": 3, "strategy": "ddp"}
-    assert is_finished(job, config | {"trainer": config["trainer"] | others})
-    with pytest.raises(CompleteSplatError, match=r"with another trainer\.precision"):
-        is_finished(job, config | {"trainer": config["trainer"] | {"precision": "64-true"}})

@@ -9,7 +9,6 @@ from omegaconf import OmegaConf
 from support import compose_config, strict_json
 
 from completesplat.commands.evaluate import scored_data
-from completesplat.commands.trained import Trained
 from completesplat.data.toy import write_objects
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError, DataError
@@ -174,19 +173,3 @@ def test_weights_score_as_the_run_they_were_saved_with(scored, pipeline):
         for views in ("novel", "reference"):
             assert first[predictor]["full"][views] == pytest.approx(second[predictor]["full"][views], rel=1e-6)
     assert first["protocol"]["checkpoint"]["path"] == str(pipeline.weights)
-
-
-def test_either_a_checkpoint_or_weights_are_scored():
-    for given, message in (
-        ({"ckpt": None}, "give one of ckpt=FILE, weights=DIR"),
-        ({"ckpt": "a", "weights": "b"}, "give one of ckpt=FILE, weights=DIR"),
-        ({"ckpt": None, "weights": "b"}, "weights=DIR and scenes=DIR need data"),
-        ({"ckpt": "a", "data": {"root": "DIR"}}, "a checkpoint's data are its run's"),
-    ):
-        with pytest.raises(CompleteSplatError, match=message):
-            Trained(**given).configuration()
-
-
-def test_a_sampler_for_a_model_without_samples_is_refused(pipeline):
-    with pytest.raises(CompleteSplatError, match="a diffusion model is needed"):
-        Trained(str(pipeline.var / "checkpoints/last.ckpt"), sampler={"steps": 2}).open()
