@@ -80,14 +80,6 @@ def test_hidden_pixels_have_no_influence_on_stage_one(pipeline):
     assert not torch.equal(model(photograph)[0].means, model(changed)[0].means)
 
 
-def test_weights_of_stage_one_are_scored_as_its_checkpoint_is(command, pipeline, tmp_path):
-    data = ["data=toy_objects", f"data.root={pipeline.toy}", "data.evaluation_targets=2", "trainer.accelerator=cpu"]
-    command.succeeds("test", f"weights={pipeline.var}", *data, f"out={tmp_path / 'test'}")
-    scores, own = (strict_json(path / "metrics.json") for path in (tmp_path / "test", pipeline.var))
-    novel, expected = (result["model"]["full"]["novel"] for result in (scores, own["test"]))
-    assert novel["psnr"] == pytest.approx(expected["psnr"], abs=1e-3)
-
-
 def test_a_run_of_fitted_scenes_leaves_them_and_says_so_when_a_photograph_is_given(command, pipeline, tmp_path):
     fitting = ["model=per_scene", "model.fitting.count=300", "model.fitting.steps=3"]
     run = tmp_path / "run"

@@ -43,11 +43,6 @@ def test_a_loss_and_an_ablation_of_the_working_folder_are_trained_with_and_the_r
     command.succeeds("test", "ckpt=RUN/checkpoints/last.ckpt", "trainer.accelerator=cpu", "out=TEST")
 
 
-def test_a_misspelt_module_is_one_line(command, own):
-    refused = command.refuses("fit", "experiment=toy_var", "rasterizer._target_=missing_module.Mine", "out=RUN")
-    assert refused.startswith("Error loading 'missing_module.Mine': ModuleNotFoundError")
-
-
 def test_a_folder_of_settings_is_added_to_those_of_the_package(command, own, toy_root):
     (own / "more/data").mkdir(parents=True)
     (own / "more/data/mine.yaml").write_text(f"defaults: [toy_objects]\nroot: {toy_root}\nimage_size: 32\n")

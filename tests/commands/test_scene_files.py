@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from scenes_for_training import scene_batch
-from support import call, refused, strict_json
+from support import call, strict_json
 from written_commands import ROOT, arguments_of, block_commands
 
 from completesplat.errors import CompleteSplatError
@@ -152,26 +152,6 @@ def test_scenes_that_cannot_be_scored_are_named_in_one_line(command, pipeline, m
     assert finished.status == 2
     assert re.search(f"{scene}{message}", line), line
     assert not (tmp_path / "out/metrics.json").exists()
-
-
-def test_contradictory_settings_are_refused(pipeline, tmp_path):
-    one = "give one of ckpt=FILE, weights=DIR and scenes=DIR; all but ckpt need data=NAME"
-    no_data = "weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR"
-    toys = f"data=toy_objects data.root={tmp_path}"
-    for given, message in (
-        ("ckpt=null", one),
-        ("ckpt=a weights=b", one),
-        ("scenes=a ckpt=b", one),
-        (f"scenes=a weights=b {toys}", one),
-        ("scenes=a", no_data),
-        ("ckpt=null weights=b", no_data),
-        (f"ckpt=a {toys}", "a checkpoint's data are its run's"),
-        (f"scenes={tmp_path}/gone {toys}", f"scenes={tmp_path}/gone: no such folder; give one with SCENE/"),
-        ("scenes=a frame=colmap", "frame=colmap: choose one of opencv, opengl"),
-        ("scenes=a align=all", "align=all: choose one of none, scale"),
-        (f"ckpt={pipeline.var} sampler=dpm20", "a diffusion model is needed"),
-    ):
-        assert message in refused("test", *given.split()), given
 
 
 def test_hidden_modes_are_scored_from_files(command, pipeline, model_test, tmp_path):

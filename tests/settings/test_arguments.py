@@ -12,18 +12,8 @@ from completesplat.settings.arguments import ALONE, CHOICES, WITH_VALUE, behind_
 
 DASHES = "settings are key=value without dashes, such as out=DIR, and files are given by their names: `completesplat"
 NAMES = ["a.jpg", "a,b.jpg", "[a].jpg", "{a:1}.jpg", "a=b.jpg", "seed=1.jpg", " (1) .jpg", "it's.jpg", '"a".jpg']
-NAMES += [
-    "a\\.jpg",
-    "a\\",
-    "a\\'.jpg",
-    "é ü 写真.jpg",
-    "a${seed}.jpg",
-    "a\\${b.jpg",
-    "$x.jpg",
-    "new\nline.jpg",
-    "~a.jpg",
-]
-NAMES += ["null", "1", "+a.jpg", "#a.jpg", "a\ud800.jpg", os.fsdecode(b"\xff.jpg")]
+NAMES += ["a\\.jpg", "a\\", "a\\'.jpg", "é ü 写真.jpg", "a${seed}.jpg", "a\\${b.jpg", "$x.jpg", "new\nline.jpg"]
+NAMES += ["~a.jpg", "null", "1", "+a.jpg", "#a.jpg", "a\ud800.jpg", os.fsdecode(b"\xff.jpg")]
 
 
 def values(verb: str, *typed: str) -> dict[str, object]:

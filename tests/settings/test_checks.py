@@ -9,6 +9,9 @@ from completesplat.cli import VERBS
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.checks import check_image_size, check_parts, check_verb, complete_task
 
+ONE = "give one of ckpt=FILE, weights=DIR and scenes=DIR; all but ckpt need data=NAME"
+NO_DATA = "weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR"
+PRETRAINED = "CompVis/stable-diffusion-v1-4, or null for random weights"
 WHOLE, NUMBER = "must be a whole number", "must be a number"
 ODD = [
     ("predict", "samples=abc", f"samples=abc: {WHOLE}"),
@@ -45,14 +48,44 @@ ODD = [
     ("fit", "model=per_scene model.fitting=null", "model.fitting=null: must not be null; leave it out"),
     ("fit", "model.optimizer=null", "model.optimizer=null: must not be null; leave it out"),
     ("fit", "data=toy_rooms data.crop=top", "data.crop=top: choose one of center, principal"),
+    ("fit", "experiment=paper_var_stage1 data=toy_objects", f"give autoreconstructor.pretrained={PRETRAINED}"),
+    ("fit", "experiment=toy_var_masked", "model.checkpoint is needed: give model.checkpoint=RUN/checkpoints/last.ckpt"),
+    ("fit", "experiment=paper_diffusion", "data.root is needed: give data.root=DIR"),
+    ("fit", "experiment=toy_diffusion", "give model.autoreconstructor_checkpoint=RUN/checkpoints/last.ckpt of stage 1"),
+    ("data", "data_task=check splits=[x]", "splits=['x']: choose one of train, val, test"),
+    ("data", "data_task=check splits=[]", "splits=[]: must not be empty"),
+    ("data", "data_task=show split=x", "split=x: choose one of train, val, test"),
+    ("plan", "gpu=h10", "did you mean h100"),
+    ("plan", "devices=0", "devices=0: must be at least 1"),
+    ("plan", "price=-1", "price=-1: must be at least 0"),
+    ("plan", "share=0", "share=0: must lie between"),
+    ("plan", "devices=3", "must be a multiple of 3 processes"),
+    ("plan", "trainer.max_steps=-1", "give trainer.max_steps=N or trainer.max_epochs=N"),
+    ("plan", "model=per_scene", "PerScene has nothing to train"),
+    ("plan", "model=reconstructor_only", "this model cannot be planned"),
+    ("plan", "model=capture", "CaptureFit fits Gaussians, not a network: nothing to plan"),
+    ("report", "samples=1", "samples=1: must be at least 2"),
+    ("report", "guidance_weights=0.5", "guidance_weights=0.5: must be a list, such as guidance_weights=[0.5]"),
+    ("report", "seed=0", "nowhere: no such checkpoint"),
+    ("test", "ckpt=null", ONE),
+    ("test", "weights=a", ONE),
+    ("test", "scenes=a", ONE),
+    ("test", "ckpt=null scenes=a weights=b data=toy_objects data.root=x", ONE),
+    ("test", "ckpt=null scenes=a", NO_DATA),
+    ("test", "ckpt=null weights=a", NO_DATA),
+    ("test", "data=toy_objects data.root=x", "a checkpoint's data are its run's"),
+    ("test", "ckpt=null data=toy_objects data.root=x scenes=no", "scenes=no: no such folder; give one with SCENE/"),
+    ("test", "scenes=a frame=colmap", "frame=colmap: choose one of opencv, opengl"),
+    ("test", "scenes=a align=all", "align=all: choose one of none, scale"),
 ]
 
 
 @pytest.mark.parametrize(("verb", "setting", "message"), ODD, ids=lambda text: text[:40])
 def test_a_wrong_value_is_refused_with_the_allowed_values(verb, setting, message):
     given = {"predict": "image=a.png weights=nowhere", "data": "data_task=toy", "test": "ckpt=nowhere"}
-    given |= {"fit": "trainer.max_steps=1"}
-    assert message in refused(verb, *given.get(verb, "").split(), *setting.split())
+    given |= {"fit": "trainer.max_steps=1", "report": "report_task=controls ckpt=nowhere", "view": ""}
+    given |= {"plan": "experiment=toy_var data.image_size=32"}
+    assert message in refused(verb, *given[verb].split(), *setting.split())
 
 
 @pytest.mark.parametrize("chosen", [*VERBS, "data_task=check", "bench_task=paper", "report_task=summary"])
@@ -104,9 +137,14 @@ def test_a_wrong_value_is_reported_under_the_setting_that_the_user_gave():
         ("predict sampels=1", r"no setting 'sampels' of completesplat predict; did you mean samples\?"),
         ("predcit a.png", r"no verb 'predcit': there are data, .*; did you mean predict\?"),
         (f"predict image={__file__} weights=toy_object", r"toy_object: no such folder.*toy_objects"),
+        ("report controls", "give one of ckpt=FILE, weights=DIR"),
+        ("test ckpt=nowhere/checkpoints/last.ckpt", ".*no such checkpoint"),
+        ("data toy kind=nonsense", "no toy data of kind 'nonsense'"),
+        ("fit -m seed=0,1 --cfg job", "--cfg and --info show the settings of one run: leave out -m$"),
+        ("fit rasterizer._target_=nowhere.Mine", "Error loading 'nowhere.Mine': ModuleNotFoundError"),
     ],
 )
-def test_the_nearest_name_is_suggested_for_a_mistyped_one(command, typed, message):
+def test_a_refusal_is_one_line_that_suggests_the_nearest_name(command, typed, message):
     refused = command.refuses(*typed.split())
     assert re.match(message, refused), refused
     assert len(refused) < 700

@@ -162,9 +162,16 @@ def test_depth_replaces_colours_and_frusta_stand_at_the_cameras(page):
     assert page.view._frusta == []
 
 
+def titles(page: Page, monkeypatch) -> list[str]:
+    """What the title of the panel says from now on: all that a phone shows of its folded panel."""
+    said = []
+    monkeypatch.setattr(page.server.gui, "set_panel_label", said.append)
+    return said
+
+
 def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(completion, model, monkeypatch):
     monkeypatch.setattr("completesplat.viewer.completion.PAUSE", 0)
-    seen, show = [], completion.page.show
+    said, seen, show = titles(completion.page, monkeypatch), [], completion.page.show
     monkeypatch.setattr(completion.page, "show", lambda samples, text: seen.append(samples[0]) or show(samples, text))
     samples = load(completion.page)
     for sample, expected in zip(samples, model(completion.photograph[1], **SETTINGS), strict=True):
@@ -173,6 +180,8 @@ def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(comple
     assert "photo.png" in completion.controls.preview.content
     assert completion.page.looking.chosen.options == ("sample 1", "sample 2", "all, side by side")
     assert [sample.finished for sample in seen] == [False, False, True]
+    assert said[0] == "completesplat: drawing from photo.png"
+    assert said[-1].startswith("completesplat: 2 drawn in ")
     assert not torch.equal(seen[0].gaussians.means, seen[-1].gaussians.means)
 
 
@@ -238,22 +247,6 @@ def test_one_of_several_scenes_is_chosen(server, tmp_path):
     made.opening.chosen.value = "a"
     assert (len(finish(made)), made.opening.chosen.options) == (2, ("a", "b"))
     made.worker.close()
-
-
-def titles(page: Page, monkeypatch) -> list[str]:
-    """What the title of the panel says from now on."""
-    said = []
-    monkeypatch.setattr(page.server.gui, "set_panel_label", said.append)
-    return said
-
-
-def test_the_title_says_what_is_waited_for(completion, monkeypatch):
-    """A phone shows nothing else of its folded panel."""
-    said = titles(completion.page, monkeypatch)
-    completion.controls.forming.value = False
-    load(completion.page)
-    assert said[0] == "completesplat: drawing from photo.png"
-    assert said[1].startswith("completesplat: 2 drawn in ")
 
 
 def test_a_slider_draws_anew_unless_drawing_is_off(completion):
