@@ -17,7 +17,7 @@ from completesplat.autoreconstructor.encoder import Images
 from completesplat.autoreconstructor.model import DepthRange, VariationalAutoReconstructor
 from completesplat.baselines.splatter_image.model import PublishedOneAnswer, is_published
 from completesplat.diffusion.guidance import allowed_skip_weight
-from completesplat.diffusion.sampling import Sampler, draw_noise, in_parts, with_forward_process
+from completesplat.diffusion.sampling import PART, Sampler, draw_noise, in_parts, one_thread_each, with_forward_process
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -138,21 +138,25 @@ class CompleteSplat(SceneModel):
         """
         weight = allowed_skip_weight(skip_weight, visible)
         images = images if visible is None else images * visible
-        conditioning = self.conditioning(images)
-        stage1 = self.autoreconstructor
-        features = stage1.encoder.features(images * 2 - 1, stage1.reconstructor.feature_levels) if weight else []
-        shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
-        noise = draw_noise(len(images), samples, shape, seed).to(images.device)
-        image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
-        decode = partial(self._decode, image_of, features, weight, cameras, depth_range)
+        with one_thread_each(self.denoiser, images.device) as threads:
+            conditioning = self.conditioning(images)
+            stage1 = self.autoreconstructor
+            features = stage1.encoder.features(images * 2 - 1, stage1.reconstructor.feature_levels) if weight else []
+            shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
+            noise = draw_noise(len(images), samples, shape, seed).to(images.device)
+            image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
+            decode = partial(self._decode, image_of, features, weight, cameras, depth_range)
 
-        def draw(part: slice) -> Tensor:
-            watch = None if on_step is None else lambda step, level, latent: on_step(step, level, decode(latent, part))
-            return self.sampler(self.denoiser, noise[part], conditioning[image_of[part]], guidance_weight, steps, watch)
+            def draw(part: slice) -> Tensor:
+                watch = None if on_step is None else lambda step, t, latent: on_step(step, t, decode(latent, part))
+                inputs = noise[part], conditioning[image_of[part]]
+                return self.sampler(self.denoiser, *inputs, guidance_weight, steps, watch)
 
-        # Sample first, then decode: if a GPU's memory does not suffice to decode a part, its latents are not lost.
-        latents = torch.cat(in_parts(draw, len(noise), batch))
-        scenes = concatenate(in_parts(lambda part: decode(latents[part], part), len(noise), batch))
+            # Sample first, then decode: if a GPU's memory does not suffice to decode a part, its latents are not lost.
+            most = batch or (PART if threads else None)
+            parts = partial(in_parts, count=len(noise), most=most, threads=1 if on_step else threads)
+            latents = torch.cat(parts(draw))
+            scenes = concatenate(parts(lambda part: decode(latents[part], part)))
         return self.fitted(scenes, images, cameras, visible, color_fits)
 
     def _decode(

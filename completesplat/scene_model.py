@@ -252,7 +252,8 @@ def distance_to_training(photograph: Photograph, architecture: Mapping[str, Any]
 def distances_to_shipped(image: ImageLike, remove_background: bool = False) -> dict[str, float]:
     """Return the distances of an image from the training images of the weights in the package, the nearest first.
 
-    They depend on the resolution, so the image, which is read once, is resized for each model.
+    They depend on the resolution, so the image, which is read once, is resized for each model. Weights that know objects
+    on a background are left out if the image's border does not show this background, because they know nothing else.
 
     Raises:
         CompleteSplatError: as `read_photograph`.
@@ -262,9 +263,17 @@ def distances_to_shipped(image: ImageLike, remove_background: bool = False) -> d
     square = read_photograph(image, largest, remove_background=remove_background).image
     distances: dict[str, float] = {}
     for name, config in configs.items():
+        if not _is_border(config["training"].get("background"), square):
+            continue
         distance = distance_to_training(read_photograph(square, config["image_size"]), config)
         distances |= {} if distance is None else {name: distance}
     return dict(sorted(distances.items(), key=itemgetter(1)))
+
+
+def _is_border(background: float | None, square: Float[Tensor, "3 size size"]) -> bool:
+    """Return whether at least half of an image's border has this grey value, up to 0.1; None: any."""
+    border = torch.cat([square[:, [0, -1]].flatten(1), square[:, :, [0, -1]].flatten(1)], 1)
+    return background is None or ((border - background).abs().amax(0) < 0.1).float().mean().item() >= 0.5
 
 
 def camera_tensors(camera: Mapping[str, Any]) -> dict[str, Tensor]:

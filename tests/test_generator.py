@@ -94,6 +94,24 @@ def test_one_model_draws_in_four_threads_what_it_draws_one_after_the_other(model
     assert all(same(*pair) for scenes in zip(alone, together, strict=True) for pair in zip(*scenes, strict=True))
 
 
+@pytest.fixture
+def threads():
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("mixed", [False, True], ids=["float32", "bfloat16"])
+def test_any_number_of_threads_draws_the_same_scenes_bit_for_bit_and_stays_set(model, photo, threads, mixed):
+    drawn = []
+    for number in (1, 2, 3):
+        threads(number)
+        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+            drawn.append(model(photo, samples=10, steps=2))
+        assert torch.get_num_threads() == number
+    assert all(same(*pair) for others in drawn[1:] for pair in zip(drawn[0], others, strict=True))
+
+
 def test_another_default_type_of_torch_changes_nothing_and_weights_of_another_type_are_refused(folder, photo):
     expected = CompleteSplat.from_pretrained(folder)(photo, samples=1, steps=1)[0]
     torch.set_default_dtype(torch.float64)
@@ -179,13 +197,13 @@ def test_an_image_is_encoded_once_for_all_samples_and_steps_and_only_as_far_as_s
 ):
     actual = calls_of(model, samples=2, steps=1, skip_weight=0.0)
     assert actual == {"conditioning": [1], "denoiser": [2], "reconstructor": [2]}
-    actual = calls_of(model, samples=20, steps=4, guidance_weight=guidance_weight)
+    actual = calls_of(model, samples=20, batch=20, steps=4, guidance_weight=guidance_weight)
     once = {"conditioning": [1], "first level": [1], "skip": [20], "reconstructor": [20]}
     assert actual == {**once, "denoiser": [20 * passes] * 4}
 
 
 def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(model, photo, monkeypatch):
-    whole, decode, sizes = model(photo, samples=5, steps=2), model._decode, []
+    whole, decode, sizes = model(photo, samples=5, batch=5, steps=2), model._decode, []
 
     def small(*inputs):
         sizes.append(len(inputs[-2]))
@@ -196,7 +214,7 @@ def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(mo
     monkeypatch.setattr(model, "_decode", small)
     denoised = []
     hook = model.denoiser.register_forward_pre_hook(lambda _, inputs: denoised.append(len(inputs[0])))
-    parts = model(photo, samples=5, steps=2)
+    parts = model(photo, samples=5, batch=5, steps=2)
     hook.remove()
     assert (denoised, sizes) == ([5, 5], [5, 3, 2, 2, 1])
     for one, other in zip(whole, parts, strict=True):

@@ -2,7 +2,10 @@
 
 import gc
 import statistics
-from collections.abc import Mapping, Sequence
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,7 +23,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.trajectories import orbit
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Positive
+from completesplat.settings.schema import Natural, Positive
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stage import Stage
@@ -69,7 +72,7 @@ WAYS = (
 
 def run(
     data: Mapping[str, object], stage1: Mapping[str, object], stage2: Mapping[str, object], steps: Positive,
-    device: Literal["cuda", "cpu"], repeats: Positive, samples: Positive, compile: bool, training: bool,
+    device: Literal["cuda", "cpu"], repeats: Positive, samples: Positive, compile: bool, training: bool, busy: Natural,
     channels: Mapping[str, Sequence[int]], seed: int, out: Path,
 ) -> None:  # fmt: skip
     """Measure with random weights, write `paper.json`, and print a table.
@@ -97,7 +100,7 @@ def run(
                 status.update(f"timing {way.name}")
                 torch.manual_seed(seed)
                 module: Stage = instantiate(config, _convert_="all").to(device)
-                rows += rows_of(module, scenes, way, samples, training, repeats)
+                rows += rows_of(module, scenes, way, samples, training, repeats, busy)
                 del module
     work = {"image_size": loaded.image_size, "batch": loaded.batch_size, "samples": samples, "steps": steps}
     if is_as_in_the_paper(work, channels):
@@ -118,7 +121,9 @@ def is_as_in_the_paper(work: Mapping[str, int], channels: Mapping[str, Sequence[
     return dict(work) == PAPERS_WORK and dict(channels) == PAPERS_CHANNELS
 
 
-def rows_of(module: Stage, scenes: SceneBatch, way: Way, samples: int, training: bool, repeats: int) -> list[Row]:
+def rows_of(
+    module: Stage, scenes: SceneBatch, way: Way, samples: int, training: bool, repeats: int, busy: int = 0
+) -> list[Row]:
     """Return a row for each kind of work: median ms and, on a GPU, torch's peak memory in MB, weights included.
 
     If some work fails, for example because memory is short, its row has the reason instead. Optimizer steps are left
@@ -129,24 +134,41 @@ def rows_of(module: Stage, scenes: SceneBatch, way: Way, samples: int, training:
     for name, work in works_of(module, scenes, way.precision, samples).items():
         if name.endswith("_step") and (not training or way.compile == "reduce-overhead"):
             continue
-        results.append({"name": name, "way": way.name} | measured(work, repeats, module.device))
+        results.append({"name": name, "way": way.name} | measured(work, repeats, module.device, busy))
         gc.collect()
     return results
 
 
-def measured(work: Work, repeats: int, device: torch.device) -> Row:
-    """Return the median time, and on a GPU the peak memory; or the reason why the work failed."""
+def measured(work: Work, repeats: int, device: torch.device, busy: int = 0) -> Row:
+    """Return the median time, alone and beside busy processes, and on a GPU the peak memory; or why the work failed."""
     try:
         for _ in range(WARM_UP):
             work()
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)
-        times = [milliseconds(work) for _ in range(repeats)]
+        row = {"ms": statistics.median(milliseconds(work) for _ in range(repeats))}
+        if busy:
+            with busy_processes(busy):
+                row["busy_ms"] = statistics.median(milliseconds(work) for _ in range(repeats))
+            row["times"] = row["busy_ms"] / row["ms"]
     except (RuntimeError, AssertionError) as error:  # torch's compiler raises both kinds, too
         first = (str(error).strip().splitlines() or [""])[0]
         return {"not_measured": f"{type(error).__name__}: {first}"}
     memory = {"memory_mb": torch.cuda.max_memory_allocated(device) / MEGABYTE} if device.type == "cuda" else {}
-    return {"ms": statistics.median(times), **memory}
+    return row | memory
+
+
+@contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """Let other processes compute all the time; they end with the block, or with this process."""
+    program = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"
+    processes = [subprocess.Popen([sys.executable, "-c", program]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 def compile_networks(networks: list[nn.Module], way: Way) -> None:

@@ -1,5 +1,8 @@
 """`completesplat bench paper`: what it writes, prints and refuses."""
 
+import os
+from pathlib import Path
+
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -66,3 +69,20 @@ def test_failing_work_has_the_reason_in_its_row():
         raise RuntimeError("out of memory\nand a long story")
 
     assert measured(fail, 1, torch.device("cpu")) == {"not_measured": "RuntimeError: out of memory"}
+
+
+def children() -> int:
+    return len(Path(f"/proc/self/task/{os.getpid()}/children").read_text().split())
+
+
+@pytest.mark.processes
+def test_work_is_measured_beside_busy_processes_which_end_with_it():
+    busy = []
+
+    def work() -> None:
+        busy.append(children())
+
+    row = measured(work, 2, torch.device("cpu"), busy=3)
+    assert busy == [0] * (paper.WARM_UP + 2) + [3] * 2
+    assert row["times"] == row["busy_ms"] / row["ms"]
+    assert children() == 0
