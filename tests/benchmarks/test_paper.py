@@ -25,15 +25,11 @@ QUICK = [
 def test_both_stages_are_measured_written_and_printed(command, tmp_path, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # starting workers costs more than writing a few images
     monkeypatch.setattr(paper, "WARM_UP", 0)
-    finished = command(*QUICK, f"out={tmp_path / 'out'}")
-    assert finished.status == 0, finished.err
+    finished = command.succeeds(*QUICK, f"out={tmp_path / 'out'}")
     results = strict_json(tmp_path / "out/paper.json")
-    assert [(row["name"], row["way"]) for row in results["rows"]] == [
-        (name, way)
-        for names in (("reconstruct", "render", "stage1_step"), ("sample", "samples", "stage2_step"))
-        for way in ("float32", "bfloat16")
-        for name in names
-    ]
+    stages = (["reconstruct", "render", "stage1_step"], ["sample", "samples", "stage2_step"])
+    works = [(name, way) for names in stages for way in ("float32", "bfloat16") for name in names]
+    assert [(row["name"], row["way"]) for row in results["rows"]] == works
     # Less work than the paper's, so its durations do not stand beside these.
     assert all(set(row) == {"name", "way", "ms"} and row["ms"] > 0 for row in results["rows"])
     work = {"device": "cpu", "image_size": 32, "batch": 2, "samples": 3, "steps": 2, "repeats": 1}

@@ -81,8 +81,7 @@ def test_distances_are_of_the_image_at_the_size_of_each_model(package, tmp_path)
 
 def test_the_default_chooses_and_says_so_in_one_line(command, tmp_path):
     quick = ["samples=1", "steps=1", "color_fits=0", "video=[]"]
-    finished = command("predict", f"image={COUCH}", f"out={tmp_path / 'out'}", *quick)
-    assert finished.status == 0, finished.err
+    finished = command.succeeds("predict", f"image={COUCH}", f"out={tmp_path / 'out'}", *quick)
     (line,) = [line for line in finished.out.splitlines() if line.startswith("weights: ")]
     assert line.startswith("weights: rendered_couches, which come with the package and know renders of ")
     assert "nearest to held_out.jpg (" in line

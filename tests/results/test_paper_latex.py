@@ -20,16 +20,10 @@ from completesplat.results.tables import BLANK, Cell
 
 ENVIRONMENT = re.compile(r"\\begin\{table(\*?)\}.*?\\end\{table\1\}", re.DOTALL)
 COMMENT = re.compile(r"(?<!\\)%.*")
-DECORATION = re.compile(
-    r"\\(?:top|mid|bottom)rule|\\hline|\\cmidrule(?:\([lr]*\))?\{[^}]*\}|\\(?:row|cell)color(?:\[\w*\])?\{[^}]*\}"
-)
+RULES, COLORS = r"\\(?:top|mid|bottom)rule|\\hline", r"\\(?:row|cell)color(?:\[\w*\])?\{[^}]*\}"
+DECORATION = re.compile(rf"{RULES}|\\cmidrule(?:\([lr]*\))?\{{[^}}]*\}}|{COLORS}")
 SPAN = re.compile(r"\\multi(row|column)\{(-?\d+)\}\{[^}]*\}\{(.*)\}", re.DOTALL)
-MARKED = {
-    "best": re.compile(r"\\textbf|\\bf\b"),
-    "second": re.compile(r"\\underline|\\ul\b"),
-    "dagger": re.compile(r"\$\\dagger\$"),
-    "star": re.compile(r"\$\\star\$"),
-}
+MARKED = {"best": r"\\textbf|\\bf\b", "second": r"\\underline|\\ul\b", "dagger": r"\$\\dagger\$", "star": r"\$\\star\$"}
 
 
 def grid(table: str, last_heading: str) -> tuple[list[str], list[list[Cell]]] | None:
@@ -50,9 +44,9 @@ def grid(table: str, last_heading: str) -> tuple[list[str], list[list[Cell]]] | 
 
 def figure(cell: str) -> Cell:
     """Text and marks of a cell: bold is the best, underlined the second."""
-    marks = [mark for mark, pattern in MARKED.items() if pattern.search(cell)]
-    for pattern in (re.compile(r"~?\\cite\{[^}]*\}"), *MARKED.values()):
-        cell = pattern.sub("", cell)
+    marks = [mark for mark, pattern in MARKED.items() if re.search(pattern, cell)]
+    for pattern in (r"~?\\cite\{[^}]*\}", *MARKED.values()):
+        cell = re.sub(pattern, "", cell)
     return parse_cell(" ".join([re.sub(r"[{}]", "", cell).replace(r"\#", "#"), *marks]))
 
 

@@ -3,7 +3,6 @@
 import math
 
 import imageio.v3 as imageio
-import numpy as np
 import pytest
 import torch
 
@@ -38,18 +37,11 @@ def test_near_is_an_angle_between_optical_axes():
     assert near_reference(turned(10)[0], targets, 45).tolist() == [True, True, False, False, False, True, True]
 
 
-def read(path) -> np.ndarray:
-    return imageio.imread(path)[..., :3]
-
-
-def shows(image: np.ndarray, color: tuple[int, int, int]) -> bool:
-    return bool((image == color).all(-1).any())
-
-
 def test_the_papers_settings_are_always_in_the_grid_and_marked(tmp_path):
     assert grid([], []) == sorted(PAPER)
     assert set(grid([0, 1], [0.2])) == {(0.0, 0.2), (1.0, 0.2), (0.5, 0.5), (0.0, 0.5)}
     row = {"skip_weight": 0.5, "guidance_weight": 0.5, "diversity": 0.1, "reference_psnr": 20.0}
     for paper in (True, False):
         plot_controls([row | {"paper": paper, "near_object_psnr": None}], tmp_path / "controls.png", "title")
-        assert shows(read(tmp_path / "controls.png"), (220, 20, 60)) == paper
+        crimson = (imageio.imread(tmp_path / "controls.png")[..., :3] == (220, 20, 60)).all(-1)
+        assert crimson.any() == paper
