@@ -94,7 +94,7 @@ def test_one_store_serves_smaller_images_as_pillow_makes_them(tmp_path: Path) ->
 def test_masks_of_some_frames_only_stay_with_them() -> None:
     image, mask = smooth_image(1, True)
     images = [EncodedImage(encode(image, "png"), content) for content in (None, encode(mask, "png"))]
-    read = from_row(to_row(make_sequence("s", frames=2), [0, 1], images), "file", "s").read
+    read = from_row(to_row(make_sequence("s", (10, 13)), [0, 1], images), "file", "s").read
     assert read(0).mask is None
     assert torch.equal(read(1).mask, mask)
 
@@ -197,7 +197,7 @@ def change(row: pa.Table, column: str, value: object) -> pa.Table:
     ],
 )
 def test_a_row_that_does_not_fit_is_refused_with_its_place(column: str, value: object, kind: type[DataError]) -> None:
-    row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedImage(b"", b"")] * 2)
+    row = to_row(make_sequence("s", (10, 13)), [0, 1], [EncodedImage(b"", b"")] * 2)
     with pytest.raises(kind) as caught:
         from_row(change(row, column, value), "shard.arrow", "s")
     assert (caught.value.file, caught.value.sequence) == ("shard.arrow", "s")
@@ -208,14 +208,14 @@ def test_bytes_that_are_not_the_image_are_refused_with_their_place() -> None:
     # Where the checksum is that of the wrong bytes, decoding them has to notice.
     for wrong in (image[: len(image) // 2], encode(smooth_image(0, True, size=SIZE + 1).image, "png")):
         images = [EncodedImage(image, None), EncodedImage(wrong, None)]
-        sequence = from_row(to_row(make_sequence("s", frames=2), [0, 1], images), "shard.arrow", "s")
+        sequence = from_row(to_row(make_sequence("s", (10, 13)), [0, 1], images), "shard.arrow", "s")
         sequence.read(0)
         with pytest.raises(BadImage) as caught:
             sequence.read(1)
         assert (caught.value.file, caught.value.sequence, caught.value.frame) == ("shard.arrow", "s", 13)
     flipped = image[:-20] + bytes([image[-20] ^ 1]) + image[-19:]
     assert decode(flipped, 3, SIZE, SIZE).shape == (3, SIZE, SIZE)
-    row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedImage(image, None)] * 2)
+    row = to_row(make_sequence("s", (10, 13)), [0, 1], [EncodedImage(image, None)] * 2)
     read = from_row(change(row, "images", [image, flipped]), "shard.arrow", "s").read
     read(0)
     with pytest.raises(BadImage, match="no longer"):
