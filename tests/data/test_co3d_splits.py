@@ -4,19 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from co3d_trees import (
-    CATEGORY,
-    FRAMES,
-    SET_LIST,
-    SUBSET,
-    change,
-    frame_entry,
-    look,
-    orbit,
-    sequence_entry,
-    write_annotations,
-    write_tree,
-)
+from co3d_trees import CATEGORY, FRAMES, SET_LIST, SUBSET, change, frame_entry, look, orbit, sequence_entry
+from co3d_trees import write_annotations, write_tree
 
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.splits import Category, Filters, SeededSplit, read_category
@@ -62,7 +51,7 @@ def test_frames_come_in_order_whatever_the_file_says(tmp_path):
 def test_whole_sequences_are_split_by_seed_also_where_there_are_set_lists(tmp_path):
     annotate(tmp_path, many(60), {"train": list(many(60)), "val": [], "test": []})
     assert names(read(tmp_path))["test"] == set()
-    category = read(tmp_path, subset=None)
+    category = read(tmp_path, None)
     taken = names(category)
     assert taken["train"] | taken["val"] | taken["test"] == set(many(60))
     assert sum(map(len, taken.values())) == 60
@@ -97,9 +86,8 @@ def test_unknown_subsets_and_missing_and_outside_categories_are_refused(tmp_path
     assert caught.value.file == str(lists)
     for path in lists.iterdir():
         path.unlink()
-    with pytest.raises(
-        DataError, match=r"no set list 'other' there; nor any other; give data.subset=null, which splits"
-    ):
+    nothing = r"no set list 'other' there; nor any other; give data.subset=null, which splits"
+    with pytest.raises(DataError, match=nothing):
         read(tmp_path / "root", subset="other")
     with pytest.raises(DataError, match="no such CO3D category") as caught:
         read_category(tmp_path / "root", "none", SUBSET, SeededSplit(0.1, 0.1, 0), Filters())
@@ -183,3 +171,85 @@ def test_cameras_that_do_not_move_are_refused(tmp_path):
         data.source("train").read("a")
     assert (caught.value.file, caught.value.sequence) == (str(category / FRAMES), "a")
     assert data.source("val").read("b").frames == (0, 1, 2)
+
+
+COUNTS = dict.fromkeys("abcdefgh", 3)
+APART = {"train": "abcdef", "val": "g", "test": "h"}
+SHARED = {"train": "abcdef", "val": "", "test": "abcdefgh"}
+"""As `set_lists_fewview_train.json`: all of training is tested too (facebookresearch/co3d issue 49)."""
+
+
+def module(root: Path, **settings) -> CO3DDataModule:
+    return CO3DDataModule(str(root), CATEGORY, image_size=8, **settings)
+
+
+def listed_names(data: CO3DDataModule) -> dict[str, list[str]]:
+    return {split: data.source(split).names for split in SPLITS}
+
+
+def test_few_views_of_sequences_never_seen_are_the_default_and_a_split_by_seed_must_be_asked_for(tmp_path):
+    """Splatter Image takes `fewview_dev` (`data_preprocessing/preprocess_co3d.py`)."""
+    write_tree(tmp_path / "lists", COUNTS, APART)
+    data = module(tmp_path / "lists")
+    assert listed_names(data) == {split: list(listed) for split, listed in APART.items()}
+    assert data.describe()["subset"] == "fewview_dev"
+    write_tree(tmp_path / "none", COUNTS, None)
+    with pytest.raises(DataError, match=r"data\.subset=null"):
+        module(tmp_path / "none").setup("fit")
+    by_seed = module(tmp_path / "none", subset=None, batch_size=2, targets=1)
+    by_seed.setup("fit")
+    assert by_seed.describe()["subset"] is None
+    assert "seed 0" in by_seed.describe()["split"]
+
+
+@pytest.mark.parametrize("on_bad", ["skip", "raise"])
+def test_a_list_that_tests_on_training_sequences_is_refused_unless_asked_for(tmp_path, on_bad):
+    category = write_tree(tmp_path, COUNTS, SHARED)
+    for stage in ("fit", "test"):
+        with pytest.raises(DataError, match=r"6 sequences .* a, b, c, d, e, .*allow_shared_sequences=true") as caught:
+            module(tmp_path, on_bad=on_bad).setup(stage)
+        assert caught.value.file == str(category / SET_LIST)
+    allowed = module(tmp_path, allow_shared_sequences=True)
+    assert allowed.source("test").names == list("abcdefgh")
+    assert "allowed" in allowed.describe()["split"]
+    assert "allowed" not in module(tmp_path).describe()["split"]
+
+
+@pytest.mark.parametrize("val", ["h", "gh"])
+def test_a_list_that_validates_on_test_sequences_is_refused_unless_asked_for(tmp_path, val):
+    """Whoever chooses by validation would choose by the test."""
+    category = write_tree(tmp_path, COUNTS, APART | {"val": val})
+    for stage in ("fit", "test"):
+        with pytest.raises(DataError, match=r"1 sequences are in both val and test: h; .*allow_shared") as caught:
+            module(tmp_path).setup(stage)
+        assert caught.value.file == str(category / SET_LIST)
+    assert module(tmp_path, allow_shared_sequences=True).source("val").names == list(val)
+
+
+def test_validation_leaves_out_what_is_trained_on(tmp_path):
+    write_tree(tmp_path, COUNTS, APART | {"val": "abg"})
+    source = module(tmp_path).source("val")
+    assert (source.names, source.left_out) == (["g"], {"in training too": ["a", "b"]})
+    assert module(tmp_path, allow_shared_sequences=True).source("val").names == ["a", "b", "g"]
+
+
+@pytest.mark.parametrize("val", ["", "ab"])
+def test_a_seeded_part_of_training_validates_where_nothing_else_does(tmp_path, caplog, val):
+    write_tree(tmp_path, COUNTS, APART | {"val": val})
+    result = [listed_names(module(tmp_path, val_fraction=0.4, split_seed=seed)) for seed in (0, 0, 1)]
+    assert result[0] == result[1] != result[2]
+    for taken in result:
+        assert taken["val"]
+        assert sorted(taken["train"] + taken["val"]) == list("abcdef")
+        assert taken["test"] == ["h"]
+    assert f"{len(result[0]['val'])} of 6 training sequences validate" in caplog.text
+    assert "validates" in module(tmp_path).describe()["split"]
+
+
+def test_a_source_knows_how_many_sequences_its_list_has(tmp_path):
+    """Also those that filters leave out or that cannot be read."""
+    category = write_tree(tmp_path, COUNTS, APART | {"train": "abcd", "test": "efh"})
+    assert module(tmp_path, min_frames=4).source("test").listed == 3
+    change(category / SET_LIST, lambda splits: splits["test"].append(["gone", 0, "x"]))
+    source = module(tmp_path).source("test")
+    assert (len(source.names), source.listed) == (3, 4)
