@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from completesplat.data.packed.writing import prepare
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.data.validation import BadImage
 from completesplat.errors import DataError
@@ -87,5 +89,12 @@ class ListedSource(SequenceSource):
         return self.content
 
 
+def pack(source: ListedSource, out: Path, split: str = "train", settings: dict | None = None, **options: Any) -> Path:
+    """Prepare a store of one split: two sequences in each shard, in this process."""
+    quick = {"sequences_per_shard": 2, "workers": 1, "progress": False}
+    return prepare({split: source}, {"image_size": SIZE} | (settings or {}), out, **quick | options)
+
+
 def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    """What the files of a folder and of those in it hold, by path."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -410,25 +410,37 @@ def test_distortion_that_leaves_no_image_is_refused(tmp_path, k1):
         first_sequence(tmp_path)
 
 
-@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
-@pytest.mark.parametrize("share", [0.01, 0.99, 1.01])
-def test_cut_and_lengthened_models_are_refused(tmp_path, file, share):
-    model = write_model(tmp_path, "OPENCV")
-    path = model / f"{file}.bin"
-    content = path.read_bytes()
-    path.write_bytes((content + bytes(99))[: int(share * len(content)) + (share > 1)])
-    with pytest.raises(DataError, match=rf"{file}\.bin: cut off"):
+def resized(share: float) -> Callable[[bytes], bytes]:
+    return lambda content: (content + bytes(99))[: int(share * len(content)) + (share > 1)]
+
+
+def replaced(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
+    return lambda content: content.replace(old, new)
+
+
+LENS = r"cameras\.\w+: camera model .* is not supported"
+# a fault: (file, change of its content, error, message)
+COLMAP = {
+    f"{share} of {name}": (f"{name}.bin", resized(share), DataError, rf"{name}\.bin: cut off")
+    for name, share in product(("cameras", "images", "points3D"), (0.01, 0.99, 1.01))
+} | {
+    "an image outside": ("images.txt", replaced(b"left/3.png", b"../3.png"), OutsidePath, "frame 3: leads outside"),
+    "an image twice": ("images.txt", replaced(b"left/3.png", b"left/4.png"), DataError, "frame 4: the same image"),
+    "a word for a number": ("points3D.txt", lambda content: b"1 2 three\n", DataError, r"points3D\.txt"),
+    "another lens": ("cameras.txt", replaced(b"PINHOLE", b"FULL_OPENCV"), BadCamera, LENS),
+    "another lens in binary": ("cameras.bin", lambda content: content[:12] + b"\6" + content[13:], BadCamera, LENS),
+}
+
+
+@pytest.mark.parametrize(("file", "change", "kind", "message"), COLMAP.values(), ids=COLMAP)
+def test_a_bad_model_of_colmap_is_refused(tmp_path, file, change, kind, message):
+    model = write_model(tmp_path, "PINHOLE", binary=file.endswith(".bin"))
+    (model / file).write_bytes(change((model / file).read_bytes()))
+    with pytest.raises(kind, match=message):
         read_colmap(model, tmp_path / "images")
 
 
-@pytest.mark.parametrize("binary", [True, False])
-def test_other_models_of_lenses_are_refused(tmp_path, binary):
-    model = write_model(tmp_path, "FULL_OPENCV", binary)
-    with pytest.raises(BadCamera, match=r"cameras\.\w+: camera model .* is not supported"):
-        read_colmap(model, tmp_path / "images")
-
-
-def test_missing_images_are_left_out_and_those_outside_and_what_is_no_model_are_refused(tmp_path, caplog):
+def test_missing_images_are_left_out_and_a_folder_or_file_that_is_missing_is_refused(tmp_path, caplog):
     model, images = write_model(tmp_path, "PINHOLE", binary=False), tmp_path / "images"
     for number in (3, 5):
         (images / f"left/{number}.png").unlink()
@@ -436,14 +448,6 @@ def test_missing_images_are_left_out_and_those_outside_and_what_is_no_model_are_
     assert "images.txt: 2 of 8 frames have no image and are left out: left/3.png, left/5.png" in caplog.text
     with pytest.raises(MissingFile, match="nowhere: no such folder"):
         read_colmap(model, tmp_path / "nowhere")
-    text = (model / "images.txt").read_text()
-    (model / "images.txt").write_text(text.replace("left/3.png", "../3.png"))
-    with pytest.raises(OutsidePath, match=r"frame 3: leads outside"):
-        read_colmap(model, images)
-    (model / "images.txt").write_text(text.replace("left/3.png", "left/4.png"))
-    (model / "points3D.txt").write_text("1 2 three\n")
-    with pytest.raises(DataError):
-        read_colmap(model, images)
     (model / "points3D.txt").unlink()
     with pytest.raises(MissingFile, match=r"points3D\.txt: no such file"):
         read_colmap(model, images)

@@ -3,23 +3,22 @@ import json
 import logging
 import pickle
 from pathlib import Path
+from typing import Any
 
 import pytest
-from packed_sequences import ListedSource, contents
+from packed_sequences import SIZE, ListedSource, contents, pack
 
 from completesplat.data.packed.manifest import read_manifest
 from completesplat.data.packed.source import PackedSource
-from completesplat.data.packed.writing import prepare
 from completesplat.data.validation import BadImage, TooFewFrames
 from completesplat.errors import CompleteSplatError, DataError
 
-SETTINGS = {"image_size": 16, "category": "chair", "crop": None}
+SETTINGS = {"image_size": SIZE, "category": "chair", "crop": None}
 NAMES = [f"s{number}" for number in range(8)]
 
 
-def make(source: ListedSource, out: Path, **options: object) -> Path:
-    keywords = {"sequences_per_shard": 2, "workers": 1, "progress": False, **options}
-    return prepare({"train": source}, SETTINGS, out, **keywords)  # type: ignore[arg-type]
+def make(source: ListedSource, out: Path, **options: Any) -> Path:
+    return pack(source, out, settings=SETTINGS, **options)
 
 
 def failing(*names: str) -> dict[str, BaseException]:
@@ -57,7 +56,7 @@ def test_an_interrupted_run_is_not_continued_with_other_data_or_settings(tmp_pat
     with pytest.raises(KeyboardInterrupt):
         make(ListedSource(NAMES, failing={"s3": KeyboardInterrupt()}), out)
     with pytest.raises(DataError, match=r"image_size=16 \(asked for: 32\).*another folder"):
-        prepare({"train": ListedSource(NAMES)}, {**SETTINGS, "image_size": 32}, out, sequences_per_shard=2)
+        pack(ListedSource(NAMES), out, settings=SETTINGS | {"image_size": 32})
     for source, options in [
         (ListedSource(NAMES, content="b"), {}),
         (ListedSource(NAMES), {"codec": "jpeg"}),
