@@ -1,5 +1,6 @@
 import json
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
 import co3d_trees as trees
@@ -202,28 +203,26 @@ def test_few_views_of_sequences_never_seen_are_the_default_and_a_split_by_seed_m
     assert "seed 0" in by_seed.describe()["split"]
 
 
-@pytest.mark.parametrize("on_bad", ["skip", "raise"])
-def test_a_list_that_tests_on_training_sequences_is_refused_unless_asked_for(tmp_path, on_bad):
-    category = trees.write_tree(tmp_path, COUNTS, SHARED)
-    for stage in ("fit", "test"):
-        with pytest.raises(DataError, match=r"6 sequences .* a, b, c, d, e, .*allow_shared_sequences=true") as caught:
+TESTS_ON_TRAINING = r"6 sequences .* a, b, c, d, e, .*allow_shared_sequences=true"
+CHOOSES_BY_TEST = r"1 sequences are in both val and test: h; .*allow_shared"
+# Each list: (its splits, refusal, a split, its names where shared sequences are allowed)
+OVERLAPS = {
+    "training is tested": (SHARED, TESTS_ON_TRAINING, "test", "abcdefgh"),
+    "the test validates": (APART | {"val": "h"}, CHOOSES_BY_TEST, "val", "h"),
+    "the test validates too": (APART | {"val": "gh"}, CHOOSES_BY_TEST, "val", "gh"),
+}
+
+
+@pytest.mark.parametrize(("splits", "message", "split", "allowed"), OVERLAPS.values(), ids=OVERLAPS)
+def test_a_list_whose_splits_share_sequences_is_refused_unless_asked_for(tmp_path, splits, message, split, allowed):
+    category = trees.write_tree(tmp_path, COUNTS, splits)
+    for stage, on_bad in product(("fit", "test"), ("skip", "raise")):
+        with pytest.raises(DataError, match=message) as caught:
             module(tmp_path, on_bad=on_bad).setup(stage)
         assert caught.value.file == str(category / trees.SET_LIST)
-    allowed = module(tmp_path, allow_shared_sequences=True)
-    assert allowed.source("test").names == list("abcdefgh")
-    assert "allowed" in allowed.describe()["split"]
-    assert "allowed" not in module(tmp_path).describe()["split"]
-
-
-@pytest.mark.parametrize("val", ["h", "gh"])
-def test_a_list_that_validates_on_test_sequences_is_refused_unless_asked_for(tmp_path, val):
-    """Whoever chooses by validation would choose by the test."""
-    category = trees.write_tree(tmp_path, COUNTS, APART | {"val": val})
-    for stage in ("fit", "test"):
-        with pytest.raises(DataError, match=r"1 sequences are in both val and test: h; .*allow_shared") as caught:
-            module(tmp_path).setup(stage)
-        assert caught.value.file == str(category / trees.SET_LIST)
-    assert module(tmp_path, allow_shared_sequences=True).source("val").names == list(val)
+    shared = module(tmp_path, allow_shared_sequences=True)
+    assert shared.source(split).names == list(allowed)
+    assert ["allowed" in data.describe()["split"] for data in (shared, module(tmp_path))] == [True, False]
 
 
 def test_validation_leaves_out_what_is_trained_on(tmp_path):

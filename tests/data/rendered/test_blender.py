@@ -83,15 +83,13 @@ def test_the_given_program_goes_before_the_variable_and_that_before_the_path(pro
     assert found.command[-1] == "--python"
 
 
-@pytest.mark.parametrize("version", ["4.1.1", "3.6.12", "2.79"])
-def test_an_old_blender_is_refused(line, program, version):
-    message = line(f"blender={program(VERSION.format(version))}")
-    assert f"Blender {version} is older than 4.2; get one by " in message
-
-
-def test_programs_that_are_no_blender_are_refused(line, program, tmp_path):
-    assert "neither Blender nor a Python with bpy (hello)" in line(f"blender={program('echo hello')}")
-    assert "(it prints nothing)" in line(f"blender={program('exit 3')}")
+def test_programs_that_are_no_blender_or_too_old_are_refused(line, program, tmp_path):
+    for text, message in {
+        "echo hello": "neither Blender nor a Python with bpy (hello)",
+        "exit 3": "(it prints nothing)",
+        **{VERSION.format(old): f"Blender {old} is older than 4.2; get one by " for old in ("4.1.1", "3.6.12", "2.79")},
+    }.items():
+        assert message in line(f"blender={program(text)}")
     assert f"{tmp_path / 'gone'}: cannot be run: No such file or directory" in line(f"blender={tmp_path / 'gone'}")
     assert f"{tmp_path}: cannot be run: Permission denied" in line(f"blender={tmp_path}")
     # The Python of these tests is one without bpy.
