@@ -67,9 +67,8 @@ def test_only_the_test_reads_depths_and_what_has_none_costs_no_scene(data, monke
 
 def test_depths_are_unknown_where_only_other_scenes_of_a_batch_have_them(data):
     known = scene_of(data)
-    unknown = replace(
-        known, reference=replace(known.reference, depths=None), targets=replace(known.targets, depths=None)
-    )
+    parts = {name: replace(getattr(known, name), depths=None) for name in ("reference", "targets")}
+    unknown = replace(known, **parts)
     depths = collate([LoadedScenes(unknown, ()), LoadedScenes(known, ())]).scenes.all_views().depths
     assert torch.equal(depths[1], known.all_views().depths)
     assert depths[1].any()
