@@ -116,7 +116,7 @@ def _magnification(cameras: Cameras, constants: RenderingConstants) -> Float[Ten
     height, width = cameras.image_size
     focal = torch.diagonal(cameras.intrinsics, dim1=-2, dim2=-1)[..., :2]
     principal = cameras.intrinsics[..., :2, 2]
-    extent = torch.tensor([width, height], dtype=focal.dtype, device=focal.device)
+    extent = torch.stack([torch.full_like(focal[..., 0], side) for side in (width, height)], -1)  # without a copy
     slope = (torch.maximum(principal, extent - principal) + constants.frustum_margin * 0.5 * extent) / focal
     return (focal * (1 + slope.square()).sqrt()).amax(-1)
 
