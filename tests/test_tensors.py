@@ -111,4 +111,4 @@ def test_lightning_copies_a_batch_to_a_gpu_without_waiting(monkeypatch, device, 
     copies = []
     monkeypatch.setattr(Tensor, "to", lambda tensor, *arguments: copies.append(arguments) or tensor)
     move_data_to_device(Inner(torch.zeros(2)), torch.device(device))
-    assert copies == [(torch.device(device), torch.float32, not blocking)]
+    assert copies == [(torch.device(device), None, not blocking)]
