@@ -3,12 +3,12 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import meshes
 import numpy as np
 import pytest
-from co3d_trees import CATEGORY, SUBSET
+from co3d_trees import CATEGORY, SUBSET, change
 from co3d_trees import write_tree as write_category
 from latent_caches import rooms, small_autoreconstructor, sound_rooms
 from PIL import Image
@@ -31,6 +31,7 @@ from completesplat.ply_files import read_vertices
 from completesplat.training.encoding import encode_training_set
 from completesplat.viewer.sample import read_newest, read_scene
 
+Damage = Callable[[Path], object]
 CLIPS = [make_clip(key, frames=4) for key in ("bad", "one", "two")]
 VAE = random_vae()
 CAMERA = {
@@ -181,3 +182,23 @@ READERS = {
     ),
     "meshes": Reader(write_meshes, read_meshes),
 }
+
+
+def edit(file: str, edit_content: Callable[[Any], object]) -> Damage:
+    """Edit a (gzipped) JSON file."""
+    return lambda folder: change(folder / file, edit_content)
+
+
+def put(file: str, keys: str, value: object) -> Damage:
+    """Set a value in a JSON file at keys that are joined by dots, or remove it (...)."""
+    *path, last = [int(key) if key.isdecimal() else key for key in keys.split(".")]
+
+    def edit_content(content: Any) -> None:
+        for key in path:
+            content = content[key]
+        if value is ...:
+            del content[last]
+        else:
+            content[last] = value
+
+    return edit(file, edit_content)

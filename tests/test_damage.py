@@ -7,18 +7,18 @@ import shutil
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import meshes
 import numpy as np
 import pyarrow as pa
 import pytest
 import torch
-from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SIZE, change, depth_bits
+from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SIZE, depth_bits
 from PIL import Image
 from pretrained_vaes import BIN, SAFETENSORS, rewrite
 from published_weights import write_published
-from readers import CLIPS, READERS, VAE, Usable, write_chunks, write_texts
+from readers import CLIPS, READERS, VAE, Damage, Usable, edit, put, write_chunks, write_texts
 from realestate10k_trees import StoredClip, chunk_entry, make_clip
 
 from completesplat.baselines.splatter_image.model import STATE
@@ -35,31 +35,10 @@ from completesplat.data.validation import (
 )
 from completesplat.errors import CompleteSplatError, DataError, PlyError, WeightsError
 
-Damage = Callable[[Path], object]
 NAN, INF = float("nan"), float("inf")
 
 
 # Damage of the input in a folder.
-
-
-def edit(file: str, edit_content: Callable[[Any], object]) -> Damage:
-    """Edit a (gzipped) JSON file."""
-    return lambda folder: change(folder / file, edit_content)
-
-
-def put(file: str, keys: str, value: object) -> Damage:
-    """Set a value in a JSON file at keys that are joined by dots, or remove it (...)."""
-    *path, last = [int(key) if key.isdecimal() else key for key in keys.split(".")]
-
-    def edit_content(content: Any) -> None:
-        for key in path:
-            content = content[key]
-        if value is ...:
-            del content[last]
-        else:
-            content[last] = value
-
-    return edit(file, edit_content)
 
 
 def content(file: str, data: bytes) -> Damage:
