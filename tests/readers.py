@@ -18,13 +18,13 @@ from realestate10k_trees import StoredClip, make_clip, module, write_chunk_form,
 from splats_of_others import SCENE
 from support import some_gaussians, write_capture
 
-from completesplat.baselines.splatter_image.model import find, read_tensors
+from completesplat.baselines.splatter_image.model import find_published, read_tensors
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.data.rendered.rendering import render
 from completesplat.data.sequences import SequenceSource
-from completesplat.data.validation import at, refused_to
+from completesplat.data.validation import errors_at, refused_to
 from completesplat.errors import DataError
 from completesplat.export.ply import write_ply
 from completesplat.ply_files import read_vertices
@@ -60,10 +60,10 @@ def read_frames(source: SequenceSource) -> Usable:
     """Read every frame of a source."""
     result = Usable(set(), list(source.refused))
     for name in source.names:
-        with refused_to(result.refused.append), at(sequence=name):
+        with refused_to(result.refused.append), errors_at(sequence=name):
             sequence = source.read(name)
             for index, frame in enumerate(sequence.frames):
-                with refused_to(result.refused.append), at(sequence=name, frame=frame):
+                with refused_to(result.refused.append), errors_at(sequence=name, frame=frame):
                     sequence.read(index)
                     result.frames.add((name, frame))
     return result
@@ -173,7 +173,7 @@ READERS = {
     "vae": Reader(VAE.save_pretrained, lambda folder: build(str(folder))),
     "published": Reader(
         lambda folder: write_published(folder, "hydrants"),
-        lambda folder: read_tensors(find(str(folder / "model_hydrants.pth")).weights),
+        lambda folder: read_tensors(find_published(str(folder / "model_hydrants.pth")).weights),
     ),
     "prediction": Reader(write_prediction, read_scene),
     "newest": Reader(write_prediction, read_newest),

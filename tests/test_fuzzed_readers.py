@@ -39,7 +39,7 @@ from support import some_gaussians
 from completesplat.data.captures.capture import CapturedFrame, Lens
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.images.exif import ORIENTATION
-from completesplat.data.images.files import decode, read_depth, stored_size
+from completesplat.data.images.files import decode_image, read_depth, stored_size
 from completesplat.data.images.photograph import read_photograph
 from completesplat.data.validation import read_points
 from completesplat.errors import CompleteSplatError
@@ -101,7 +101,7 @@ def test_images(tmp_path):
 
     def read_images(content: bytes) -> None:
         path.write_bytes(content)
-        calls = [partial(decode, path, "a", mode) for mode in ("RGB", "L")]
+        calls = [partial(decode_image, path, "a", mode) for mode in ("RGB", "L")]
         calls += [
             partial(stored_size, path, "a"),
             partial(read_depth, path, 1.0),
