@@ -53,25 +53,6 @@ def test_the_hub_is_asked_once_and_without_it_a_line_says_what_to_fetch(tmp_path
         find_published("splatter_image:../cars")
 
 
-REFUSED = {
-    "two images": ({"data": {"input_images": 2}}, "data.input_images is 2"),
-    "embedded cameras": ({"cam_embd": {"embedding": "pose"}}, "cam_embd.embedding is pose"),
-    "another network": ({"model": {"name": "TwoUNets"}}, "model.name is TwoUNets"),
-    "no harmonics": ({"model": {"max_sh_degree": 0}}, "model.max_sh_degree is 0"),
-    "a width beyond bounds": ({"model": {"base_dim": 10**6}}, "model.base_dim is 1000000"),
-    "no size": ({"data": {"training_resolution": None}}, "data.training_resolution is None"),
-    "depths the wrong way round": ({"data": {"znear": 5.0}}, "data.znear must be below data.zfar"),
-}
-
-
-@pytest.mark.parametrize("kind", REFUSED)
-def test_other_settings_than_those_of_published_weights_are_refused(kind, tmp_path):
-    settings, message = REFUSED[kind]
-    path = write_published(tmp_path, "hydrants", settings=settings)
-    with pytest.raises(WeightsError, match=rf"config_hydrants.yaml: {re.escape(message)}"):
-        find_published(str(path))
-
-
 class Called:
     """What a checkpoint must not call when it is read."""
 
@@ -85,23 +66,12 @@ def test_files_are_read_as_data_only(tmp_path, monkeypatch):
     torch.save({"model_state_dict": {"ray_dirs": Called()}}, path)
     with pytest.raises(WeightsError, match=r"model_hydrants.pth: damaged, or not plain numbers"):
         read_tensors(path)
-    for content, message in (
-        ("model: !!python/object/apply:pathlib.Path.touch [called]", "not readable as YAML"),
-        ("a: &a [1, 2]\nb: [*a, *a]", "has aliases"),
-        ("just text", "data.training_resolution is None"),
-    ):
-        (tmp_path / "config_hydrants.yaml").write_text(content)
-        with pytest.raises(WeightsError, match=f"config_hydrants.yaml: {message}"):
-            find_published(str(path))
+    harmful = "model: !!python/object/apply:pathlib.Path.touch [called]"
+    (tmp_path / "config_hydrants.yaml").write_text(harmful)
+    with pytest.raises(WeightsError, match=r"config_hydrants.yaml: not readable as YAML"):
+        find_published(str(path))
     assert not Path("called").exists()
     # What else the file holds (the optimizer, `_target_`s) is not looked at.
     described = config("hydrants") | {"opt": {"_target_": "os.system"}}
     (tmp_path / "config_hydrants.yaml").write_text(yaml.safe_dump(described))
     assert find_published(str(path)).model["base_dim"] == 16
-    for content in (b"", path.read_bytes()[:100]):
-        path.write_bytes(content)
-        with pytest.raises(WeightsError, match="damaged"):
-            read_tensors(path)
-    torch.save({"state_dict": {}}, path)
-    with pytest.raises(WeightsError, match="no model_state_dict in it"):
-        read_tensors(path)

@@ -25,8 +25,6 @@ from completesplat.data.validation import (
     BadImage,
     MissingFile,
     OutsidePath,
-    TooFewFrames,
-    UnreadableFile,
 )
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import look_at, project
@@ -339,41 +337,6 @@ def test_photographs_have_the_cameras_of_their_squares(tmp_path):
         read_photographs([tmp_path / "0/images/r_0.png"], path, 32)
 
 
-def of_frame(number: int, **values: object) -> Change:
-    return lambda content: content["frames"][number].update(values)
-
-
-def entry_of_pose(row: int, column: int, value: float) -> Change:
-    return lambda content: content["frames"][3]["transform_matrix"][row].__setitem__(column, value)
-
-
-TRANSFORMS = {
-    "no frames": (lambda c: c.pop("frames"), BadAnnotation, r"transforms\.json: no frames"),
-    "five frames": (lambda c: c["frames"].__delitem__(slice(5, None)), TooFewFrames, "5 frames; .* at least 6"),
-    "NaN in a pose": (entry_of_pose(0, 3, float("nan")), BadAnnotation, r"transforms\.json, frame 3: .* not finite"),
-    "a sheared pose": (entry_of_pose(0, 0, 0.3), BadCamera, r"transforms\.json, frame 3: .* not orthonormal"),
-    "a projective pose": (entry_of_pose(3, 0, 0.1), BadCamera, "frame 3: transform_matrix ends in the row"),
-    "an image twice": (of_frame(2, file_path="./images/r_1"), BadAnnotation, "frame 2: the same image as frame 1"),
-    "an image outside": (of_frame(2, file_path="../r_2.png"), OutsidePath, r"json, frame 2: leads outside"),
-    "a missing mask": (of_frame(4, mask_path="m.png"), MissingFile, r"m\.png, frame 4: no such file"),
-    "no focal length": (lambda c: c.pop("fl_x"), BadAnnotation, "frame 0: neither fl_x nor camera_angle_x"),
-    "a negative focal length": (of_frame(1, fl_y=-2.0), BadCamera, "frame 1: .* must be positive"),
-    "half a circle": (lambda c: (c.pop("fl_x"), c.update(camera_angle_x=3.2)), BadCamera, "field of view of 3.2"),
-    "a centre outside": (of_frame(1, cx=210.0), BadCamera, r"frame 1: principal point \(210, 66\) lies outside"),
-    "a fisheye": (lambda c: c.update(camera_model="OPENCV_FISHEYE"), BadCamera, "OPENCV_FISHEYE is not supported"),
-    "instant-ngp's fisheye": (lambda c: c.update(is_fisheye=True), BadCamera, "is_fisheye is not supported"),
-    "a fourth coefficient": (lambda c: c.update(k4=0.1), BadCamera, "k4 = 0.1 has no meaning for camera model OPENCV"),
-    "no point cloud": (lambda c: c.update(ply_file_path="transforms.json"), UnreadableFile, r"json: not a point cloud"),
-}
-
-
-@pytest.mark.parametrize(("change", "kind", "message"), TRANSFORMS.values(), ids=TRANSFORMS)
-def test_a_bad_transforms_file_is_refused(tmp_path, change, kind, message):
-    path = write_transforms(tmp_path, change=change)
-    with pytest.raises(kind, match=message):
-        read_transforms(path)
-
-
 def turn(path: Path) -> None:
     exif = Image.Exif()
     exif[274] = 3  # Upside down: the size is the same.
@@ -410,10 +373,6 @@ def test_distortion_that_leaves_no_image_is_refused(tmp_path, k1):
         first_sequence(tmp_path)
 
 
-def resized(share: float) -> Callable[[bytes], bytes]:
-    return lambda content: (content + bytes(99))[: int(share * len(content)) + (share > 1)]
-
-
 def replaced(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
     return lambda content: content.replace(old, new)
 
@@ -421,9 +380,6 @@ def replaced(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
 LENS = r"cameras\.\w+: camera model .* is not supported"
 # a fault: (file, change of its content, error, message)
 COLMAP = {
-    f"{share} of {name}": (f"{name}.bin", resized(share), DataError, rf"{name}\.bin: cut off")
-    for name, share in product(("cameras", "images", "points3D"), (0.01, 0.99, 1.01))
-} | {
     "an image outside": ("images.txt", replaced(b"left/3.png", b"../3.png"), OutsidePath, "frame 3: leads outside"),
     "an image twice": ("images.txt", replaced(b"left/3.png", b"left/4.png"), DataError, "frame 4: the same image"),
     "a word for a number": ("points3D.txt", lambda content: b"1 2 three\n", DataError, r"points3D\.txt"),
