@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -15,6 +16,9 @@ from completesplat.rasterizers import Rasterizer
 RATES = {"colors": 0.1, "opacities": 0.4, "scales": 0.12}
 DAMPING = 0.01
 """Adam's epsilon: a Gaussian moves slowly if the image's squared error changes by less than this with its values."""
+WARM_UP = 8  # rounds in which the rates rise, so that a scene that is nearly right moves little
+ENOUGH = 1e-3
+"""Mean squared error (30 dB) at which fitting ends, because more of it makes the sides of a scene worse."""
 SMALLEST = 1e-4  # opacity's distance from 0 and 1
 
 
@@ -29,8 +33,9 @@ def fit_front(
 ) -> Gaussians:
     """Fit colours, opacities and scales of Gaussians [batch], so that each set looks like its image from its camera.
 
-    Each round is a step of Adam on the squared error; the best of all rounds is returned. Gaussians that the image
-    hides stay as they are, and none changes its place. Of `DirectionalGaussians`, the means of the colours change.
+    Each round is a step of Adam on the squared error, until it is `ENOUGH`; the best of all rounds is returned.
+    Gaussians that the image hides stay as they are, and none changes its place. Of `DirectionalGaussians`, the means of
+    the colours change.
 
     This also works where autograd is off, as in `torch.inference_mode()`.
 
@@ -42,24 +47,31 @@ def fit_front(
         # Autograd cannot use tensors that were made in inference mode, but it can use copies.
         fixed, views = gaussians.map(torch.clone).detach(), cameras.map(lambda x: x[:, None].clone())
         image = images[:, None].clone()
-        shown = 1.0 if visible is None else visible[:, None].clone()
+        shown = torch.ones_like(image) if visible is None else visible[:, None].expand_as(image).clone()
         moves = {name: torch.zeros_like(getattr(fixed, name), requires_grad=True) for name in RATES}
         optimizer = torch.optim.Adam(
             [{"params": [moves[name]], "lr": rate} for name, rate in RATES.items()], eps=DAMPING
         )
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(rounds, 1))
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, partial(_rate, rounds=rounds))
         best, least = gaussians, math.inf
         for number in range(rounds + 1):
             moved = _moved(fixed, **moves)
             error = ((rasterizer(moved, views).over(background) - image) * shown).square().sum() / 2
             if error.item() < least:
                 best, least = moved.detach(), error.item()
+            if least <= ENOUGH * shown.sum().item() / 2:
+                break
             if number < rounds:
                 optimizer.zero_grad()
                 torch.autograd.backward(error)
                 optimizer.step()
                 schedule.step()
     return best
+
+
+def _rate(number: int, rounds: int) -> float:
+    """Return the factor of the rates in a round: a linear rise times half a cosine."""
+    return min(1, (number + 1) / WARM_UP) * (1 + math.cos(math.pi * number / max(rounds, 1))) / 2
 
 
 def _moved(gaussians: Gaussians, colors: Tensor, opacities: Tensor, scales: Tensor) -> Gaussians:

@@ -7,7 +7,7 @@ import torch
 
 from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
-from completesplat.rasterizers.front_fitting import fit_front
+from completesplat.rasterizers.front_fitting import ENOUGH, fit_front
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 SIDE = 8
@@ -51,14 +51,14 @@ def fitted(gaussians: Gaussians, image: torch.Tensor, rounds: int, visible: torc
 
 def test_more_rounds_bring_the_render_nearer_to_the_image(image):
     scene = joined(wall(2, 0.2), wall(3, 0.8))
-    errors = [(render(fitted(scene, image, rounds)) - image).square().mean().item() for rounds in (0, 2, 5, 10, 20)]
+    errors = [(render(fitted(scene, image, rounds)) - image).square().mean().item() for rounds in (0, 5, 10, 20, 40)]
     assert errors == sorted(errors, reverse=True)
-    assert errors[-1] < errors[0] / 20
+    assert errors[-1] < errors[0] / 10
 
 
 def test_what_the_front_hides_stays_as_it_is_and_nothing_changes_its_place(image):
     scene = joined(wall(2, 0.2), wall(2.1, 0.8), wall(3, 0.8))
-    result = fitted(scene, image, 5)
+    result = fitted(scene, image, 20)
     moved = (result.colors - scene.colors).abs().amax(-1).view(3, SIDE, SIDE)[:, 1:-1, 1:-1]
     assert moved[0].mean() > 0.2
     assert moved[2].max() < 1e-3
@@ -76,10 +76,10 @@ def test_what_no_pixel_shows_stays_exactly_as_it_is(image):
     assert all(torch.equal(*pair) for pair in zip(vars(result).values(), vars(behind).values(), strict=True))
 
 
-def test_the_best_of_all_rounds_is_returned():
-    """A scene that is right already stays; a step of Adam would move it by rounding."""
+@pytest.mark.parametrize("visible", [None, torch.ones(1, 1, SIDE, SIDE)])
+def test_a_scene_that_is_near_enough_stays(visible):
     scene = wall(2, 0.4)
-    result = fitted(scene, render(scene), 3)
+    result = fitted(scene, render(scene) + ENOUGH**0.5 * 0.99, 3, visible)
     assert all(torch.equal(*pair) for pair in zip(vars(result).values(), vars(scene).values(), strict=True))
 
 
@@ -95,10 +95,10 @@ def test_hidden_pixels_have_no_influence(image):
 
 @pytest.mark.parametrize("name", ["colors", "opacities", "scales"])
 def test_a_value_that_is_wrong_is_found(name):
-    right = replace(wall(2, 0.9)[:, 27:28], opacities=torch.full((1, 1), 0.7))
-    wrong = replace(right, **{name: getattr(right, name) * 0.8})
-    before, after = ((render(x) - render(right)).square().sum() for x in (wrong, fitted(wrong, render(right), 100)))
-    assert after < before / 100
+    right = replace(wall(2, 0.9), opacities=torch.full((1, SIDE**2), 0.7))
+    wrong = replace(right, **{name: getattr(right, name) * 0.25})
+    before, after = ((render(x) - render(right)).square().mean() for x in (wrong, fitted(wrong, render(right), 100)))
+    assert after <= ENOUGH < before / 1.5
 
 
 def test_it_works_where_autograd_is_off(image):
@@ -114,7 +114,7 @@ def test_of_directional_colors_the_means_move_and_the_photo_is_met(image: torch.
     plain = wall(2, 0.5)
     slopes = 0.1 * torch.randn(1, plain.count, 3, 3, generator=torch.Generator().manual_seed(2))
     before = DirectionalGaussians(**vars(replace(plain, colors=plain.colors - 0.1)), harmonics=slopes)
-    after = fitted(before, image, rounds=20)
+    after = fitted(before, image, rounds=100)
     assert isinstance(after, DirectionalGaussians)
     assert torch.equal(after.harmonics, slopes)
-    assert (render(after) - image).abs().max() < 0.1
+    assert (render(after) - image).square().mean() <= ENOUGH * 1.01
