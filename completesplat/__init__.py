@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # parallel regions. Beside another busy process they keep the threads that they wait for off the cores. If none
 # spins, regions on free cores begin late. torch reads this when it is loaded; what a user has set stays.
 if "torch" not in sys.modules:
-    os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+    os.environ.setdefault("GOMP_SPINCOUNT", "1500")
 
 _PLACES = {"CompleteSplat": "generator", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
 _PLACES |= {"compose": "settings.composition", "instantiate": "commands.fit", "__version__": "version"}

@@ -100,6 +100,6 @@ class DirectionalGaussians(Gaussians):
         return super().finite() & self.harmonics.isfinite().flatten(-2).all(-1)
 
 
-def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
+def merge_gaussians(sets: Sequence[Gaussians]) -> Gaussians:
     """Join sets of equal batch shape into one."""
     return tensors.concatenate(sets, axis=sets[0].opacities.ndim - 1)

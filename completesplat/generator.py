@@ -15,13 +15,13 @@ from torch import Tensor
 
 from completesplat.autoreconstructor.encoder import Images
 from completesplat.autoreconstructor.model import DepthRange, VariationalAutoReconstructor
-from completesplat.baselines.splatter_image.model import PublishedOneAnswer, is_published
+from completesplat.baselines.splatter_image.model import PublishedModel, is_published
 from completesplat.diffusion.guidance import allowed_skip_weight
-from completesplat.diffusion.sampling import Sampler, draw_noise, in_parts, with_forward_process
+from completesplat.diffusion.sampling import PART, Sampler, draw_noise, in_parts, one_thread_each, with_forward_process
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.parts import PartConfig, build, check_architecture, read_weights, saved
+from completesplat.parts import PartConfig, build, check_architecture, read_weights, stored_config
 from completesplat.run_configs import read_run
 from completesplat.scene import Views
 from completesplat.scene_model import SceneModel, Visible
@@ -128,7 +128,7 @@ class CompleteSplat(SceneModel):
             steps: denoising steps; by default the sampler's number.
             seed: seed of all noise, or one for each image, whose samples then do not depend on the other images.
             visible: 0 where an image is hidden; hidden pixels have no influence.
-            color_fits: rounds in which colours are fitted to the image (`fit_colors`); 0 in the paper.
+            color_fits: rounds of fitting to the image (`fit_front`); 0 in the paper.
             batch: the largest number of latents at a time, which changes only the rounding of float32; all by default,
                 or fewer if a GPU's memory does not suffice.
             on_step: called after each denoiser call of each batch with its number, the timestep, the estimated scenes.
@@ -138,21 +138,25 @@ class CompleteSplat(SceneModel):
         """
         weight = allowed_skip_weight(skip_weight, visible)
         images = images if visible is None else images * visible
-        conditioning = self.conditioning(images)
-        stage1 = self.autoreconstructor
-        features = stage1.encoder.features(images * 2 - 1, stage1.reconstructor.feature_levels) if weight else []
-        shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
-        noise = draw_noise(len(images), samples, shape, seed).to(images.device)
-        image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
-        decode = partial(self._decode, image_of, features, weight, cameras, depth_range)
+        with one_thread_each(self.denoiser, images.device) as threads:
+            conditioning = self.conditioning(images)
+            stage1 = self.autoreconstructor
+            features = stage1.encoder.features(images * 2 - 1, stage1.reconstructor.feature_levels) if weight else []
+            shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
+            noise = draw_noise(len(images), samples, shape, seed).to(images.device)
+            image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
+            decode = partial(self._decode, image_of, features, weight, cameras, depth_range)
 
-        def draw(part: slice) -> Tensor:
-            watch = None if on_step is None else lambda step, level, latent: on_step(step, level, decode(latent, part))
-            return self.sampler(self.denoiser, noise[part], conditioning[image_of[part]], guidance_weight, steps, watch)
+            def draw(part: slice) -> Tensor:
+                watch = None if on_step is None else lambda step, t, latent: on_step(step, t, decode(latent, part))
+                inputs = noise[part], conditioning[image_of[part]]
+                return self.sampler(self.denoiser, *inputs, guidance_weight, steps, watch)
 
-        # Sample first, then decode: if a GPU's memory does not suffice to decode a part, its latents are not lost.
-        latents = torch.cat(in_parts(draw, len(noise), batch))
-        scenes = concatenate(in_parts(lambda part: decode(latents[part], part), len(noise), batch))
+            # Sample first, then decode: if a GPU's memory does not suffice to decode a part, its latents are not lost.
+            most = batch or (PART if threads else None)
+            parts = partial(in_parts, count=len(noise), most=most, threads=1 if on_step else threads)
+            latents = torch.cat(parts(draw))
+            scenes = concatenate(parts(lambda part: decode(latents[part], part)))
         return self.fitted(scenes, images, cameras, visible, color_fits)
 
     def _decode(
@@ -174,7 +178,7 @@ class CompleteSplat(SceneModel):
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Use another sampler from now on, with the noise schedule and prediction type of training."""
-        config = saved(with_forward_process(sampler, self.architecture["sampler"]))
+        config = stored_config(with_forward_process(sampler, self.architecture["sampler"]))
         check_architecture({**self.architecture, "sampler": config})
         self.sampler = build(config)
         self.architecture["sampler"] = config
@@ -182,11 +186,11 @@ class CompleteSplat(SceneModel):
     @staticmethod
     @in_float32()
     def from_pretrained(path: Path | str) -> SceneModel:
-        """Load what `save_pretrained` wrote or a run trained, in evaluation mode on the CPU; stage 1 is a `OneAnswer`.
+        """Load a saved or trained model in evaluation mode on the CPU; stage 1 gives a `DeterministicModel`.
 
         Args:
             path: a name of shipped weights, a folder of weights or of a run, a checkpoint, or an id on the Hugging Face
-                hub (`locate`). Published weights of Splatter Image (`is_published`) give a `PublishedOneAnswer`.
+                hub (`locate`). Published weights of Splatter Image (`is_published`) give a `PublishedModel`.
 
         Raises:
             WeightsError: files are missing, unreadable, changed, not finite, do not belong together, or name parts that
@@ -204,7 +208,7 @@ class CompleteSplat(SceneModel):
         return model.eval()
 
 
-class OneAnswer(SceneModel):
+class DeterministicModel(SceneModel):
     """Model of one pass from a photo to its scene: stage 1 at its posterior's mode, or the baseline Splatter Image.
 
     Args:
@@ -226,7 +230,7 @@ def _architecture(
     parts: Mapping[str, PartConfig], image_size: int, training: Mapping[str, object] | None
 ) -> dict[str, Any]:
     """Return a model's config as weights store it; raise WeightsError for parts that weights may not name."""
-    config: dict[str, Any] = {name: saved(part) for name, part in parts.items()} | {"image_size": image_size}
+    config: dict[str, Any] = {name: stored_config(part) for name, part in parts.items()} | {"image_size": image_size}
     config |= {} if training is None else {"training": dict(training)}
     check_architecture(config)
     return config
@@ -234,10 +238,10 @@ def _architecture(
 
 def _opened(path: Path | str) -> SceneModel:
     if is_published(path):
-        return PublishedOneAnswer(str(path))
+        return PublishedModel(str(path))
     file = locate(path)
     architecture, tensors = (read_weights if file.name == WEIGHTS_FILE else read_run)(file)
-    model: SceneModel = (OneAnswer if "network" in architecture else CompleteSplat)(**architecture)
+    model: SceneModel = (DeterministicModel if "network" in architecture else CompleteSplat)(**architecture)
     if (difference := mismatch(model.state_dict(), tensors)) is not None:
         raise ValueError(difference)
     model.load_state_dict(tensors)

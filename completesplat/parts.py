@@ -34,7 +34,7 @@ from completesplat.diffusion.denoiser import Denoiser, TextlessStableDiffusion
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import WeightsError
 from completesplat.files import SHORT, printable
-from completesplat.settings.schema import Entries, Range, Share, hints_of, refused, start_weights
+from completesplat.settings.schema import Entries, Range, Share, hints_of, start_weights, violations
 from completesplat.splatter_image import Parameterization
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, read_small
 
@@ -72,10 +72,12 @@ class TrainingImages(TypedDict, total=False):
     picture_std: Annotated[Sequence[Annotated[float, Range(1e-6, 1)]], Entries(8, 8)]
 
 
-# Settings of models: those of `CompleteSplat`, and those of `OneAnswer`. All but `training` are needed.
-COMMON = {"image_size": Annotated[int, Range(8, 1024)], "training": TrainingImages}
-DRAWING = dict.fromkeys(("autoreconstructor", "conditioning", "denoiser", "sampler"), PartConfig) | COMMON
-ONE_ANSWER = {"network": PartConfig} | COMMON
+# Settings of models: those of `CompleteSplat`, and those of `DeterministicModel`. All but `training` are needed.
+COMMON_SETTINGS = {"image_size": Annotated[int, Range(8, 1024)], "training": TrainingImages}
+SAMPLING_SETTINGS = (
+    dict.fromkeys(("autoreconstructor", "conditioning", "denoiser", "sampler"), PartConfig) | COMMON_SETTINGS
+)
+DETERMINISTIC_SETTINGS = {"network": PartConfig} | COMMON_SETTINGS
 
 
 class SchedulerSettings(TypedDict, total=False):
@@ -139,24 +141,24 @@ def read_weights(file: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     except (ValueError, RecursionError) as error:
         raise WeightsError(f"{path}: not readable as JSON ({error})") from error
     check_architecture(architecture, path)
-    architecture, tensors = saved(architecture), load_file(file)
+    architecture, tensors = stored_config(architecture), load_file(file)
     check_sizes(architecture, tensors, (WEIGHTS_FILE, CONFIG_FILE))
     return architecture, tensors
 
 
-def saved(part: Any) -> Any:
+def stored_config(part: Any) -> Any:
     """Return a part's config as weights store it: classes by name, and without weights that training started from."""
     if not isinstance(part, Mapping):
         return part
     kind = class_of(part)
-    settings = {name: None if name in start_weights(kind) else saved(value) for name, value in part.items()}
+    settings = {name: None if name in start_weights(kind) else stored_config(value) for name, value in part.items()}
     return settings if kind is None else settings | {"_target_": kind.__name__}
 
 
 def check_architecture(architecture: object, file: Path | None = None) -> None:
     """Raise WeightsError, naming `file`, for the first setting that `CHOICES` or a signature refuses."""
     settings = architecture if isinstance(architecture, Mapping) else {}
-    hints = ONE_ANSWER if "network" in settings else DRAWING
+    hints = DETERMINISTIC_SETTINGS if "network" in settings else SAMPLING_SETTINGS
     try:
         if not hints.keys() - {"training"} <= settings.keys() <= hints.keys():
             raise WeightsError(f"a model's settings are {', '.join(hints)}")
@@ -175,7 +177,7 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
             _check_part(key, value, CHOICES[name])
         elif isinstance(hint, type) and is_typeddict(hint) and isinstance(value, Mapping):
             _check_settings(key, hints_of(hint), value)
-        elif name not in CHOICES and (refusals := refused(hint, value)):
+        elif name not in CHOICES and (refusals := violations(hint, value)):
             raise WeightsError(f"{key}={printable(value, SHORT)}: {refusals[0].reason}")
 
 

@@ -37,7 +37,7 @@ class Element(NamedTuple):
         return np.dtype([(name, order + kind) for name, kind in self.fields.items()])
 
 
-def header(count: int, properties: Sequence[tuple[str, str]], comments: Sequence[str] = ()) -> bytes:
+def vertex_header(count: int, properties: Sequence[tuple[str, str]], comments: Sequence[str] = ()) -> bytes:
     """Return the header of a binary little-endian file that has vertices only.
 
     Args:

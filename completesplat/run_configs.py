@@ -21,7 +21,7 @@ from yaml import YAMLError
 
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import SHORT, printable
-from completesplat.parts import check_architecture, check_sizes, saved
+from completesplat.parts import check_architecture, check_sizes, stored_config
 from completesplat.scene_model import camera_tensors
 from completesplat.settings.checks import (
     check_image_size,
@@ -101,7 +101,7 @@ def read_run(checkpoint: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     architecture = {key: x for key, x in settings.items() if key not in ("_target_", "_recursive_")}
     if one_answer:
         architecture = {"network": part, "image_size": config["data"].get("image_size")}
-    architecture = saved(architecture)
+    architecture = stored_config(architecture)
     check_architecture(architecture, path)
     contents, name = read_checkpoint(checkpoint), "network." if one_answer else ""
     tensors = {name + k.removeprefix(prefix): x for k, x in contents["state_dict"].items() if k.startswith(prefix)}

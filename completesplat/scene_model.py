@@ -19,7 +19,7 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import make_folder, write_bytes, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
-from completesplat.rasterizers.color_fitting import fit_colors
+from completesplat.rasterizers.front_fitting import fit_front
 from completesplat.rasterizers.selection import auto
 from completesplat.scene import Views
 from completesplat.settings.schema import Natural, check_settings
@@ -33,7 +33,7 @@ _rasterizer = cache(auto)
 
 
 class SceneModel(nn.Module):
-    """Base class of models from photos to scenes: `CompleteSplat`, which samples, `OneAnswer`, `PublishedOneAnswer`.
+    """Base class of models from photos to scenes: `CompleteSplat` (samples), `DeterministicModel`, `PublishedModel`.
 
     Args:
         architecture: the config that is written beside the weights; it has `image_size`.
@@ -86,7 +86,7 @@ class SceneModel(nn.Module):
 
         Args:
             visible: 0 where an image is hidden; hidden pixels have no influence.
-            color_fits: rounds in which colours are fitted to the image (`fit_colors`); 0 in the paper.
+            color_fits: rounds of fitting to the image (`fit_front`); 0 in the paper.
             **settings: sampling options of `CompleteSplat.generate`; they have no effect.
 
         Raises:
@@ -103,7 +103,7 @@ class SceneModel(nn.Module):
     def fitted(
         self, scenes: Gaussians, images: Images, cameras: Cameras, visible: Visible | None, color_fits: int
     ) -> Gaussians:
-        """Return scenes [batch * samples] with colours fitted to what is visible of their images."""
+        """Return scenes [batch * samples] fitted to what is visible of their images."""
         if not color_fits:
             return scenes
         background, parts = 0.5 if self.background is None else self.background, []
@@ -111,7 +111,7 @@ class SceneModel(nn.Module):
             own = slice(j := i * len(images) // len(scenes.means), j + 1)
             shown = None if visible is None else visible[own]
             image = cameras[own], images[own]
-            parts.append(fit_colors(scenes[i : i + 1], *image, _rasterizer(), color_fits, background, shown))
+            parts.append(fit_front(scenes[i : i + 1], *image, _rasterizer(), color_fits, background, shown))
         return concatenate(parts)
 
     @property
@@ -252,7 +252,8 @@ def distance_to_training(photograph: Photograph, architecture: Mapping[str, Any]
 def distances_to_shipped(image: ImageLike, remove_background: bool = False) -> dict[str, float]:
     """Return the distances of an image from the training images of the weights in the package, the nearest first.
 
-    They depend on the resolution, so the image, which is read once, is resized for each model.
+    They depend on the resolution, so the image, which is read once, is resized for each model. Weights of objects on
+    one background are left out if the image's border does not show it.
 
     Raises:
         CompleteSplatError: as `read_photograph`.
@@ -262,9 +263,17 @@ def distances_to_shipped(image: ImageLike, remove_background: bool = False) -> d
     square = read_photograph(image, largest, remove_background=remove_background).image
     distances: dict[str, float] = {}
     for name, config in configs.items():
+        if not _is_border(config["training"].get("background"), square):
+            continue
         distance = distance_to_training(read_photograph(square, config["image_size"]), config)
         distances |= {} if distance is None else {name: distance}
     return dict(sorted(distances.items(), key=itemgetter(1)))
+
+
+def _is_border(background: float | None, square: Float[Tensor, "3 size size"]) -> bool:
+    """Return whether at least half of an image's border has this grey value, up to 0.1; None: any."""
+    border = torch.cat([square[:, [0, -1]].flatten(1), square[:, :, [0, -1]].flatten(1)], 1)
+    return background is None or ((border - background).abs().amax(0) < 0.1).float().mean().item() >= 0.5
 
 
 def camera_tensors(camera: Mapping[str, Any]) -> dict[str, Tensor]:

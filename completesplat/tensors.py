@@ -42,8 +42,12 @@ class TensorDataclass:
         return replace(self, **{field.name: apply(getattr(self, field.name)) for field in fields(self)})
 
     def to(self: T, *args: Any, **kwargs: Any) -> T:
-        """Move every tensor to a device or dtype (`non_blocking`); integer and boolean tensors keep their dtype."""
+        """Move every tensor to a device or dtype (`non_blocking`); integer and boolean tensors keep their dtype.
+
+        Copies to a GPU do not block: Lightning asks for that only if a batch is a plain tensor.
+        """
         device, dtype, non_blocking, _ = torch._C._nn._parse_to(*args, **kwargs)
+        non_blocking = non_blocking or (device is not None and device.type == "cuda")
         return self.map(lambda x: x.to(device, dtype if x.is_floating_point() else x.dtype, non_blocking))
 
     def pin_memory(self: T) -> T:

@@ -216,19 +216,39 @@ class Finished(NamedTuple):
     err: str
 
 
+class Command(NamedTuple):
+    """`completesplat`, run in this process."""
+
+    run: Callable[..., Finished]
+
+    def __call__(self, *arguments: object) -> Finished:
+        return self.run(*arguments)
+
+    def succeeds(self, *arguments: object) -> Finished:
+        finished = self.run(*arguments)
+        assert finished.status == 0, finished.err
+        return finished
+
+    def refuses(self, *arguments: object) -> str:
+        """Check that a command is refused in one line with status 2, and return the line without `error: `."""
+        finished = self.run(*arguments)
+        assert (finished.status, finished.err.count("\n"), finished.err[:7]) == (2, 1, "error: "), finished.err
+        return finished.err[7:-1]
+
+
 @pytest.fixture
-def command(capfd, monkeypatch, tmp_path):
-    """Run `completesplat` in this process, from an empty folder."""
+def command(capfd, monkeypatch, tmp_path) -> Command:
+    """The command, run from an empty folder."""
     from support import call
 
     monkeypatch.chdir(tmp_path)
 
-    def run(*arguments: str) -> Finished:
+    def run(*arguments: object) -> Finished:
         capfd.readouterr()
         status = call(monkeypatch, *arguments)
         return Finished(status, *capfd.readouterr())
 
-    return run
+    return Command(run)
 
 
 @pytest.fixture

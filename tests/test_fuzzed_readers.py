@@ -4,19 +4,19 @@
 Files that broke a reader are added to its test as `cases`.
 """
 
-import copy
 import gzip
 import io
 import json
 import shutil
 from contextlib import suppress
 from functools import partial
+from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET
-from co3d_trees import write_tree as write_category
 from fuzzing import (
     CLEAR,
     damaged,
@@ -32,18 +32,15 @@ from fuzzing import (
 )
 from hypothesis import strategies as st
 from PIL import Image, ImageCms
-from realestate10k_trees import make_clip, write_chunk_form
+from readers import READERS, put, read_frames
 from splats_of_others import FILES
-from support import some_gaussians, write_capture
+from support import some_gaussians
 
 from completesplat.data.captures.capture import CapturedFrame, Lens
-from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.images.crop import Square
 from completesplat.data.images.exif import ORIENTATION
-from completesplat.data.images.files import decode, read_depth, stored_size
+from completesplat.data.images.files import decode_image, read_depth, stored_size
 from completesplat.data.images.photograph import read_photograph
-from completesplat.data.realestate10k.clips import ChunkedClips
 from completesplat.data.validation import read_points
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import write_splat
@@ -104,7 +101,7 @@ def test_images(tmp_path):
 
     def read_images(content: bytes) -> None:
         path.write_bytes(content)
-        calls = [partial(decode, path, "a", mode) for mode in ("RGB", "L")]
+        calls = [partial(decode_image, path, "a", mode) for mode in ("RGB", "L")]
         calls += [
             partial(stored_size, path, "a"),
             partial(read_depth, path, 1.0),
@@ -174,56 +171,65 @@ def test_splats_of_others(tmp_path):
     fuzz(of(".splat") | of(".spz"), read_splats, examples=60)
 
 
-def test_annotations(tmp_path):
-    category = write_category(tmp_path, {"a": 3, "b": 2, "c": 2}, {"train": ["a"], "val": ["b"], "test": ["c"]})
-    files = {name: (category / name).read_bytes() for name in (FRAMES, SEQUENCES, SET_LIST)}
-    packed = {name: name.endswith(".jgz") for name in files}
-    contents = {
-        name: json.loads(gzip.decompress(content) if packed[name] else content) for name, content in files.items()
-    }
+FILES_OF = {
+    "co3d": [f"{CATEGORY}/{name}" for name in (FRAMES, SEQUENCES, SET_LIST)],
+    "chunks": ["train/index.json", "train/000000.torch"],
+    "transforms": ["transforms.json"],
+    "colmap": [f"sparse/0/{name}.bin" for name in ("cameras", "frames", "images", "points3D", "rigs")],
+}
+LENS = {"k1": 0.01, "k2": 0.0, "p1": 0, "p2": 0, "camera_model": "OPENCV", "ply_file_path": "points.ply"}
 
-    def read_annotations(changed: tuple[str, bytes]) -> None:
+
+def read_annotations(folder: Path) -> None:
+    """Read a category with and without lists, both for training and for testing."""
+    for subset, split in product((SUBSET, None), ("train", "test")):
+        with suppress(CompleteSplatError):
+            data = CO3DDataModule(str(folder), CATEGORY, subset, image_size=8, batch_size=2, targets=1)
+            read_frames(data.source(split))
+
+
+def changed(name: str, content: bytes) -> st.SearchStrategy[bytes]:
+    """Damage a file's bytes, or the content of a format and then write it rightly."""
+    if name.endswith(".torch"):
+        return damaged([content]) | damaged_parts([zip_parts(content)], zip_of)
+    if name.endswith(".bin"):
+        return damaged([content])
+    packed = name.endswith(".jgz")
+    value = json.loads(gzip.decompress(content) if packed else content)
+    seeds = [value, {**value, **LENS}] if name == "transforms.json" else [value]
+    whole = damaged_json(seeds).map(json_bytes)
+    return (whole.map(gzipped) if packed else whole) | damaged([content])
+
+
+def claimed(files: dict[str, bytes], name: str, place: int) -> tuple[str, bytes]:
+    """Return a file whose count at `place` claims the largest possible number of entries."""
+    return name, files[name][:place] + b"\xff" * 8 + files[name][place + 8 :]
+
+
+@pytest.mark.parametrize("reader", FILES_OF)
+def test_inputs_of_several_files(reader, tmp_path):
+    READERS[reader].write(tmp_path)
+    if reader == "transforms":
+        write_ply(tmp_path / "points.ply", some_gaussians(1)[0])
+        put("transforms.json", "frames.0.mask_path", "frame1.png")(tmp_path)
+    files = {name: (tmp_path / name).read_bytes() for name in FILES_OF[reader]}
+    read = read_annotations if reader == "co3d" else READERS[reader].read
+
+    def read_files(change: tuple[str, bytes]) -> None:
         for name, content in files.items():
-            (category / name).write_bytes(changed[1] if changed[0] == name else content)
-        for subset in (SUBSET, None):
-            data = CO3DDataModule(str(tmp_path), CATEGORY, subset, image_size=8, batch_size=2, targets=1)
-            for split in ("train", "test"):
-                with suppress(CompleteSplatError):
-                    source = data.source(split)
-                    for name in source.names:
-                        each(partial(source.read, name))
-                        each(lambda name=name, source=source: source.read(name).read(0))
+            (tmp_path / name).write_bytes(change[1] if change[0] == name else content)
+        read(tmp_path)
 
-    def of(name: str) -> st.SearchStrategy[tuple[str, bytes]]:
-        whole = damaged_json([contents[name]]).map(json_bytes)
-        changed = (whole.map(gzipped) if packed[name] else whole) | damaged([files[name]])
-        return st.tuples(st.just(name), changed)
-
-    huge = copy.deepcopy(contents[FRAMES])
-    huge[0]["image"]["size"] = [10**400, 24]
-    cases = [(FRAMES, gzipped(json_bytes(huge)))]
-    fuzz(st.one_of(*map(of, files)), read_annotations, cases, examples=20)
-
-
-def test_chunks(tmp_path):
-    write_chunk_form(tmp_path, [make_clip("a", frames=3), make_clip("b", frames=2)])
-    index, chunk = tmp_path / "index.json", tmp_path / "000000.torch"
-    table, stored = json.loads(index.read_text()), chunk.read_bytes()
-
-    def read_chunks(changed: tuple[bytes, bytes]) -> None:
-        index.write_bytes(changed[0])
-        chunk.write_bytes(changed[1])
-        clips = ChunkedClips(tmp_path)
-        for key in clips.keys:
-            with suppress(CompleteSplatError):
-                clip = clips.clip(key)
-                clip.read(0, Square(0, 0, 18), 8)
-
-    whole = st.just(json_bytes(table))
-    chunks = damaged([stored]) | damaged_parts([zip_parts(stored)], zip_of)
-    indices = (damaged_json([table]).map(json_bytes) | damaged([json_bytes(table)])).map(lambda text: (text, stored))
-    cases = [(json_bytes({"a": "x" * 5000}), stored)]
-    fuzz(st.tuples(whole, chunks) | indices, read_chunks, cases, examples=60)
+    read_files(("", b""))
+    cases = []
+    if reader == "chunks":
+        cases = [("train/index.json", json_bytes({"a": "x" * 5000}))]
+    elif reader == "colmap":
+        images = "sparse/0/images.bin"
+        cases = [claimed(files, "sparse/0/points3D.bin", 8 + 43), *(claimed(files, name, 0) for name in files)]
+        cases += [(images, files[images].replace(b"frame3", b"\x80rame3"))]
+    changes = (st.tuples(st.just(name), changed(name, content)) for name, content in files.items())
+    fuzz(st.one_of(*changes), read_files, cases, examples=20 if reader == "co3d" else 60)
 
 
 def test_weights(tiny_weights, tmp_path):
@@ -236,63 +242,3 @@ def test_weights(tiny_weights, tmp_path):
         CompleteSplat.from_pretrained(folder)
 
     fuzz(damaged_json([json.loads(text)]).map(json_bytes) | damaged([text]), read_weights, examples=30)
-
-
-def read_all(capture) -> None:
-    """Read every frame of a capture."""
-    source = CaptureDataModule(str(capture), image_size=8).source("train")
-    for name in source.names:
-        sequence = source.read(name)
-        for index in range(len(sequence.frames)):
-            sequence.read(index)
-
-
-def test_transforms(tmp_path):
-    capture = tmp_path / "capture"
-    write_capture(capture, 6)
-    path = capture / "transforms.json"
-    write_ply(capture / "points.ply", some_gaussians(1)[0])
-    content = json.loads(path.read_text())
-    lens = {"fl_x": 20.0, "fl_y": 21.0, "cx": 8.0, "cy": 6.0, "w": 16, "h": 12, "k1": 0.01, "k2": 0.0, "p1": 0, "p2": 0}
-    lens |= {"camera_model": "OPENCV", "ply_file_path": "points.ply"}
-    content["frames"][0] |= {"mask_path": "frame1.png", "k3": 0.001}
-
-    def read_transforms(changed: bytes) -> None:
-        path.write_bytes(changed)
-        read_all(capture)
-
-    fuzz(damaged_json([content, content | lens]).map(json_bytes) | damaged([json_bytes(content)]), read_transforms)
-
-
-def test_colmap(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
-    write_capture(tmp_path / "images", 6)
-    model = tmp_path / "sparse/0"
-    model.mkdir(parents=True)
-    reconstruction = pycolmap.Reconstruction()
-    camera = pycolmap.Camera.create_from_model_name(1, "OPENCV", 20.0, 16, 12)
-    reconstruction.add_camera_with_trivial_rig(camera)
-    for number in range(6):
-        image = pycolmap.Image()
-        image.name, image.camera_id, image.image_id = f"frame{number}.png", 1, number + 1
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), [0, 0, number]))
-    for number in range(3):
-        reconstruction.add_point3D(np.full(3, float(number)), pycolmap.Track(), np.full(3, 9, dtype=np.uint8))
-    reconstruction.write_binary(str(model))
-    files = {path.name: path.read_bytes() for path in model.iterdir()}
-
-    def read_models(changed: tuple[str, bytes]) -> None:
-        for name, content in files.items():
-            (model / name).write_bytes(changed[1] if changed[0] == name else content)
-        read_all(tmp_path)
-
-    def claimed(name: str, place: int, size: int) -> tuple[str, bytes]:
-        """Return a file whose count of `size` bytes at `place` claims the largest possible number of entries."""
-        return name, files[name][:place] + b"\xff" * size + files[name][place + size :]
-
-    read_models(("", b""))
-    tracks, records = claimed("points3D.bin", 8 + 43, 8), [claimed(name, 0, 8) for name in files]
-    cases = [tracks, *records]
-    cases += [("images.bin", files["images.bin"].replace(b"frame3", b"\x80rame3"))]
-    changed = st.sampled_from(sorted(files)).flatmap(lambda name: st.tuples(st.just(name), damaged([files[name]])))
-    fuzz(changed, read_models, cases)

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.gaussians import Gaussians, merge_gaussians
 
 FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
 
@@ -61,7 +61,7 @@ def test_transforms_compose_and_one_matrix_serves_a_batch() -> None:
 
 def test_concatenation_keeps_all_gaussians_in_order() -> None:
     sets = [make(2, count=n, seed=n) for n in (4, 0, 7)]
-    joined = concatenate(sets)
+    joined = merge_gaussians(sets)
     assert joined.count == 11
     for name in FIELDS:
         assert torch.equal(getattr(joined, name)[:, :4], getattr(sets[0], name))

@@ -55,15 +55,15 @@ def test_what_is_saved_is_loaded_bit_for_bit(model, folder, photo):
         assert same(ours, theirs)
 
 
-def test_colors_are_fitted_to_the_visible_part_of_the_image_sample_by_sample(model, photo):
+def test_samples_are_fitted_to_the_visible_part_of_the_image_one_by_one(model, photo):
     visible = torch.ones(1, model.image_size, model.image_size)
     visible[..., : model.image_size // 2] = 0
     draw = partial(model, photo, samples=3, steps=1, skip_weight=0.0)
     plain, fitted, parts = draw(), draw(color_fits=2), draw(color_fits=2, batch=2)
     for one, other, part in zip(plain, fitted, parts, strict=True):
-        assert same(replace(one, colors=other.colors), other)
+        assert torch.equal(one.means, other.means)
         assert (one.colors - other.colors).abs().max() > 0.01
-        torch.testing.assert_close(other.colors, part.colors, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(other.colors, part.colors, atol=1e-3, rtol=1e-3)
     assert not same(fitted[0], draw(visible=visible, color_fits=2)[0])
 
 
@@ -92,6 +92,24 @@ def test_one_model_draws_in_four_threads_what_it_draws_one_after_the_other(model
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(draw, range(4)))
     assert all(same(*pair) for scenes in zip(alone, together, strict=True) for pair in zip(*scenes, strict=True))
+
+
+@pytest.fixture
+def threads():
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("mixed", [False, True], ids=["float32", "bfloat16"])
+def test_any_number_of_threads_draws_the_same_scenes_bit_for_bit_and_stays_set(model, photo, threads, mixed):
+    drawn = []
+    for number in (1, 2, 3):
+        threads(number)
+        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+            drawn.append(model(photo, samples=10, steps=2))
+        assert torch.get_num_threads() == number
+    assert all(same(*pair) for others in drawn[1:] for pair in zip(drawn[0], others, strict=True))
 
 
 def test_another_default_type_of_torch_changes_nothing_and_weights_of_another_type_are_refused(folder, photo):
@@ -179,13 +197,13 @@ def test_an_image_is_encoded_once_for_all_samples_and_steps_and_only_as_far_as_s
 ):
     actual = calls_of(model, samples=2, steps=1, skip_weight=0.0)
     assert actual == {"conditioning": [1], "denoiser": [2], "reconstructor": [2]}
-    actual = calls_of(model, samples=20, steps=4, guidance_weight=guidance_weight)
+    actual = calls_of(model, samples=20, batch=20, steps=4, guidance_weight=guidance_weight)
     once = {"conditioning": [1], "first level": [1], "skip": [20], "reconstructor": [20]}
     assert actual == {**once, "denoiser": [20 * passes] * 4}
 
 
 def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(model, photo, monkeypatch):
-    whole, decode, sizes = model(photo, samples=5, steps=2), model._decode, []
+    whole, decode, sizes = model(photo, samples=5, batch=5, steps=2), model._decode, []
 
     def small(*inputs):
         sizes.append(len(inputs[-2]))
@@ -196,7 +214,7 @@ def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(mo
     monkeypatch.setattr(model, "_decode", small)
     denoised = []
     hook = model.denoiser.register_forward_pre_hook(lambda _, inputs: denoised.append(len(inputs[0])))
-    parts = model(photo, samples=5, steps=2)
+    parts = model(photo, samples=5, batch=5, steps=2)
     hook.remove()
     assert (denoised, sizes) == ([5, 5], [5, 3, 2, 2, 1])
     for one, other in zip(whole, parts, strict=True):

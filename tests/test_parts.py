@@ -15,7 +15,7 @@ from support import compose_config
 from completesplat.errors import WeightsError
 from completesplat.generator import CompleteSplat
 from completesplat.parts import CHOICES, PARTS, check_architecture, settings_of
-from completesplat.settings.schema import refused
+from completesplat.settings.schema import violations
 from completesplat.weights import CONFIG_FILE, LARGEST_TEXT, SHIPPED, SUMS_FILE
 
 ENCODER = "autoreconstructor.encoder"
@@ -177,7 +177,7 @@ def test_any_value_in_any_place_is_refused_as_weights_are_or_is_of_the_settings_
 def test_every_setting_of_every_class_is_checked():
     for kind in PARTS.values():
         for name, hint in settings_of(kind).items():
-            assert name in CHOICES or refused(hint, object()), (kind, name)
+            assert name in CHOICES or violations(hint, object()), (kind, name)
 
 
 @pytest.mark.parametrize(

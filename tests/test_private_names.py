@@ -12,65 +12,47 @@ ROOT = Path(completesplat.__file__).parent
 PUBLIC = {"_asdict", "_replace", "_exit", "_target_", "_global_", "_self_", "_partial_", "_recursive_"}
 FOR_BLENDER = "data/rendered/_scene_"  # Blender runs these files beside each other
 FAKE = "torch._subclasses.fake_tensor"
+LOADERS = "torch.utils.data.dataloader"
+SIGNALS = "lightning.pytorch.trainer.connectors.signal_connector"
+ATTENTION = "_scaled_dot_product_flash_attention_for_cpu"
+WAITING = "its handlers wait for other processes within a step; without it, Lightning's own way"
+NO_FAKES = "fake tensors cannot be had publicly"
 NO_TREES = "torch has no public functions for nested containers"
 NO_ORIGIN = "OmegaConf does not tell publicly to which setting a setting refers"
 NO_FEATURES = "the library gives the last features only, the loss needs those of each stage"
 ONE_OF_TORCH = "torch.nn.Module.to reads its arguments with it; a copy of its rules would go wrong first"
 DURING_JOB = "processes that Lightning starts repeat the program's arguments; put back afterwards"
 
+# File, names: reason.
 REASONS = {
-    (
-        "baselines/autodecoder.py",
-        "_load_from_state_dict",
-    ): "makes room for a checkpoint's codes before they are compared",
-    ("commands/__init__.py", "logging.raiseExceptions"): "documented: no reports of logging's own errors",
-    ("commands/__init__.py", "sys.argv"): DURING_JOB,
-    ("commands/imports.py", "_disable_dynamo"): "diffusers' functions stay excluded from compilation, as by torch's",
-    ("commands/imports.py", "importlib.metadata.packages_distributions"): "diffusers reads all packages when imported",
-    ("commands/jobs.py", "sys.argv"): DURING_JOB,
-    (
-        "data/loading/loader.py",
-        "torch.utils.data.dataloader._BaseDataLoaderIter",
-    ): "the type of `_iterator`, by which Lightning ends workers",
-    ("data/validation/processes.py", "_processes"): "executors cannot end workers before Python 3.14",
-    ("losses/efficientnet.py", "_blocks"): NO_FEATURES,
-    ("losses/efficientnet.py", "_bn0"): NO_FEATURES,
-    ("losses/efficientnet.py", "_conv_stem"): NO_FEATURES,
-    ("losses/efficientnet.py", "_swish"): NO_FEATURES,
-    ("settings/checks.py", "_get_node"): NO_ORIGIN,
-    ("settings/checks.py", "_get_root"): NO_ORIGIN,
-    ("settings/checks.py", "_value"): NO_ORIGIN,
-    ("settings/composition.py", "_is_avx512_bf16_supported"): "torch does not tell publicly whether a CPU has bfloat16",
-    ("tensors.py", "_C"): ONE_OF_TORCH,
-    ("weights/checkpoint_reading.py", "_Unpickler"): "Python's unpickler in Python, whose calls a dry run replaces",
-    ("tensors.py", "_nn"): ONE_OF_TORCH,
-    ("tensors.py", "_parse_to"): ONE_OF_TORCH,
-    ("training/callbacks.py", "_get_train_description"): "the progress bar covers the run, not an epoch",
-    ("training/callbacks.py", "_swap_models"): "images of fixed scenes are drawn with the averaged weights",
-    ("training/callbacks.py", "_update"): "the progress bar covers the run, not an epoch",
-    (
-        "training/loggers.py",
-        "_check_log_dir_exists",
-    ): "Lightning's logger would delete the rows of the run that goes on",
-    ("training/loggers.py", "_wandb_init"): "W&B's run begins with Lightning's options and ours",
-    ("training/optimization.py", "_orthogonalize"): "Muon's own way is slow on CPUs and less exact",
-    ("training/stage.py", "_foreach_mul_"): "one kernel instead of one for each gradient",
-    ("training/stage.py", "_trainer"): "Lightning's `trainer` raises an error where there is none",
-    ("training/step_counts.py", "_scaled_dot_product_flash_attention_for_cpu"): "torch's counter lacks it",
-    ("training/step_counts.py", "_scaled_dot_product_flash_attention_for_cpu_backward"): "torch's counter lacks it",
-    ("training/step_counts.py", f"{FAKE}.DataDependentOutputException"): "fake tensors cannot be had publicly",
-    ("training/step_counts.py", f"{FAKE}.FakeTensorMode"): "fake tensors cannot be had publicly",
-    ("training/step_counts.py", "torch.utils._python_dispatch.TorchDispatchMode"): "the base of torch's own counters",
-    ("training/step_counts.py", "torch.utils._pytree.tree_leaves"): NO_TREES,
-    ("training/stopping.py", "_launch_process_observer"): "kills the first process; without it, Lightning's own way",
-    ("training/stopping.py", "lightning.pytorch.trainer.connectors.signal_connector._SignalConnector"): (
-        "its handlers wait for other processes within a step; without it, Lightning's own way"
-    ),
-    (
-        "viewer/access.py",
-        "websockets_server.serve",
-    ): "viser starts its server without checks, and has no option for them",
-    ("weights/checkpoint_reading.py", "_C"): "sizes of an archive's parts are checked before torch allocates them",
+    "baselines/autodecoder.py _load_from_state_dict": "makes room for a checkpoint's codes before they are compared",
+    "commands/__init__.py logging.raiseExceptions": "documented: no reports of logging's own errors",
+    "commands/__init__.py sys.argv": DURING_JOB,
+    "commands/imports.py _disable_dynamo": "diffusers' functions stay excluded from compilation, as by torch's",
+    "commands/imports.py importlib.metadata.packages_distributions": "diffusers reads all packages when imported",
+    "commands/jobs.py sys.argv": DURING_JOB,
+    f"data/loading/loader.py {LOADERS}._BaseDataLoaderIter": "the type of `_iterator`, by which Lightning ends workers",
+    "data/validation/processes.py _processes": "executors cannot end workers before Python 3.14",
+    "losses/efficientnet.py _blocks _bn0 _conv_stem _swish": NO_FEATURES,
+    "settings/checks.py _get_node _get_root _value": NO_ORIGIN,
+    "settings/composition.py _is_avx512_bf16_supported": "torch does not tell publicly whether a CPU has bfloat16",
+    "tensors.py _C _nn _parse_to": ONE_OF_TORCH,
+    "weights/checkpoint_reading.py _Unpickler": "Python's unpickler in Python, whose calls a dry run replaces",
+    "training/callbacks.py _get_train_description _update": "the progress bar covers the run, not an epoch",
+    "training/callbacks.py _swap_models": "images of fixed scenes are drawn with the averaged weights",
+    "training/loggers.py _check_log_dir_exists": "Lightning's logger would delete the rows of the run that goes on",
+    "training/loggers.py _wandb_init": "W&B's run begins with Lightning's options and ours",
+    "training/optimization.py _orthogonalize": "Muon's own way is slow on CPUs and less exact",
+    "training/stage.py _foreach_mul_": "one kernel instead of one for each gradient",
+    "training/stage.py _trainer": "Lightning's `trainer` raises an error where there is none",
+    f"training/step_counts.py {ATTENTION} {ATTENTION}_backward": "torch's counter lacks it",
+    f"training/step_counts.py {FAKE}.DataDependentOutputException {FAKE}.FakeTensorMode": NO_FAKES,
+    "training/step_counts.py torch.utils._python_dispatch.TorchDispatchMode": "the base of torch's own counters",
+    "training/step_counts.py torch.utils._pytree.tree_leaves": NO_TREES,
+    "training/stopping.py _launch_process_observer": "kills the first process; without it, Lightning's own way",
+    f"training/stopping.py {SIGNALS}._SignalConnector": WAITING,
+    "viewer/access.py websockets_server.serve": "viser starts its server without checks, and has no option for them",
+    "weights/checkpoint_reading.py _C": "sizes of an archive's parts are checked before torch allocates them",
 }
 
 
@@ -119,21 +101,23 @@ def used(text: str) -> Iterator[str]:
 
 
 def test_every_private_name_of_a_library_has_a_reason():
-    names = set()
-    for path in sorted(ROOT.rglob("*.py")):
-        place = path.relative_to(ROOT).as_posix()
-        if not place.startswith(FOR_BLENDER):
-            names |= {(place, name) for name in used(path.read_text())}
-    assert names == set(REASONS)
+    places = {path.relative_to(ROOT).as_posix(): path for path in ROOT.rglob("*.py")}
+    ours = {place: path for place, path in places.items() if not place.startswith(FOR_BLENDER)}
+    names = {(place, name) for place, path in ours.items() for name in used(path.read_text())}
+    assert names == {(place, name) for place, *listed in map(str.split, REASONS) for name in listed}
 
 
 def test_each_kind_of_use_is_found():
-    assert set(used("import torch._dynamo as dynamo")) == {"torch._dynamo"}
-    assert set(used("from hydra._internal import utils")) == {"hydra._internal.utils"}
-    assert set(used("from completesplat.cli import _own")) == set()
-    assert set(used("pool._processes")) == set(used("getattr(pool, '_processes')")) == {"_processes"}
-    assert set(used("import numpy as np\nnp.zeros = None")) == {"np.zeros"}
     own = "class A(B):\n def _f(self): self._x = 1\n def g(self): self._f(), self._x"
-    assert set(used(own)) == set()
-    assert set(used(own.replace("self._f()", "super()._f()"))) == {"_f"}
-    assert set(used("class A(B):\n def _f(self): pass")) == {"_f"}
+    for text, name in {
+        "import torch._dynamo as dynamo": "torch._dynamo",
+        "from hydra._internal import utils": "hydra._internal.utils",
+        "from completesplat.cli import _own": None,
+        "pool._processes": "_processes",
+        "getattr(pool, '_processes')": "_processes",
+        "import numpy as np\nnp.zeros = None": "np.zeros",
+        own: None,
+        own.replace("self._f()", "super()._f()"): "_f",
+        "class A(B):\n def _f(self): pass": "_f",
+    }.items():
+        assert set(used(text)) == ({name} if name else set()), text

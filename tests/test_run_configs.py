@@ -94,10 +94,9 @@ FOREIGN = [
 ]
 
 
+@pytest.mark.usefixtures("mine", "elsewhere")
 @pytest.mark.parametrize("foreign", FOREIGN, ids=lambda foreign: str(foreign["_target_"]))
-def test_what_is_neither_the_packages_nor_the_users_is_refused_always(
-    run, mine, elsewhere, tmp_path, monkeypatch, foreign
-):
+def test_what_is_neither_the_packages_nor_the_users_is_refused_always(run, tmp_path, monkeypatch, foreign):
     torch.save(Payload(tmp_path / "sprung"), tmp_path / "payload")
     text = OmegaConf.to_yaml(foreign).replace("PAYLOAD", str(tmp_path / "payload"))
     name(run, OmegaConf.create(text.replace("SPRUNG", str(tmp_path / "sprung"))), "model.rasterizer")
@@ -110,10 +109,9 @@ def test_what_is_neither_the_packages_nor_the_users_is_refused_always(
     assert not (tmp_path / "sprung").exists()
 
 
+@pytest.mark.usefixtures("mine", "elsewhere")
 @pytest.mark.parametrize("target", ["mine.Mine", "mine.make"])
-def test_modules_of_the_users_own_are_named_where_the_run_is_the_users_or_trusted(
-    run, mine, elsewhere, tmp_path, monkeypatch, target
-):
+def test_modules_of_the_users_own_are_named_where_the_run_is_the_users_or_trusted(run, tmp_path, monkeypatch, target):
     name(run, {"_target_": target})
     with pytest.raises(WeightsError, match=rf"config\.yaml names {target}, .* trust=true"):
         configuration(run)
@@ -192,34 +190,28 @@ def test_what_the_user_changes_may_name_anything_and_what_the_package_offers_nee
     assert with_targets - others <= GROUPS
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_changes_are_held_to_what_fit_takes(run):
+    for change, message in (
         ("data.batch_size=-1", "data.batch_size=-1: must be at least 1"),
         ("data.rot=x", "ToyObjectsDataModule has no setting rot (data.rot); did you mean root?"),
         ("model.background=2", "model.background=2: must lie between 0 and 1"),
         ("model.optimizer.adam_betas=[2,2]", "optimizer: "),
         ("data.image_size=50", "data.image_size=50: must be a multiple of 8 "),
         ("seed=3", "seed: no setting of a run's model or data"),
-    ],
-)
-def test_changes_are_held_to_what_fit_takes(run, change, message):
-    with pytest.raises(CompleteSplatError, match=re.escape(message)):
-        configuration(run, change)
+    ):
+        with pytest.raises(CompleteSplatError, match=re.escape(message)):
+            configuration(run, change)
 
 
-@pytest.mark.parametrize("value", ["${oc.env:HOME}", "a ${x}"])
-def test_resolvers_and_references_are_refused(run, value):
-    name(run, value, "model.background")
-    with pytest.raises(WeightsError, match=re.escape(f"{value} refers to something else")):
-        configuration(run, trust=True)
-
-
-@pytest.mark.parametrize("text", ["", "[1]", "model: 3", "{", "!!python/object/apply:os.getcwd []"])
-def test_what_is_no_configuration_is_refused(run, text):
-    (run / "config.yaml").write_text(text)
-    with pytest.raises(WeightsError, match=r"config\.yaml: not "):
-        configuration(run)
+def test_resolvers_and_references_and_what_is_no_configuration_are_refused(run):
+    for value in ("${oc.env:HOME}", "a ${x}"):
+        name(run, value, "model.background")
+        with pytest.raises(WeightsError, match=re.escape(f"{value} refers to something else")):
+            configuration(run, trust=True)
+    for text in ("", "[1]", "model: 3", "{", "!!python/object/apply:os.getcwd []"):
+        (run / "config.yaml").write_text(text)
+        with pytest.raises(WeightsError, match=r"config\.yaml: not "):
+            configuration(run)
 
 
 @pytest.mark.parametrize("verb", ["test", "report controls", "data latents"])

@@ -16,7 +16,7 @@ from completesplat.export.formats import RECORD
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.export.reading import read_gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.viewer.sample import read_newest, read_scene
+from completesplat.viewer.sample import read_scene
 
 CAMERA = {
     "world_to_camera": np.eye(4).tolist(),
@@ -32,67 +32,6 @@ def prediction(folder: Path, **changes: object) -> Path:
     settings = {"up": changes.pop("up", [0, -1, 0])}
     (folder / "scene.json").write_text(json.dumps({"reference_camera": CAMERA | changes, "settings": settings}))
     return folder
-
-
-def turned(**entries: float) -> list[list[float]]:
-    pose = np.eye(4)
-    for name, value in entries.items():
-        pose[int(name[1]), int(name[2])] = value
-    return pose.tolist()
-
-
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"image_size": [float("inf"), 32]}, "Infinity is no JSON"),
-        ({"image_size": [0, 32]}, r"image_size must be from 1 to 50,000,000 pixels, not \[0, 32\]"),
-        ({"image_size": [32, 1e300]}, "image_size is not finite in float32"),
-        ({"image_size": [32]}, "image_size must be 2 numbers"),
-        ({"intrinsics": np.zeros((3, 3)).tolist()}, "intrinsics of no camera"),
-        ({"intrinsics": [[1e-300, 0, 16], [0, 50, 16], [0, 0, 1]]}, "intrinsics of no camera"),
-        ({"intrinsics": [[50, 0, 1e200], [0, 50, 16], [0, 0, 1]]}, "intrinsics is not finite in float32"),
-        ({"up": [float("nan")] * 3}, "NaN is no JSON"),
-        ({"up": [0, 0, 0]}, r"up must have a length, not \[0, 0, 0\]"),
-        ({"up": [0, -1e300, 0]}, "up is not finite in float32"),
-        ({"up": "north"}, "up must be 3 numbers, not 'north'"),
-        ({"world_to_camera": turned(_03=float("nan"))}, "NaN is no JSON"),
-        ({"world_to_camera": turned(_00=0)}, "world_to_camera is not orthonormal"),
-        ({"world_to_camera": turned(_23=1e30)}, "world_to_camera is not finite in float32"),
-    ],
-)
-def test_a_camera_of_no_prediction_is_refused_by_file_and_value(tmp_path, changes, reason):
-    with pytest.raises(CompleteSplatError, match=rf"scene\.json: .*{reason}"):
-        read_scene(prediction(tmp_path, **changes))
-
-
-def newest(folder: Path, camera: object, up: object = (0, -1, 0)) -> Path:
-    write_ply(folder / "a.ply", SCENE)
-    rows = [{"file": "a.ply", "scene": "a", "reference_camera": camera}]
-    (folder / "scenes.json").write_text(json.dumps({"step": 3, "up": up, "scenes": rows}))
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("camera", "up", "reason"),
-    [
-        (CAMERA | {"intrinsics": np.zeros((3, 3)).tolist()}, [0, -1, 0], "intrinsics of no camera"),
-        (CAMERA, [0, float("inf"), 0], "Infinity is no JSON"),
-        (None, [0, -1, 0], "reference_camera must be of type dict, not None"),
-    ],
-)
-def test_the_scenes_of_a_run_are_checked_alike(tmp_path, camera, up, reason):
-    assert read_newest(newest(tmp_path, CAMERA))[0] == 3
-    with pytest.raises(CompleteSplatError, match=rf"scenes\.json: .*{reason}"):
-        read_newest(newest(tmp_path, camera, up))
-
-
-@pytest.mark.parametrize("read", [read_scene, read_newest])
-def test_deeply_nested_descriptions_are_refused(tmp_path, read):
-    prediction(tmp_path)
-    for name in ("scene.json", "scenes.json"):
-        (tmp_path / name).write_text("[" * DEEP + "]" * DEEP)
-    with pytest.raises(CompleteSplatError, match=r"scenes?\.json: not a JSON file"):
-        read(tmp_path)
 
 
 def test_a_scene_of_thousands_of_layers_is_shown_as_one(tmp_path):

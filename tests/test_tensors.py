@@ -104,3 +104,11 @@ def test_the_data_loaders_pinning_pins_every_tensor(monkeypatch: pytest.MonkeyPa
     item = make()
     assert isinstance(pin_memory([item])[0], Outer)
     assert {id(tensor) for tensor in asked} == {id(tensor) for tensor in tensors(item)}
+
+
+@pytest.mark.parametrize(("device", "blocking"), [("cuda", False), ("cpu", True), ("meta", True)])
+def test_lightning_copies_a_batch_to_a_gpu_without_waiting(monkeypatch, device, blocking):
+    copies = []
+    monkeypatch.setattr(Tensor, "to", lambda tensor, *arguments: copies.append(arguments) or tensor)
+    move_data_to_device(Inner(torch.zeros(2)), torch.device(device))
+    assert copies == [(torch.device(device), None, not blocking)]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from completesplat.data.images.files import to_bytes
+from completesplat.data.images.files import to_uint8
 from completesplat.data.toy.object_scene import ToyScene, draw_mini, render_frame
 from completesplat.data.toy.shapes import CHECKS, rotation_about
 
@@ -29,7 +29,7 @@ def draw(scene: ToyScene, azimuth: float) -> Image.Image:
     light = scene.light._replace(place=rotation_about("y", azimuth) @ [0.5, 0.6, 0.62])
     moved = replace(scene, camera_to_world=pose[None], light=light)
     color, coverage, _ = render_frame(moved, 0, SIZE)
-    return Image.fromarray(to_bytes(color + 0.5 * (1 - coverage[..., None])))  # the dome behind it is grey
+    return Image.fromarray(to_uint8(color + 0.5 * (1 - coverage[..., None])))  # the dome behind it is grey
 
 
 def cropped(photo: Image.Image) -> Image.Image:

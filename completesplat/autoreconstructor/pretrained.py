@@ -21,7 +21,7 @@ WEIGHTS_FILES = tuple(f"diffusion_pytorch_model{ending}" for ending in ENDINGS)
 SUFFIXES = (".safetensors", ".bin", ".ckpt", ".pt", ".pth")
 LDM = re.compile(r"(?:first_stage_model\.|vae\.)?encoder\.down\.(\d+)\.")  # names in Stable Diffusion's own files
 PLACES = ("", "vae/")  # a VAE by itself, or within a whole pipeline
-HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[\w.-]+)?")
+MODEL_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[\w.-]+)?")
 ENCODER = ("encoder.", "quant_conv.")
 HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
 # Names in older versions of diffusers (`_convert_deprecated_attention_blocks` in its modeling_utils.py).
@@ -94,7 +94,7 @@ def _needed_settings(config: Mapping[str, object], part: str) -> str:
 
 def _vae_file(source: str, part: str) -> Path:
     """Return the file of the VAE's tensors; download it from the hub if `source` is not a file or folder."""
-    local, is_id = Path(source).expanduser(), HUB_ID.fullmatch(source) is not None
+    local, is_id = Path(source).expanduser(), MODEL_ID.fullmatch(source) is not None
     hub_id = source if is_id and not local.exists() else "CompVis/stable-diffusion-v1-4"
     advice = (
         f"run `hf download {hub_id} --local-dir DIR` with network access (add `--include 'vae/*'` for the VAE of a "

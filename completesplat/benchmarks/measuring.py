@@ -7,7 +7,7 @@ from typing import Any
 from completesplat.files import write_json
 from completesplat.results.machine import machine
 from completesplat.results.tables import records_table, show
-from completesplat.training.scoring import now
+from completesplat.training.scoring import synchronized_time
 
 Work = Callable[[], object]
 Row = dict[str, object]  # of a table; its values can be written as JSON
@@ -16,9 +16,9 @@ WARM_UP = 2  # untimed calls
 
 def milliseconds(work: Work) -> float:
     """Return the time of one call in ms, including its work on the GPU."""
-    start = now()
+    start = synchronized_time()
     work()
-    return (now() - start) * 1e3
+    return (synchronized_time() - start) * 1e3
 
 
 def report(path: Path, results: Mapping[str, Any], tables: Mapping[str, Sequence[Row]], device: object = "cpu") -> None:

@@ -2,7 +2,10 @@
 
 import gc
 import statistics
-from collections.abc import Mapping, Sequence
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,7 +23,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.trajectories import orbit
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Positive
+from completesplat.settings.schema import Natural, Positive
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stage import Stage
@@ -30,7 +33,7 @@ VIEWS = 100
 MEGABYTE = 1e6
 
 
-class Figure(NamedTuple):
+class Duration(NamedTuple):
     """Durations in ms of one kind of work: the paper's on an A100, and our aim on a newer GPU."""
 
     text: str
@@ -39,19 +42,19 @@ class Figure(NamedTuple):
 
 
 FIGURES = {
-    "reconstruct": Figure("encode and reconstruct an image", 15.7, 5),  # Table 2, "Ours - AutoReconstructor"
-    "sample": Figure("draw a sample", 2_700, 500),  # Table 2, "Ours - Diffusion single sample"
-    "samples": Figure("draw all samples at once", 54_000, 2_000),  # Table 2, "20-best oracle"
-    "render": Figure("render 100 views of a scene", 29.1, 5),  # Table 2; the paper does not say how many views
-    "stage1_step": Figure("training step of stage 1", None, None),
-    "stage2_step": Figure("training step of stage 2", 157, None),  # supplement: 1,100,000 steps in 2 days
+    "reconstruct": Duration("encode and reconstruct an image", 15.7, 5),  # Table 2, "Ours - AutoReconstructor"
+    "sample": Duration("draw a sample", 2_700, 500),  # Table 2, "Ours - Diffusion single sample"
+    "samples": Duration("draw all samples at once", 54_000, 2_000),  # Table 2, "20-best oracle"
+    "render": Duration("render 100 views of a scene", 29.1, 5),  # Table 2; the paper does not say how many views
+    "stage1_step": Duration("training step of stage 1", None, None),
+    "stage2_step": Duration("training step of stage 2", 157, None),  # supplement: 1,100,000 steps in 2 days
 }
 # The paper's durations are shown beside ours only for the same work.
 PAPERS_WORK = {"image_size": 128, "batch": 32, "samples": 20, "steps": 50}
 PAPERS_CHANNELS = {"encoder": [128, 256, 512, 512], "denoiser": [320, 640, 1280, 1280]}
 
 
-class Way(NamedTuple):
+class ComputeMode(NamedTuple):
     """Precision of the networks and mode of `torch.compile`; None does not compile them."""
 
     name: str
@@ -59,17 +62,17 @@ class Way(NamedTuple):
     compile: Literal["default", "reduce-overhead"] | None = None  # the latter records CUDA graphs
 
 
-WAYS = (
-    Way("float32", "32-true"),
-    Way("bfloat16", "bf16-mixed"),
-    Way("bfloat16, compiled", "bf16-mixed", "default"),
-    Way("bfloat16, CUDA graphs", "bf16-mixed", "reduce-overhead"),
+COMPUTE_MODES = (
+    ComputeMode("float32", "32-true"),
+    ComputeMode("bfloat16", "bf16-mixed"),
+    ComputeMode("bfloat16, compiled", "bf16-mixed", "default"),
+    ComputeMode("bfloat16, CUDA graphs", "bf16-mixed", "reduce-overhead"),
 )
 
 
 def run(
     data: Mapping[str, object], stage1: Mapping[str, object], stage2: Mapping[str, object], steps: Positive,
-    device: Literal["cuda", "cpu"], repeats: Positive, samples: Positive, compile: bool, training: bool,
+    device: Literal["cuda", "cpu"], repeats: Positive, samples: Positive, compile: bool, training: bool, busy: Natural,
     channels: Mapping[str, Sequence[int]], seed: int, out: Path,
 ) -> None:  # fmt: skip
     """Measure with random weights, write `paper.json`, and print a table.
@@ -84,7 +87,7 @@ def run(
             "device=cuda: no GPU is available; measure with device=cpu, which takes minutes with "
             "autoreconstructor=tiny conditioning=learned denoiser=tiny"
         )
-    ways = [way for way in WAYS if compile or way.compile is None]
+    ways = [way for way in COMPUTE_MODES if compile or way.compile is None]
     quieten()
     rows: list[Row] = []
     with TemporaryDirectory(prefix="bench_", dir=out) as folder, Console(stderr=True).status("building") as status:
@@ -97,7 +100,7 @@ def run(
                 status.update(f"timing {way.name}")
                 torch.manual_seed(seed)
                 module: Stage = instantiate(config, _convert_="all").to(device)
-                rows += rows_of(module, scenes, way, samples, training, repeats)
+                rows += rows_of(module, scenes, way, samples, training, repeats, busy)
                 del module
     work = {"image_size": loaded.image_size, "batch": loaded.batch_size, "samples": samples, "steps": steps}
     if is_as_in_the_paper(work, channels):
@@ -108,7 +111,7 @@ def run(
     report(out / "paper.json", results, {title.format(**work): named}, device)
 
 
-def _with_figures(rows: Sequence[Row]) -> list[tuple[Figure, Row]]:
+def _with_figures(rows: Sequence[Row]) -> list[tuple[Duration, Row]]:
     """Return each row with its figure; the ways of doing one kind of work stand next to each other."""
     return [(figure, row) for name, figure in FIGURES.items() for row in rows if row["name"] == name]
 
@@ -118,7 +121,9 @@ def is_as_in_the_paper(work: Mapping[str, int], channels: Mapping[str, Sequence[
     return dict(work) == PAPERS_WORK and dict(channels) == PAPERS_CHANNELS
 
 
-def rows_of(module: Stage, scenes: SceneBatch, way: Way, samples: int, training: bool, repeats: int) -> list[Row]:
+def rows_of(
+    module: Stage, scenes: SceneBatch, way: ComputeMode, samples: int, training: bool, repeats: int, busy: int = 0
+) -> list[Row]:
     """Return a row for each kind of work: median ms and, on a GPU, torch's peak memory in MB, weights included.
 
     If some work fails, for example because memory is short, its row has the reason instead. Optimizer steps are left
@@ -129,27 +134,44 @@ def rows_of(module: Stage, scenes: SceneBatch, way: Way, samples: int, training:
     for name, work in works_of(module, scenes, way.precision, samples).items():
         if name.endswith("_step") and (not training or way.compile == "reduce-overhead"):
             continue
-        results.append({"name": name, "way": way.name} | measured(work, repeats, module.device))
+        results.append({"name": name, "way": way.name} | time_and_memory(work, repeats, module.device, busy))
         gc.collect()
     return results
 
 
-def measured(work: Work, repeats: int, device: torch.device) -> Row:
-    """Return the median time, and on a GPU the peak memory; or the reason why the work failed."""
+def time_and_memory(work: Work, repeats: int, device: torch.device, busy: int = 0) -> Row:
+    """Return the median time, alone and beside busy processes, and on a GPU the peak memory; or why the work failed."""
     try:
         for _ in range(WARM_UP):
             work()
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)
-        times = [milliseconds(work) for _ in range(repeats)]
+        row = {"ms": statistics.median(milliseconds(work) for _ in range(repeats))}
+        if busy:
+            with busy_processes(busy):
+                row["busy_ms"] = statistics.median(milliseconds(work) for _ in range(repeats))
+            row["times"] = row["busy_ms"] / row["ms"]
     except (RuntimeError, AssertionError) as error:  # torch's compiler raises both kinds, too
         first = (str(error).strip().splitlines() or [""])[0]
         return {"not_measured": f"{type(error).__name__}: {first}"}
     memory = {"memory_mb": torch.cuda.max_memory_allocated(device) / MEGABYTE} if device.type == "cuda" else {}
-    return {"ms": statistics.median(times), **memory}
+    return {**row, **memory}
 
 
-def compile_networks(networks: list[nn.Module], way: Way) -> None:
+@contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """Let other processes compute all the time; they end with the block, or with this process."""
+    program = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"
+    processes = [subprocess.Popen([sys.executable, "-c", program]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def compile_networks(networks: list[nn.Module], way: ComputeMode) -> None:
     """Let these networks compile on their first call, if the way says so."""
     if way.compile is not None:
         torch.compiler.reset()

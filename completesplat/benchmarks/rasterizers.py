@@ -24,7 +24,7 @@ from completesplat.training.steps import peak_megabytes
 
 BACKENDS = {"reference": ReferenceRasterizer, **FASTER}
 LONGEST_SECONDS = 4.0  # a backend that has run this long on a workload does not repeat it
-Tick = Callable[[str], None]
+OnProgress = Callable[[str], None]
 
 
 def run(
@@ -66,7 +66,7 @@ def working_backends(names: Sequence[str], constants: RenderingConstants) -> tup
 
 
 def speed_rows(
-    backends: Sequence[Backend], sizes: Sequence[int], views: Sequence[int], repeats: int, tick: Tick
+    backends: Sequence[Backend], sizes: Sequence[int], views: Sequence[int], repeats: int, tick: OnProgress
 ) -> list[Row]:
     """Return a row for each backend and workload (size, number of views, kind of opacities)."""
     rows: list[Row] = []

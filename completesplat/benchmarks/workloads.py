@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unproject
 from completesplat.rasterizers import Rasterizer
-from completesplat.training.scoring import now
+from completesplat.training.scoring import synchronized_time
 from completesplat.training.steps import DISTANCE, FOV_DEGREES, cameras_on_orbit
 
 OPACITIES = ("trained", "initial")
@@ -40,7 +40,7 @@ def splatter_scene(size: int, views: int, opacity: str) -> tuple[Gaussians, Came
     generator = torch.Generator().manual_seed(0)
     source = Cameras(torch.eye(4), pinhole(FOV_DEGREES, size), (size, size))
     layers = [_layer(layer, source, opacity, generator) for layer in range(2)]
-    return concatenate(layers)[None], cameras_on_orbit(size, views)
+    return merge_gaussians(layers)[None], cameras_on_orbit(size, views)
 
 
 def _layer(layer: int, source: Cameras, opacity: str, generator: torch.Generator) -> Gaussians:
@@ -69,11 +69,11 @@ def rendering_milliseconds(rasterizer: Rasterizer, gaussians: Gaussians, cameras
     """Return the times of the forward pass, and of both passes with gradients to all parameters of the Gaussians."""
     gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     ones = [_ones(cameras, channels) for channels in (3, 1, 1)]
-    start = now()
+    start = synchronized_time()
     rendering = rasterizer(gaussians, cameras)
-    middle = now()
+    middle = synchronized_time()
     torch.autograd.backward([rendering.color, rendering.depth, rendering.alpha], ones)
-    return (middle - start) * 1e3, (now() - start) * 1e3
+    return (middle - start) * 1e3, (synchronized_time() - start) * 1e3
 
 
 def _ones(cameras: Cameras, channels: int) -> Tensor:

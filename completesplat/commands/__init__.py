@@ -45,7 +45,7 @@ def launch(verb: str, arguments: list[str]) -> None:
     program, original = sys.argv[0], arguments
     arguments = behind_dashes(arguments)
     if any(flag in arguments for flag in help.FLAGS) or (verb == "bench" and not arguments):
-        return print(help.page(verb, arguments))
+        return print(help.help_page(verb, arguments))
     if verb == "new":  # its files are the user's, and it has no folder for a job
         return new.run(compose(verb, *arguments))
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
@@ -60,7 +60,7 @@ def launch(verb: str, arguments: list[str]) -> None:
 
     def job(config: DictConfig) -> float | None:
         try:
-            with jobs.alone_in(Path(HydraConfig.get().runtime.output_dir)):
+            with jobs.hold_job_lock(Path(HydraConfig.get().runtime.output_dir)):
                 return jobs.run_job(verb, config, program, original)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:

@@ -12,11 +12,11 @@ from completesplat.settings.schema import Entries, Positive, Range
 
 logger = logging.getLogger(__name__)
 
-Split = Literal["train", "val", "test"]
-Splits = Annotated[Sequence[Split], Entries(1)]
+SplitName = Literal["train", "val", "test"]
+SplitNames = Annotated[Sequence[SplitName], Entries(1)]
 
 
-def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> None:
+def check(data: Any, splits: SplitNames, workers: Positive | None, out: Path) -> None:
     """Read everything once and write `check.json`; exit with status 1 when no sequence is usable."""
     from completesplat.data.validation import audit
 
@@ -24,7 +24,7 @@ def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> Non
         sources = {split: data.evaluated(split, source) for split, source in _sources(data, splits).items()}
         findings = audit.check(sources, workers, splits_share_sequences=data.splits_share_sequences)
     except DataError as error:  # concerns the data set as a whole
-        findings = audit.Findings(0, 0, [error], {}, {})
+        findings = audit.AuditReport(0, 0, [error], {}, {})
     findings.write(out / "check.json")
     audit.show_findings(findings)
     if not findings.sequences:
@@ -32,7 +32,7 @@ def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> Non
         sys.exit(1)
 
 
-def stats(data: Any, splits: Splits, out: Path) -> None:
+def stats(data: Any, splits: SplitNames, out: Path) -> None:
     """Write `stats.json` and `stats.png`, and print the numbers."""
     from rich.progress import track
 
@@ -46,7 +46,7 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
     show_statistics(results)
 
 
-def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path) -> None:
+def show(data: Any, split: SplitName, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path) -> None:
     """Write `show.png`: images of some sequences, evenly spread over a split."""
     from completesplat.studies.contact_sheet import write_contact_sheet
 
@@ -63,7 +63,7 @@ def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], images: P
 
 def prepare(
     data: Any,
-    splits: Splits,
+    splits: SplitNames,
     out: Path,
     codec: str,
     sequences_per_shard: Positive,

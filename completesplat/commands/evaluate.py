@@ -15,8 +15,8 @@ from rich.progress import track
 
 from completesplat.commands import quieten
 from completesplat.commands.jobs import CONFIG, METRICS
-from completesplat.commands.protocol import drawing, protocol, provenance
-from completesplat.commands.trained import Trained
+from completesplat.commands.protocol import protocol, provenance, sampler_settings
+from completesplat.commands.trained import TrainedModel
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
@@ -24,7 +24,7 @@ from completesplat.files import write_json
 from completesplat.results.measured import MODE_COLUMNS, evaluation_table
 from completesplat.results.runs import MODEL
 from completesplat.results.tables import records_table, show
-from completesplat.settings.checks import EvaluationSettings, Tested
+from completesplat.settings.checks import EvaluationSettings, TestSettings
 from completesplat.settings.schema import Natural, Positive, Range
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.scoring import Scorer
@@ -78,14 +78,18 @@ def set_scoring(module: Scorer, evaluation: Config) -> None:
 
 @stopped_together()
 def run(
-    evaluation: EvaluationSettings, trainer: Config, out: Path, logger: Config | None = None, **trained: Unpack[Tested]
+    evaluation: EvaluationSettings,
+    trainer: Config,
+    out: Path,
+    logger: Config | None = None,
+    **trained: Unpack[TestSettings],
 ) -> None:
     """Write `metrics.json` and print the table.
 
     Args:
         evaluation, trainer, logger: configs of the protocol, the trainer (without precision), loggers by name.
     """
-    tested = Trained(**trained)
+    tested = TrainedModel(**trained)
     run_config = tested.configuration()
     quieten()
     seed_everything(tested.seed, verbose=False)
@@ -125,7 +129,7 @@ def run_hidden_modes(
     trainer: Config,
     out: Path,
     logger: Config | None = None,
-    **trained: Unpack[Tested],
+    **trained: Unpack[TestSettings],
 ) -> None:
     """Write JSON files of hidden modes, shares and protocol, draw `hidden_modes.png`, and print the table.
 
@@ -135,9 +139,9 @@ def run_hidden_modes(
     Raises:
         CompleteSplatError: the data's hidden parts are not known, or no scene can be used.
     """
-    from completesplat.studies.mode_benchmark import measure, predictors, usable, write_modes
+    from completesplat.studies.mode_benchmark import measure, predictors, usable_scenes, write_modes
 
-    tested = Trained(**trained)
+    tested = TrainedModel(**trained)
     quieten()
     module, data = tested.open()
     data.prepare_data()
@@ -145,7 +149,8 @@ def run_hidden_modes(
     device = torch.device("cuda" if trainer["accelerator"] != "cpu" and torch.cuda.is_available() else "cpu")
     module.to(device).eval()
     samples = evaluation["samples"]
-    scenes, skipped = usable(data.hidden_modes(evaluation["views"], evaluation["spread_views"]), evaluation["scenes"])
+    candidates = data.hidden_modes(evaluation["views"], evaluation["spread_views"])
+    scenes, skipped = usable_scenes(candidates, evaluation["scenes"])
     if tested.scenes is not None:
         tested.files.find([scene.scene.names[0] for scene in scenes], samples)
     progress = partial(track, description="Hidden modes", console=Console(stderr=True))
@@ -156,10 +161,10 @@ def run_hidden_modes(
     write_json(out / "hidden_modes.json", results)
     write_json(out / "shares.json", measured.shares())
     used_settings = ("name", "samples", "views", "spread_views", "seed")
-    settings = {key: value for key, value in evaluation.items() if key in used_settings}
-    stated = {**settings, "method": module.method, **data.describe(), "image_size": data.image_size, **drawing(module)}
+    settings: dict[str, object] = {key: value for key, value in evaluation.items() if key in used_settings}
+    settings |= {"method": module.method, **data.describe(), "image_size": data.image_size, **sampler_settings(module)}
     used = {"scenes": measured.names, "skipped": skipped, **provenance(data, out), **tested.facts()}
-    write_json(out / "protocol.json", stated | used)
+    write_json(out / "protocol.json", settings | used)
     write_modes(measured, samples, out / "hidden_modes.png")
     scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
     loggers: list[Logger] = list(instantiate(logger or {}, _convert_="all").values())

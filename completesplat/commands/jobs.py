@@ -48,7 +48,7 @@ def one_of_several() -> bool:
     return "LOCAL_RANK" in os.environ or int(os.environ.get("SLURM_STEP_NUM_TASKS", 1)) > 1
 
 
-def is_first() -> bool:
+def is_first_process() -> bool:
     """Return whether this process is alone, or the first that torchrun (`RANK`) or srun (`SLURM_PROCID`) started."""
     return int(os.environ.get("RANK", os.environ.get("SLURM_PROCID", 0))) == 0
 
@@ -63,7 +63,7 @@ class LogFile(logging.FileHandler):
 
 
 @contextmanager
-def alone_in(out: Path) -> Iterator[None]:
+def hold_job_lock(out: Path) -> Iterator[None]:
     """Hold the lock of a job's directory in the job's first process; the lock file names process and computer.
 
     The operating system releases the lock when the process ends, for whatever reason. The unfinished files of a killed
@@ -73,7 +73,7 @@ def alone_in(out: Path) -> Iterator[None]:
         CompleteSplatError: another process holds the lock, or its path is a link or a folder.
     """
     path = out / LOCK
-    if not is_first():
+    if not is_first_process():
         yield
         return
     if path.is_symlink() or path.is_dir():
@@ -96,7 +96,7 @@ def alone_in(out: Path) -> Iterator[None]:
         yield
 
 
-def at_work(out: Path) -> bool:
+def is_running(out: Path) -> bool:
     """Return whether a process of this computer holds the lock of a job's directory."""
     path = out / LOCK
     if not path.is_file():
@@ -123,7 +123,7 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     if is_finished(out, resolved, hydra_config.overrides.task):
         print(f"{out}: finished before, not repeated")
         return optimized(config.get("optimized_metric"), out)
-    first = is_first()
+    first = is_first_process()
     try:
         recorded = out, [f"completesplat {verb}", *given], list(hydra_config.overrides.task), resolved
         with ended_by_signals(), _recorded(*recorded) if first else nullcontext():

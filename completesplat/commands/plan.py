@@ -26,7 +26,7 @@ from completesplat.scene import Batch, SceneBatch
 from completesplat.settings.checks import check_image_size, check_optimizer, each_part, remove_start_weights
 from completesplat.settings.options import did_you_mean
 from completesplat.training.latent_diffusion import LatentDiffusion
-from completesplat.training.scoring import now
+from completesplat.training.scoring import synchronized_time
 from completesplat.training.stage import Stage
 from completesplat.training.step_counts import StepCounts, count_step, with_latents
 from completesplat.training.steps import MEBIBYTE, Training, peak_megabytes, synthetic_batch
@@ -90,10 +90,10 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
     sequences, frames = data.get("scenes", config.sequences), data.get("frames", config.frames)
     if not OmegaConf.is_missing(data, "root") and Path(data.root).is_dir():
         sequences = len(build(data, _convert_="all").source("train").names)
-    steps, counts, limit = steps_of(config, sequences), counted(config, batch), memory_limit(config)
+    steps, counts, limit = steps_of(config, sequences), count_work(config, batch), memory_limit(config)
     flops, measured, fits = counts.flops * config.devices, None, counts.peak <= limit
     if config.gpu == HERE:
-        seconds, measured = timed(config, counts, batch)
+        seconds, measured = measure_steps(config, counts, batch)
         seconds *= accumulated
         speed = f"measured here, {flops / seconds / 1e12:.3g} TFLOP/s"
     else:
@@ -166,11 +166,11 @@ def without_weights(config: DictConfig) -> DictConfig:
     return config
 
 
-def counted(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
+def count_work(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
     """Return the counts of a process that takes `batch` scenes at a time."""
     copied = without_weights(config)
     gpu = config.gpu != HERE or torch.cuda.is_available()
-    copied.rasterizer = {"_target_": "completesplat.training.step_counts.StoreOnly", "gpu": gpu}
+    copied.rasterizer = {"_target_": "completesplat.training.step_counts.MemoryOnlyRasterizer", "gpu": gpu}
     for key, value in changes.items():
         OmegaConf.update(copied, key, value)
     callbacks = config.get("callbacks", {}).values()
@@ -204,7 +204,7 @@ def advice(config: DictConfig, counts: StepCounts, batch: int, limit: float) -> 
     key = f"{'denoiser' if 'completesplat' in config.model else 'autoreconstructor'}.gradient_checkpointing"
     ways = [("", counts)]
     if OmegaConf.select(config, key) is False:
-        ways.append((f"{key}=true", counted(config, batch, **{key: True})))
+        ways.append((f"{key}=true", count_work(config, batch, **{key: True})))
     lines = []
     for settings, found in ways:
         fixed, grows = parts_of(found)
@@ -218,7 +218,7 @@ def advice(config: DictConfig, counts: StepCounts, batch: int, limit: float) -> 
     return lines or [f"No setting here makes it fit: {reason}."]
 
 
-def timed(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, float | None]:
+def measure_steps(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, float | None]:
     """Return the median seconds of real steps on this machine with `batch` scenes, and their peak in GB, if known.
 
     On a CPU, steps with fewer scenes are timed, and their memory not measured, if a whole batch takes more than 1 GB.
@@ -242,9 +242,9 @@ def timed(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, fl
     training, seconds = Training(module, precision(config)), []
 
     def step() -> None:
-        start = now()
+        start = synchronized_time()
         training.step(inputs)
-        seconds.append(now() - start)
+        seconds.append(synchronized_time() - start)
 
     for _ in range(UNTIMED_STEPS + TIMED_STEPS):
         step()

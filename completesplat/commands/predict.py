@@ -24,7 +24,7 @@ from completesplat.data.images.photograph import Photograph, outside_of_box, out
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
-from completesplat.export.prediction import Shot, Wanted, write_prediction
+from completesplat.export.prediction import OutputFiles, Shot, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.files import folder_names, printable, safe_name
 from completesplat.generator import CompleteSplat
@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 def run(config: DictConfig, out: Path) -> None:
     """Write each photo's files into `out/<its name>/`."""
-    wanted = wanted_files(config)
+    wanted = output_files(config)
     images = find_images(config.image)
     if config.mask is not None and len(images) > 1:
         raise CompleteSplatError("mask=FILE belongs to one image; box=[x0,y0,x1,y1] goes for several")
@@ -90,12 +90,12 @@ def _images_of(path: Path) -> list[Path]:
     return images
 
 
-def wanted_files(config: DictConfig) -> Wanted:
+def output_files(config: DictConfig) -> OutputFiles:
     """Return the outputs for each image; raise CompleteSplatError for none, an unknown one, or a missing program."""
     formats, videos = _names(config.formats), _names(config.video)
     if not formats and not videos:
         raise CompleteSplatError(f"formats=[] video=[]: choose a format ({', '.join(FORMATS)}) or a video")
-    wanted = Wanted(
+    wanted = OutputFiles(
         formats=formats,
         videos=videos,
         frames=config.frames,
@@ -111,7 +111,9 @@ def _names(value: object) -> tuple[str, ...]:
     return tuple(dict.fromkeys(map(str, names)))
 
 
-def predict_images(config: DictConfig, model: SceneModel, images: Sequence[Path], wanted: Wanted, out: Path) -> None:
+def predict_images(
+    config: DictConfig, model: SceneModel, images: Sequence[Path], wanted: OutputFiles, out: Path
+) -> None:
     """Write each image's files into a folder below `out`, with a progress bar, or a line per image without a terminal.
 
     The background is `shown_background`.
@@ -158,7 +160,7 @@ def predict_images(config: DictConfig, model: SceneModel, images: Sequence[Path]
         raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(images) else share)
 
 
-def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Wanted, out: Path) -> None:
+def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: OutputFiles, out: Path) -> None:
     """Write the files of one scene that all images show, into a folder with the name of the first image.
 
     Raises:
@@ -197,14 +199,14 @@ def _predict(
     config: DictConfig,
     model: SceneModel,
     rasterizer: Rasterizer,
-    wanted: Wanted,
+    wanted: OutputFiles,
     image: Path,
     folder: Path,
     on_sample: Callable[[], None],
 ) -> None:
     photograph = model.read(image, config.fov, config.background == REMOVE)
     visible = visible_part(config, image, model.image_size)
-    if warnings := remarks(photograph, model, whole=visible is None):
+    if warnings := photo_warnings(photograph, model, whole=visible is None):
         log.warning("%s: %s", printable(image.name), "; ".join(warnings))
     settings = {name: config[name] for name in ("samples", "seed", "color_fits")}
     sampler = {}
@@ -236,7 +238,7 @@ def _predict(
     write_prediction(folder, visible_image, shots, rasterizer, wanted, recorded, on_sample)
 
 
-def remarks(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]:
+def photo_warnings(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]:
     """Return warnings about a photo that is unlike the training images; its contents are compared only if `whole`."""
     warnings = [unusual_field_of_view(photograph, model.fov_degrees.item())]
     distance = distance_to_training(photograph, model.architecture) if whole else None

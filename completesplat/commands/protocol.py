@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from completesplat.results.machine import machine
-from completesplat.results.runs import read_record, typed
+from completesplat.results.runs import read_record, shell_command
 from completesplat.version import __version__
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def protocol(
         **{"scenes": model["scenes"], "skipped": len(scored.skipped), "views": model["views"]},
         **{"samples": scored.samples, "criterion": scored.criterion, "seed": scored.seed},
         **({"best": BEST_RULES} if scored.samples > 1 else {}),
-        **drawing(module),
+        **sampler_settings(module),
         **({} if module.fitted_to is None else {"fitted_to": module.fitted_to}),
         "object_pixels": "background black in both, by the true mask cut at 0.5",
         "average": "over the views of a scene, then over scenes",
@@ -70,11 +70,12 @@ def protocol(
 
 def provenance(data: "SceneDataModule", out: Path) -> dict[str, object]:
     """Return the test data's fingerprint, and program, command (that of `run.json` in `out`) and machine."""
-    program = {"version": __version__, "commit": git_commit(), "command": typed(read_record(out).get("command", []))}
+    command = shell_command(read_record(out).get("command", []))
+    program = {"version": __version__, "commit": git_commit(), "command": command}
     return {"data_fingerprint": data.source("test").fingerprint(), **program, "machine": machine()}
 
 
-def drawing(module: Any) -> dict[str, object]:
+def sampler_settings(module: Any) -> dict[str, object]:
     """Return the settings of the sampler; nulls for deterministic models and for scenes from files."""
     if not hasattr(module, "completesplat"):
         return dict.fromkeys(("sampler", "steps", "skip_weight", "guidance_weight", "color_fits"))

@@ -1,6 +1,6 @@
 """`completesplat report`: studies of a trained model's samples.
 
-Each study raises the errors of `Trained.open`, `diffusion_of`, `first_scenes` and the functions of its module in
+Each study raises the errors of `TrainedModel.open`, `diffusion_of`, `first_scenes` and the functions of its module in
 `completesplat.studies`.
 """
 
@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from completesplat.commands import quieten
-from completesplat.commands.trained import Trained, diffusion_of
+from completesplat.commands.trained import TrainedModel, diffusion_of
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import CompleteSplatError
 from completesplat.export.images import image_sheet, write_png
@@ -25,7 +25,7 @@ from completesplat.scene import SceneBatch
 from completesplat.settings.checks import ModelSettings
 from completesplat.settings.schema import Entries, Positive, Range, Share
 from completesplat.studies.calibration import calibration_rows, plot_calibration
-from completesplat.studies.controls import Tick, controls_rows, controls_strips, grid, plot_controls
+from completesplat.studies.controls import OnProgress, controls_rows, controls_strips, grid, plot_controls
 from completesplat.studies.depth import depth_rows, depth_strips
 from completesplat.studies.noise_levels import noise_level_rows, plot_noise_levels, scenes_in_all_modes
 from completesplat.studies.samples import SampleRenderer, first_scenes
@@ -35,7 +35,7 @@ Weights = Annotated[Sequence[Share], Entries(1)]
 
 
 class Run(ModelSettings):
-    """Arguments of `Trained`, number of test scenes (the first ones), and number of samples of each scene."""
+    """Arguments of `TrainedModel`, number of test scenes (the first ones), and number of samples of each scene."""
 
     data: NotRequired[Mapping[str, object]]
     rasterizer: Mapping[str, object]
@@ -117,7 +117,7 @@ def _report(path: Path, title: str, rows: Sequence[Mapping[str, object]], run: R
 
 
 @contextmanager
-def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], Tick]]:
+def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], OnProgress]]:
     """Yield renderer and first test scenes (on a GPU if there is one), and a status."""
     stage, data = _opened_stage(run)
     scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
@@ -130,5 +130,5 @@ def _opened_stage(run: Run) -> tuple[Scorer, SceneDataModule]:
     """Return the stage, on a GPU if there is one, and the data."""
     quieten()
     model = run["ckpt"], run["overrides"], run["trust"], run["weights"]
-    stage, data = Trained(*model, data=run.get("data"), rasterizer=run["rasterizer"], seed=run["seed"]).open()
+    stage, data = TrainedModel(*model, data=run.get("data"), rasterizer=run["rasterizer"], seed=run["seed"]).open()
     return stage.to("cuda" if torch.cuda.is_available() else "cpu").eval(), data

@@ -28,7 +28,7 @@ WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no 
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainedModel:
     """A model with its data: a run's checkpoint, weights, or files of scenes that any program wrote.
 
     `conf/test.yaml` explains the arguments; with `ckpt`, those of its run replace `data` and `rasterizer`.
@@ -144,9 +144,11 @@ def nearest_weights(images: Sequence[Path], remove_background: bool) -> tuple[st
         raise WeightsError("weights=auto: this package has no weights; give weights=DIR")
     for image in images:
         with suppress(ImageError, OSError):  # which ends the prediction of this image alone, when its turn comes
-            (name, distance), *others = distances_to_shipped(image, remove_background).items()
-            photo = f"{'the first image, ' if len(images) > 1 else ''}{printable(image.name)}"
+            distances = distances_to_shipped(image, remove_background)
+            (name, distance), *others = distances.items()
             far = f"{distance:.1f} standard deviations{''.join(f', {other} {x:.1f}' for other, x in others)}"
+            far += "".join(f", {other} needs a plain background" for other in shipped() if other not in distances)
+            photo = f"{'the first image, ' if len(images) > 1 else ''}{printable(image.name)}"
             return name, f"; their training images are the nearest to {photo} ({far})"
     name, *names = shipped()
     return name, f"; there is no image to choose by (weights=NAME takes others: {', '.join(names)})"

@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from completesplat.commands.imports import importing, postponing
-from completesplat.commands.jobs import at_work
+from completesplat.commands.jobs import is_running
 from completesplat.errors import CompleteSplatError
 from completesplat.files import SPLATS, printable
 from completesplat.settings.checks import REMOVE, check_parts
@@ -66,7 +66,7 @@ def setting_of_path(path: Path) -> dict[str, str]:
         return {KINDS.get(path.suffix.lower(), "image"): str(path)}
     if not path.is_dir():
         raise CompleteSplatError(f"{path}: no such file or folder")
-    if (path / NEWEST).parent.is_dir() and at_work(path):
+    if (path / NEWEST).parent.is_dir() and is_running(path):
         return {"watch": str(path)}
     for folder in (path, path / "weights"):
         if all((folder / name).is_file() for name in WEIGHT_FILES):
@@ -166,9 +166,9 @@ def show_newest(page: Any, run: Path, shown: int | None) -> int | None:
 
 def export(page: Any, path: Path) -> None:
     """Write the page to a file when its work is done; raise CompleteSplatError if the page shows no scene."""
-    from completesplat.viewer.page import write_page
+    from completesplat.viewer.page import write_viewer_page
 
     page.worker.wait()
     if not page.view.samples:
         raise CompleteSplatError("there is nothing to export: give a scene, or an image and weights")
-    print(write_page(page.server, path))
+    print(write_viewer_page(page.server, path))

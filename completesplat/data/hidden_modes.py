@@ -17,7 +17,7 @@ from completesplat.data.co3d.source import CO3DSource
 from completesplat.data.loading.scenes import SceneStore, with_true_depths
 from completesplat.data.loading.view_selection import evaluation_views
 from completesplat.data.sequences import PosedSequence
-from completesplat.data.validation import BadAnnotation, at, field, finite_array, read_json
+from completesplat.data.validation import BadAnnotation, errors_at, field, finite_array, read_json
 from completesplat.errors import DataError
 from completesplat.geometry.surfaces import hidden_from
 from completesplat.scene import SceneBatch
@@ -138,7 +138,7 @@ class HiddenModeScenes:
     def _modes_of(self, name: str) -> tuple[int, Float[Tensor, " mode"]]:
         """Return the index of a scene's true mode, and the probabilities of all modes."""
         record, modes = self.record(name), list(self.chances)
-        with at(record):
+        with errors_at(record):
             content = read_json(record)
             hidden = field(content, "hidden", str)
             if hidden not in modes:

@@ -90,10 +90,10 @@ def shared_names(splits: Mapping[str, Collection[str]]) -> dict[str, list[str]]:
 
 def overlaps(shared: Mapping[str, Sequence[str]]) -> list[str]:
     """Return a sentence for each pair of `shared_names`."""
-    return [f"{len(names)} sequences are in both {pair}: {shortened(names)}" for pair, names in shared.items()]
+    return [f"{len(names)} sequences are in both {pair}: {first_names(names)}" for pair, names in shared.items()]
 
 
-def shortened(names: Sequence[str], most: int = 5) -> str:
+def first_names(names: Sequence[str], most: int = 5) -> str:
     """Return the first few names for a message."""
     return ", ".join([*names[:most], *(["..."] if len(names) > most else [])])
 

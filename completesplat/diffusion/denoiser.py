@@ -9,7 +9,7 @@ from diffusers.models.attention_processor import Attention, AttnProcessor2_0
 from jaxtyping import Int
 from torch import Tensor, nn
 
-from completesplat.diffusion.guidance import Features, Latents
+from completesplat.diffusion.guidance import Conditioning, Latents
 from completesplat.settings.schema import Few, Levels, Width, Widths
 
 
@@ -64,7 +64,7 @@ class ConditionalUNet(nn.Module):
         if gradient_checkpointing:
             self.network.enable_gradient_checkpointing()
 
-    def forward(self, noisy_latent: Latents, timestep: Int[Tensor, " batch"], conditioning: Features) -> Latents:
+    def forward(self, noisy_latent: Latents, timestep: Int[Tensor, " batch"], conditioning: Conditioning) -> Latents:
         """Predict the noise in h_t (paper, Eq. 3), or another target of training (`objective.target`), in float32."""
         inputs = torch.cat([conditioning, noisy_latent], dim=1)
         sample: Tensor = self.network(inputs, timestep, **self.context_of(len(inputs))).sample
@@ -75,7 +75,7 @@ class ConditionalUNet(nn.Module):
         return {}
 
 
-class AttentionToNothing(AttnProcessor2_0):
+class ZeroTokenAttention(AttnProcessor2_0):
     """Cross-attention to one token of zeros; without gradients, it computes the same values without queries and keys.
 
     In training, queries and keys are computed because DDP waits for every weight's gradient, even if it is zero.
@@ -119,7 +119,7 @@ class TextlessStableDiffusion(ConditionalUNet):
         for module in self.network.modules():
             if isinstance(module, BasicTransformerBlock):
                 crossing: Any = module.attn2
-                crossing.set_processor(AttentionToNothing())  # type: ignore[no-untyped-call]
+                crossing.set_processor(ZeroTokenAttention())  # type: ignore[no-untyped-call]
         self.register_buffer("context", torch.zeros(1, 1, context_channels), persistent=False)
 
     def context_of(self, batch: int) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.settings.schema import Share, check_value
 
 Latents = Float[Tensor, "batch channel height width"]
-Features = Float[Tensor, "batch feature height width"]
+Conditioning = Float[Tensor, "batch feature height width"]
 Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Denoiser: (noisy latent, timestep, conditioning) -> predicted noise."""
 
@@ -36,7 +36,7 @@ def allowed_skip_weight(given: float | None, visible: Tensor | None = None) -> f
 
 
 def guided_noise(
-    denoise: Denoise, noisy_latent: Latents, timestep: Int[Tensor, " batch"], conditioning: Features, weight: float
+    denoise: Denoise, noisy_latent: Latents, timestep: Int[Tensor, " batch"], conditioning: Conditioning, weight: float
 ) -> Latents:
     """Return eps = (1 - w) * eps_conditional + w * eps_unconditional, with w in [0, 1].
 

@@ -2,22 +2,29 @@
 
 import copy
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
 from diffusers import DDIMScheduler
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
-from completesplat.diffusion.guidance import Denoise, Features, Latents, guided_noise
+from completesplat.diffusion.guidance import Conditioning, Denoise, Latents, guided_noise
 from completesplat.diffusion.objective import clean_estimate, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.schema import Range
 
-Part = TypeVar("Part")
+T = TypeVar("T")
 logger = logging.getLogger(__name__)
+
+SMALL = 20_000_000
+"""Parameters of a denoiser below which samples are drawn side by side (notebooks/experiments.md)."""
+PART = 4
+"""Samples that one thread draws at a time with a small denoiser."""
 
 OnStep = Callable[[int, int, Tensor], None]
 """Callback: (number of the denoiser call, timestep, estimate of the clean latent) -> None."""
@@ -43,7 +50,7 @@ class Sampler:
         self,
         denoise: Denoise,
         noise: Latents,
-        conditioning: Features,
+        conditioning: Conditioning,
         guidance_weight: float = 0.0,
         steps: int | None = None,
         on_step: OnStep | None = None,
@@ -137,16 +144,42 @@ def draw_noise(
     return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(number)) for number in seeds])
 
 
-def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None) -> list[Part]:
+@contextmanager
+def one_thread_each(denoiser: nn.Module, device: torch.device) -> Iterator[int]:
+    """On a processor, let each operation of a small denoiser use one thread; yield how many threads torch had, else 0.
+
+    A sample has hundreds of operations of a tenth of a millisecond. Threads that share each of them wait for each other
+    as often, and beside another busy process they wait for a core, too. Threads that draw parts of all samples do not,
+    and parts of `PART` samples are the same however many threads draw them.
+    """
+    before = torch.get_num_threads()
+    if device.type != "cpu" or sum(parameter.numel() for parameter in denoiser.parameters()) > SMALL:
+        yield 0
+        return
+    torch.set_num_threads(1)
+    try:
+        yield before
+    finally:
+        torch.set_num_threads(before)
+
+
+def in_parts(draw: Callable[[slice], T], count: int, most: int | None = None, threads: int = 0) -> list[T]:
     """Call `draw` for all of `count` samples in order, at most `most` at a time (None: all at once).
 
     If a GPU's memory does not suffice, log a warning and draw with parts of half the size.
 
+    Args:
+        threads: number of parts that are drawn at the same time, each by one thread.
+
     Raises:
         torch.cuda.OutOfMemoryError: a single sample does not fit.
     """
-    parts: list[Part] = []
+    parts: list[T] = []
     start, size = 0, min(count if most is None else most, count)
+    if threads > 1 and size < count:
+        with ThreadPoolExecutor(threads) as pool:
+            slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
+            return list(pool.map(_with_modes_of_this_thread(draw), slices))
     while start < count:
         try:
             parts.append(draw(slice(start, min(start + size, count))))
@@ -160,3 +193,16 @@ def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None)
         logger.warning("%d samples do not fit into the GPU's memory; going on with %d at a time", size, (size + 1) // 2)
         size = (size + 1) // 2
     return parts
+
+
+def _with_modes_of_this_thread(draw: Callable[[slice], T]) -> Callable[[slice], T]:
+    """Return a function that another thread can call: torch keeps gradients, inference and autocast for each thread."""
+    grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+    cast = torch.get_autocast_dtype("cpu"), torch.is_autocast_enabled("cpu")
+
+    def in_modes(part: slice) -> T:
+        torch.set_num_threads(1)
+        with torch.autocast("cpu", *cast), torch.inference_mode(inference), torch.set_grad_enabled(grad):
+            return draw(part)
+
+    return in_modes

@@ -23,7 +23,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import cleaned, transparent
 from completesplat.export.mesh import VOXELS, Mesh, mesh_of
 from completesplat.export.ply import write_ply
-from completesplat.export.splat_transform import PageView, SplatTransform, write_page
+from completesplat.export.splat_transform import PageView, SplatTransform, write_turning_page
 from completesplat.files import write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import transform_points
@@ -93,7 +93,7 @@ def write_formats(
         elif converter is None or kind == "mesh":
             raise CompleteSplatError(f"a {'rasterizer' if kind == 'mesh' else 'converter'} is needed for {kind}")
         elif kind == "html":
-            write_page(target, clipped, view, converter)
+            write_turning_page(target, clipped, view, converter)
         else:
             stored = clipped[~transparent(clipped)] if kind == "spz" else clipped
             if not stored.count:

@@ -33,7 +33,7 @@ STOPS = [
 ]
 
 
-def to_bytes(images: Colors) -> UInt8[np.ndarray, "*batch height width 3"]:
+def to_pixels(images: Colors) -> UInt8[np.ndarray, "*batch height width 3"]:
     """Convert images (sRGB, clamped to [0, 1]) to bytes, channels last; raise ValueError if a value is not finite."""
     if not images.isfinite().all():
         raise ValueError("images hold values that are not finite")
@@ -58,7 +58,7 @@ def image_grid(*rows: Float[Tensor, "_ 3 height width"], factor: int = 3) -> Ima
     columns = max(len(row) for row in rows)
     filled = [torch.cat([row, torch.ones(columns - len(row), *row.shape[1:]).to(row)]) for row in rows]
     whole = rearrange(torch.stack(filled), "row column rgb height width -> rgb (row height) (column width)")
-    return Image.fromarray(to_bytes(enlarge(whole, factor)))
+    return Image.fromarray(to_pixels(enlarge(whole, factor)))
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def image_sheet(headings: Sequence[str] | None, rows: Sheet, title: str | None =
         for cell, left in zip(row, lefts, strict=False):
             if cell is not None:
                 draw.text((left, top - LINE), cell.label, INK, font)
-                pixels = to_bytes(enlarge(cell.image, factor))
+                pixels = to_pixels(enlarge(cell.image, factor))
                 sheet.paste(Image.fromarray(np.ascontiguousarray(pixels)), (left, top))
     return sheet
 

@@ -16,7 +16,7 @@ from completesplat.files import write_bytes
 from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.harmonics import LARGEST_DEGREE, SH_C0, coefficients, degree_of
 from completesplat.geometry.rotations import normalize_quaternion
-from completesplat.ply_files import header, read_vertices
+from completesplat.ply_files import read_vertices, vertex_header
 
 SMALLEST_ALPHA = 1e-6
 AXES_COMMENT = "coordinates as given, none turned; camera frames have +x right, +y down, +z forward (OpenCV)"
@@ -43,7 +43,7 @@ def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
     """
     table = _table(cleaned(gaussians, path))
     names = [*WRITTEN[:9], *_further_names(table.shape[1] - len(WRITTEN)), *WRITTEN[9:]]
-    first = header(len(table), [(name, "float") for name in names], (AXES_COMMENT, *comments))
+    first = vertex_header(len(table), [(name, "float") for name in names], (AXES_COMMENT, *comments))
     write_bytes(path, first + table.numpy().astype("<f4").tobytes())
     return len(table)
 

@@ -23,7 +23,7 @@ from completesplat.export.images import (
     image_sheet,
     strip,
     surface_depth,
-    to_bytes,
+    to_pixels,
     write_png,
 )
 from completesplat.export.mesh import check_available
@@ -54,7 +54,7 @@ CONVENTIONS = {
 
 
 @dataclass(frozen=True)
-class Wanted:
+class OutputFiles:
     """Selection of the files that are written for each prediction.
 
     Raises:
@@ -136,7 +136,7 @@ def write_prediction(
     image: Float[Tensor, "3 size size"],
     shots: Sequence[Shot],
     rasterizer: Rasterizer,
-    wanted: Wanted,
+    wanted: OutputFiles,
     settings: Mapping[str, Any],
     on_sample: Callable[[], None] = lambda: None,
 ) -> None:
@@ -225,7 +225,7 @@ def write_scene(
     suffix: str,
     shot: Shot,
     rasterizer: Rasterizer,
-    wanted: Wanted,
+    wanted: OutputFiles,
     comments: Sequence[str],
 ) -> tuple[Frames, Float[Tensor, "1 height width"], dict[str, str]]:
     """Write a scene's splats (`NAME.ply`, ...) in the units of files, and videos (`orbitSUFFIX.mp4`).
@@ -315,7 +315,7 @@ def write_maps(
         for kind, image in maps.items():
             name = f"{kind}_{index:02}"
             files[name] = f"{name}.png"
-            write_png(folder / files[name], Image.fromarray(to_bytes(image)))
+            write_png(folder / files[name], Image.fromarray(to_pixels(image)))
     return files, ends
 
 

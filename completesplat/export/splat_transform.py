@@ -97,9 +97,9 @@ class PageView:
     background: float
 
 
-def write_page(path: Path, gaussians: Gaussians, view: PageView, converter: SplatTransform) -> None:
+def write_turning_page(path: Path, gaussians: Gaussians, view: PageView, converter: SplatTransform) -> None:
     """Write a page with the upright scene, seen from the front and turning until a person touches it."""
-    turn = upright(view.up)
+    turn = upright_rotation(view.up)
     with tempfile.TemporaryDirectory() as folder:
         scene, settings = Path(folder) / "scene.ply", Path(folder) / "settings.json"
         write_ply(scene, gaussians.transform(turn))
@@ -121,7 +121,7 @@ def around_the_target(page: bytes) -> bytes:
     return page.replace(b"<title>SuperSplat Viewer</title>", b"<title>completesplat</title>")
 
 
-def upright(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
+def upright_rotation(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
     """Return the rotation that turns `up` to -y, as the viewer expects in files, and keeps forward in front."""
     down = -torch.nn.functional.normalize(up, dim=-1)
     axes = torch.eye(3, dtype=up.dtype, device=up.device)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.export.images import enlarge, to_bytes
+from completesplat.export.images import enlarge, to_pixels
 from completesplat.files import atomic_path
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -16,7 +16,7 @@ from completesplat.rasterizers import Rasterizer
 SMALLEST_SIDE = 256
 CHUNK = 8  # views that are rendered at a time
 Frames = Float[Tensor, "frame 3 height width"]
-Depths = Float[Tensor, "frame 1 height width"]
+DepthMaps = Float[Tensor, "frame 1 height width"]
 
 
 def orbit_views(
@@ -27,7 +27,7 @@ def orbit_views(
     frames: int,
     background: float,
     up: Float[Tensor, "3"],
-) -> tuple[Frames, Depths]:
+) -> tuple[Frames, DepthMaps]:
     """Call `render_views` for a full turn around the upward axis through the pivot, from the reference camera on."""
     return render_views(rasterizer, gaussians, orbit(reference, pivot, up, frames), background)
 
@@ -35,7 +35,7 @@ def orbit_views(
 @torch.no_grad()
 def render_views(
     rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras, background: float
-) -> tuple[Frames, Depths]:
+) -> tuple[Frames, DepthMaps]:
     """Return images of one unbatched scene from several cameras, and expected depths (0 where nothing is seen)."""
     images, depths = [], []
     for start in range(0, len(cameras.world_to_camera), CHUNK):
@@ -68,7 +68,7 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
             for frame in frames:
                 large = enlarge(frame, factor)
                 padded = torch.nn.functional.pad(large[None], (0, wide % 2, 0, tall % 2), mode="replicate")[0]
-                writer.append_data(to_bytes(padded))  # type: ignore[attr-defined]
+                writer.append_data(to_pixels(padded))  # type: ignore[attr-defined]
         # ffmpeg is another process, and imageio does not pass on its errors.
         if not _is_whole(temporary):
             raise RuntimeError(f"{path}: was not written to its end")

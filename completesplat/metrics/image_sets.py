@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.errors import WeightsError
-from completesplat.metrics.images import Images, Missing, unless_missing
+from completesplat.metrics.images import Images, MissingMetrics, load_or_missing
 from completesplat.weights import first_line, weights_file
 
 URL = "https://nvlabs-fi-cdn.nvidia.com/stylegan2-ada-pytorch/pretrained/metrics/inception-2015-12-05.pt"
@@ -20,7 +20,7 @@ SHA256 = "f58cb9b6ec323ed63459aa4fb441fe750cfe39fafad6da5cb504a16f19e958f4"
 ADVICE = "give inception-2015-12-05.pt as evaluation.scoring.sets.inception.weights=FILE_OR_URL"
 DOWNLOAD_ADVICE = f"fetch Inception with `curl -LO {URL}` and give it as evaluation.scoring.sets.inception.weights=FILE"
 
-Settings = Mapping[str, str | int]
+MetricSettings = Mapping[str, str | int]
 Descriptors = Float[Tensor, "image feature"]
 FirstSet = Float[Tensor, "first feature"]
 SecondSet = Float[Tensor, "second feature"]  # of another number of images
@@ -38,7 +38,7 @@ class SetMetric(Protocol):
     def distances(self, true: Descriptors, predicted: Descriptors) -> dict[str, float]:
         """Return figures by name; lower is better."""
 
-    def settings(self) -> dict[str, Settings]:
+    def settings(self) -> dict[str, MetricSettings]:
         """Return the settings that figures depend on, by the figures' names."""
 
 
@@ -100,16 +100,16 @@ class Inception:
         """See `SetMetric`; raise RuntimeError for a single image, which has no covariance."""
         return {"fid": frechet_distance(true, predicted), "kid": kernel_distance(true, predicted, self.subset_size)}
 
-    def settings(self) -> dict[str, Settings]:
+    def settings(self) -> dict[str, MetricSettings]:
         """See `SetMetric`."""
         network = {"network": "inception-2015-12-05", "features": "pool, 2048"}
         return {"fid": network, "kid": network | {"subset_size": self.subset_size, "subsets": 100, "factor": 1}}
 
 
-def inception(weights: str | None, sha256: str | None = None, subset_size: int = 1000) -> Inception | Missing:
+def inception(weights: str | None, sha256: str | None = None, subset_size: int = 1000) -> Inception | MissingMetrics:
     """Return FID and KID, or why they are missing; see `load_inception` for the weights."""
     load = lambda source: load_inception(source, sha256, subset_size)  # noqa: E731
-    return unless_missing(weights, load, ADVICE, ("fid", "kid"))
+    return load_or_missing(weights, load, ADVICE, ("fid", "kid"))
 
 
 def load_inception(weights: str = URL, sha256: str | None = SHA256, subset_size: int = 1000) -> Inception:

@@ -23,7 +23,7 @@ ADVICE = "give torchvision's VGG16 as evaluation.scoring.perceptual.vgg_weights=
 
 
 @dataclass(frozen=True)
-class Missing:
+class MissingMetrics:
     """Metrics that cannot be measured: the reason, and the names that are absent from results."""
 
     reason: str
@@ -33,14 +33,16 @@ class Missing:
         return f"missing: {self.reason}"
 
 
-def unless_missing(weights: str | None, load: Callable[[str], T], advice: str, names: tuple[str, ...]) -> T | Missing:
-    """Load a metric; return `Missing` with `advice` if `weights` is None, or with the error if they are unusable."""
+def load_or_missing(
+    weights: str | None, load: Callable[[str], T], advice: str, names: tuple[str, ...]
+) -> T | MissingMetrics:
+    """Load a metric; return `MissingMetrics` with `advice` without `weights`, or with the error of unusable ones."""
     if weights is None:
-        return Missing(advice, names)
+        return MissingMetrics(advice, names)
     try:
         return load(weights)
     except WeightsError as error:
-        return Missing(" ".join(str(error).split()), names)
+        return MissingMetrics(" ".join(str(error).split()), names)
 
 
 def psnr(predicted: Images, true: Images) -> PerImage:
@@ -86,7 +88,7 @@ def object_only(images: Images, masks: Float[Tensor, "image 1 height width"]) ->
     return torch.where(masks > 0.5, images, torch.zeros_like(images))
 
 
-def perceptual_metric(vgg_weights: str | None, vgg_sha256: str | None = None) -> PerceptualDistance | Missing:
+def perceptual_metric(vgg_weights: str | None, vgg_sha256: str | None = None) -> PerceptualDistance | MissingMetrics:
     """Return LPIPS with VGG16 as in the paper (Tables 2 to 5), or why it is missing; see `load_vgg16`."""
     load = lambda weights: PerceptualDistance(load_vgg16(weights, vgg_sha256), load_heads())  # noqa: E731
-    return unless_missing(vgg_weights, load, ADVICE, ("lpips",))
+    return load_or_missing(vgg_weights, load, ADVICE, ("lpips",))

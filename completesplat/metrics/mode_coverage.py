@@ -4,18 +4,18 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-Samples = Float[Tensor, "sample pixel 3"]
-Modes = Float[Tensor, "mode pixel 3"]
+SampledPixels = Float[Tensor, "sample pixel 3"]
+ModePixels = Float[Tensor, "mode pixel 3"]
 Probabilities = Float[Tensor, " mode"]
 REJECTED = -1
 
 
-def distances(samples: Samples, modes: Modes) -> Float[Tensor, "sample mode"]:
+def distances(samples: SampledPixels, modes: ModePixels) -> Float[Tensor, "sample mode"]:
     """Return the root mean square difference of every sample and every mode."""
     return torch.stack([(samples - mode).square().mean((1, 2)).sqrt() for mode in modes], dim=1)
 
 
-def classify(samples: Samples, modes: Modes, probabilities: Probabilities) -> Int64[Tensor, " sample"]:
+def classify(samples: SampledPixels, modes: ModePixels, probabilities: Probabilities) -> Int64[Tensor, " sample"]:
     """Return the mode of each sample, or `REJECTED` if it is not near enough to one of at least two modes."""
     between = distances(modes, modes).fill_diagonal_(torch.inf)
     nearest, mode = distances(samples, modes).min(dim=1)
@@ -30,7 +30,7 @@ def mean_of(modes: Float[Tensor, "mode *image _"], probabilities: Float[Tensor, 
     return mean
 
 
-def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> dict[str, float]:
+def scores(samples: SampledPixels, modes: ModePixels, probabilities: Probabilities) -> dict[str, float]:
     """Score one scene; samples and modes are the region's pixels of all views in one row.
 
     `coverage`: share of the modes (of positive probability) that at least one sample belongs to. `total_variation`:

@@ -11,18 +11,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from completesplat.data.loading.distributed import gathered
+from completesplat.data.loading.distributed import gather_values
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.surfaces import hidden_from
 from completesplat.metrics.image_sets import ImageSets, SetMetric
-from completesplat.metrics.images import Missing, object_only, psnr, sharpness, ssim
+from completesplat.metrics.images import MissingMetrics, object_only, psnr, sharpness, ssim
 from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
 from completesplat.scene import SceneBatch, Views
 
 ImageMetric = Callable[[Tensor, Tensor], Tensor]
 Scores = dict[tuple[str, str, str], float]
-Depths = Float[Tensor, "image 1 height width"]
-Samples = Float[Tensor, "sample view 3 height width"]
+DepthMaps = Float[Tensor, "image 1 height width"]
+SampledViews = Float[Tensor, "sample view 3 height width"]
 REGIONS = ("full", "object")
 PROPER_REGIONS = ("full", "hidden")
 MODEL, BEST, BEST_BY_METRIC, MEAN = "model", "best_of_k", "best_of_k_by_metric", "mean_of_k"
@@ -53,14 +53,14 @@ class Evaluation:
         samples: int = 1,
         criterion: str = "psnr",
         seed: int = 0,
-        perceptual: ImageMetric | Missing | None = None,
-        sets: Mapping[str, SetMetric | Missing | None] | None = None,
+        perceptual: ImageMetric | MissingMetrics | None = None,
+        sets: Mapping[str, SetMetric | MissingMetrics | None] | None = None,
     ) -> None:
         self.metrics: dict[str, ImageMetric] = {"psnr": psnr, "ssim": ssim}
-        if perceptual is not None and not isinstance(perceptual, Missing):
+        if perceptual is not None and not isinstance(perceptual, MissingMetrics):
             self.metrics["lpips"] = perceptual
         candidates = list((sets or {}).values())
-        absent = [metric for metric in (perceptual, *candidates) if isinstance(metric, Missing)]
+        absent = [metric for metric in (perceptual, *candidates) if isinstance(metric, MissingMetrics)]
         self.missing = {name: str(metric) for metric in absent for name in metric.names}
         if samples < 1:
             raise CompleteSplatError(f"evaluation.scoring.samples={samples}: must be at least 1")
@@ -68,7 +68,9 @@ class Evaluation:
             message = self.missing.get(criterion, f"choose one of {', '.join(self.metrics)}")
             raise CompleteSplatError(f"evaluation.scoring.criterion={criterion}: {message}")
         self.samples, self.criterion, self.seed = samples, criterion, seed
-        self.set_metrics = [metric for metric in candidates if metric is not None and not isinstance(metric, Missing)]
+        self.set_metrics = [
+            metric for metric in candidates if metric is not None and not isinstance(metric, MissingMetrics)
+        ]
         self.reset()
 
     def reset(self) -> None:
@@ -92,7 +94,7 @@ class Evaluation:
             self._add(predictor, name, self.score(clipped, truth[b]), dict.fromkeys(REGIONS, clipped), truth[b])
 
     @torch.no_grad()
-    def update_samples(self, name: str, images: Samples, truth: Views) -> None:
+    def update_samples(self, name: str, images: SampledViews, truth: Views) -> None:
         """Add the scores of one scene's samples: of the first, of the best ones (`BEST_RULES`), and their mean."""
         images = images.clamp(0, 1)
         each = [self.score(sample, truth) for sample in images]
@@ -100,7 +102,9 @@ class Evaluation:
         if len(each) == 1:
             return
         chosen = {
-            (region, metric): best([scores[region, "novel", metric] for scores in each], HIGHER_IS_BETTER[metric])
+            (region, metric): best_sample(
+                [scores[region, "novel", metric] for scores in each], HIGHER_IS_BETTER[metric]
+            )
             for region in REGIONS
             for metric in self.metrics
         }
@@ -158,7 +162,7 @@ class Evaluation:
         """Merge the scores of all processes; each of them must call this."""
         local = self.scores, self.views, self.drawn, self.sets.described, self.skipped
         self.reset()
-        for scores, views, drawn, sets, skipped in gathered(local):
+        for scores, views, drawn, sets, skipped in gather_values(local):
             for predictor, scenes in scores.items():
                 self.scores[predictor] |= scenes
             self.views |= views
@@ -195,7 +199,7 @@ def _means(rows: Sequence[Sequence[float]]) -> list[float]:
     return [sum(values) / len(rows) for values in zip(*rows, strict=True)]
 
 
-def noisy_mean(images: Samples, seed: int) -> Samples:
+def noisy_mean(images: SampledViews, seed: int) -> SampledViews:
     """Return as many images: the samples' mean plus white noise of the same variance as the samples.
 
     Best of k gains from this noise too, so a gain of that size does not speak for the samples.
@@ -204,7 +208,7 @@ def noisy_mean(images: Samples, seed: int) -> Samples:
     return (images.mean(0) + images.var(0).mean().sqrt() * noise).clamp(0, 1)
 
 
-def proper_scores(images: Samples, truth: Views) -> tuple[Scores, dict[str, list[float]]]:
+def proper_scores(images: SampledViews, truth: Views) -> tuple[Scores, dict[str, list[float]]]:
     """Return `energy`, `crps` and rank histograms of the novel views, for each region of `novel_values`."""
     scores: Scores = {}
     ranks = {}
@@ -215,7 +219,9 @@ def proper_scores(images: Samples, truth: Views) -> tuple[Scores, dict[str, list
     return scores, ranks
 
 
-def novel_values(images: Samples, truth: Views) -> dict[str, tuple[Float[Tensor, "sample n"], Float[Tensor, " n"]]]:
+def novel_values(
+    images: SampledViews, truth: Views
+) -> dict[str, tuple[Float[Tensor, "sample n"], Float[Tensor, " n"]]]:
     """Return the values of the samples and the true values by region; the first view of `truth` is the reference.
 
     Regions are all pixels (`full`) and, if true depth is known, those that the reference view does not show (`hidden`).
@@ -236,7 +242,9 @@ def _counted(truth: Views, region: str) -> Bool[Tensor, "view 1 height width"]:
     return truth.masks > 0.5 if region == "object" else torch.ones_like(truth.masks, dtype=torch.bool)
 
 
-def depth_errors(predicted: Depths, true: Depths, valid: Bool[Tensor, "image 1 _ _"]) -> list[dict[str, float] | None]:
+def depth_errors(
+    predicted: DepthMaps, true: DepthMaps, valid: Bool[Tensor, "image 1 _ _"]
+) -> list[dict[str, float] | None]:
     """Return each image's errors over valid pixels with finite, positive true depth, without aligning the scale.
 
     `abs_rel`: mean of |predicted - true| / true; `rmse`: in the depth's unit; `delta1`: share of pixels where
@@ -256,7 +264,7 @@ def depth_errors(predicted: Depths, true: Depths, valid: Bool[Tensor, "image 1 _
     return errors
 
 
-def best(scores: Sequence[float], higher_is_better: bool = True) -> int:
+def best_sample(scores: Sequence[float], higher_is_better: bool = True) -> int:
     """Return the index of the best sample, the first of equals."""
     return scores.index(_worst_first(scores, higher_is_better)[-1])
 
@@ -279,7 +287,7 @@ def _worst_first(scores: Sequence[float], higher_is_better: bool) -> list[float]
     return sorted(scores, reverse=not higher_is_better)
 
 
-def diversity(images: Samples) -> float:
+def diversity(images: SampledViews) -> float:
     """Return the root mean square difference of two samples' renders, averaged over all pairs and views."""
     differences = [(a - b).square().mean((1, 2, 3)).sqrt() for a, b in combinations(images, 2)]
     return torch.stack(differences).mean().item()

@@ -74,7 +74,7 @@ class Rasterizer(Protocol):
 Render = TypeVar("Render", bound=Callable[..., Rendering])
 
 
-def as_seen(render: Render) -> Render:
+def with_view_colors(render: Render) -> Render:
     """Decorate a backend's `__call__`, so that it draws `DirectionalGaussians` in the colours that each camera sees.
 
     Each view becomes a scene with one camera. Every backend has this decorator.

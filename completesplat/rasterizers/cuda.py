@@ -13,7 +13,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.rotations import normalize_quaternion
-from completesplat.rasterizers import Rendering, RenderingConstants, as_seen, require_float32
+from completesplat.rasterizers import Rendering, RenderingConstants, require_float32, with_view_colors
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
 
 DEVICE = "cuda"
@@ -66,7 +66,7 @@ class CudaRasterizer:
         self._near_plane = float(np.nextafter(np.float32(self.constants.near_plane), np.float32(np.inf)))
         self._rasterization = gsplat.rasterization
 
-    @as_seen
+    @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Render scenes [batch] from cameras [batch view]; CPU tensors are copied to the GPU and the images back."""
         home = gaussians.means.device
@@ -116,7 +116,7 @@ def _magnification(cameras: Cameras, constants: RenderingConstants) -> Float[Ten
     height, width = cameras.image_size
     focal = torch.diagonal(cameras.intrinsics, dim1=-2, dim2=-1)[..., :2]
     principal = cameras.intrinsics[..., :2, 2]
-    extent = torch.tensor([width, height], dtype=focal.dtype, device=focal.device)
+    extent = torch.stack([torch.full_like(focal[..., 0], side) for side in (width, height)], -1)  # without a copy
     slope = (torch.maximum(principal, extent - principal) + constants.frustum_margin * 0.5 * extent) / focal
     return (focal * (1 + slope.square()).sqrt()).amax(-1)
 

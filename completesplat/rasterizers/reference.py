@@ -7,7 +7,7 @@ from torch.utils.checkpoint import checkpoint
 
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_centers, transform_points
-from completesplat.rasterizers import Rendering, RenderingConstants, as_seen
+from completesplat.rasterizers import Rendering, RenderingConstants, with_view_colors
 from completesplat.tensors import stack
 
 # In px and px^2. Products of two such numbers are still finite in float32.
@@ -26,7 +26,7 @@ class ReferenceRasterizer:
     def __init__(self, constants: RenderingConstants | None = None) -> None:
         self.constants = constants or RenderingConstants()
 
-    @as_seen
+    @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Render scenes [batch] from cameras [batch view]."""
         batch, view = cameras.world_to_camera.shape[:2]

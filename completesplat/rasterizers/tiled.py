@@ -10,9 +10,9 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.rasterizers import Rendering, RenderingConstants, as_seen, require_float32
+from completesplat.rasterizers import Rendering, RenderingConstants, require_float32, with_view_colors
 from completesplat.rasterizers.kernels import array_layout as layout
-from completesplat.rasterizers.kernels.drawing import Drawing, Images, Parameters
+from completesplat.rasterizers.kernels.drawing import Drawing, Parameters, RenderedImages
 
 WIDTHS: dict[str, list[int]] = {"means": [3], "quaternions": [4], "scales": [3], "opacities": [], "colors": [3]}
 SMALLEST_BLUR = 1e-5  # px^2; with it, the reference's clamp on the determinant (1e-10) never applies
@@ -36,7 +36,7 @@ class TiledRasterizer:
         if not (self.constants.near_plane >= 0 and self.constants.min_transmittance >= 0):
             raise CompleteSplatError("the tiled rasterizer needs near_plane and min_transmittance of at least 0")
 
-    @as_seen
+    @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Render scenes [batch] from cameras [batch view]; CUDA tensors are copied here and the images back."""
         if gaussians.means.is_cuda:
@@ -99,7 +99,7 @@ class _Rasterize(torch.autograd.Function):
             torch.from_numpy(np.zeros(image.shape, np.float32)) if gradient is None else gradient.contiguous()
             for image, gradient in zip(images, image_gradients, strict=True)
         ]
-        gradients = ctx.drawing.backward(Images(*_arrays(images)), Images(*_arrays(filled)))
+        gradients = ctx.drawing.backward(RenderedImages(*_arrays(images)), RenderedImages(*_arrays(filled)))
         return None, None, *(torch.from_numpy(gradient) for gradient in gradients)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
-from completesplat.results.runs import MODEL, UPPER_BOUND, Protocol, Result, Scores, flat
+from completesplat.results.runs import MODEL, UPPER_BOUND, FlatScores, Protocol, ResultsFile, flat_scores
 from completesplat.results.tables import (
     ABSENT,
     LEGEND,
@@ -59,7 +59,7 @@ MODES_EXPLAINED = (
 Measured = TypeVar("Measured")
 
 
-def alike(measurements: Iterable[tuple[Measured, Protocol]], *more: str) -> list[list[Measured]]:
+def group_by_protocol(measurements: Iterable[tuple[Measured, Protocol]], *more: str) -> list[list[Measured]]:
     """Group measurements by equal protocols, in a fixed order; only scores within a group can be compared."""
     groups: dict[str, list[Measured]] = {}
     for measured, protocol in measurements:
@@ -92,13 +92,13 @@ class Entry:
     """
 
     label: str
-    scores: Scores
+    scores: FlatScores
     scenes: int | str | None
     predictor: str = MODEL
     upper_bound: bool = False
     seeds: int | None = None
     steps: int | str | None = None
-    deviations: Scores = field(default_factory=dict)
+    deviations: FlatScores = field(default_factory=dict)
     protocol: Protocol = field(default_factory=Protocol)
     note: str = ""
     lacking: str = ""
@@ -155,12 +155,12 @@ def leading_headings(keys: Iterable[str]) -> list[Heading]:
     return [Heading(LEADING[key], group, key not in ("method", "speed")) for key, group in named]
 
 
-def entries_of(runs: Iterable[Result]) -> list[Entry]:
+def entries_of(runs: Iterable[ResultsFile]) -> list[Entry]:
     """Return all entries of all runs, in the order of their files."""
     return [_entry(run, predictor, scores) for run in runs for predictor, scores in run.entries.items()]
 
 
-def _entry(run: Result, predictor: str, scores: Scores) -> Entry:
+def _entry(run: ResultsFile, predictor: str, scores: FlatScores) -> Entry:
     protocol, label = run.protocol, predictor.replace("_", " ")
     entry = Entry(label, scores, protocol["scenes"], predictor, bool(scores.get(UPPER_BOUND)), protocol=protocol)
     if entry.ours:
@@ -189,7 +189,7 @@ def time_cell(seconds: float | None) -> Cell:
 
 def score_tables(entries: Sequence[Entry]) -> list[Table]:
     """Return a table for each protocol, in the order of data sets and protocols."""
-    groups = alike((entry, entry.protocol) for entry in entries)
+    groups = group_by_protocol((entry, entry.protocol) for entry in entries)
     return [_score_table(f"own_{index}", group) for index, group in enumerate(groups, 1)]
 
 
@@ -223,7 +223,7 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = M
     Args:
         model: the label of the predictor that is the model.
     """
-    records = {model if name == MODEL else name: flat(entry) for name, entry in results.items()}
+    records = {model if name == MODEL else name: flat_scores(entry) for name, entry in results.items()}
     first = next(iter(records.values()))
     names = _evaluated(list(records.values()))
     entries = []
@@ -240,7 +240,7 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = M
     return Table(title, title, headings, rows, [*remarks, SSIM_NOTE, SHARPNESS_NOTE])
 
 
-def _evaluated(records: Sequence[Scores]) -> list[str]:
+def _evaluated(records: Sequence[FlatScores]) -> list[str]:
     """Return the names of the scores in the table, fewer than there are: more columns are too wide."""
     pairs = [(f"object_novel_{name}", f"full_novel_{name}") for name in ("psnr", "ssim")]
     masked = any(record.get(name) != record.get(whole) for record in records for name, whole in pairs)
@@ -250,13 +250,13 @@ def _evaluated(records: Sequence[Scores]) -> list[str]:
     return [name for name in present if not name.startswith(apart)]
 
 
-def mode_tables(runs: Sequence[Result]) -> list[Table]:
+def mode_tables(runs: Sequence[ResultsFile]) -> list[Table]:
     """Return a table for each protocol and number of samples."""
-    groups = alike(((run, run.protocol) for run in runs), "samples")
+    groups = group_by_protocol(((run, run.protocol) for run in runs), "samples")
     return [_mode_table(f"hidden_modes_{index}", group) for index, group in enumerate(groups, 1)]
 
 
-def _mode_table(name: str, runs: Sequence[Result]) -> Table:
+def _mode_table(name: str, runs: Sequence[ResultsFile]) -> Table:
     notes, records = Notes(), dict[object, dict[str, object]]()
     for run in runs:
         note = notes.number(f"{run.name}: {protocol_line(run.protocol)}.")

@@ -17,8 +17,8 @@ from completesplat.results.measured import (
     OF_RUNS,
     OURS,
     Entry,
-    alike,
     entries_of,
+    group_by_protocol,
     leading_headings,
     mode_tables,
     protocol_line,
@@ -59,7 +59,7 @@ PublishedTable = Any
 
 
 @cache
-def published() -> list[PublishedTable]:
+def read_tables() -> list[PublishedTable]:
     """Return all tables, in the paper's order."""
     return list(OmegaConf.load(FILE).tables)
 
@@ -69,7 +69,7 @@ def printed_rows(table: PublishedTable) -> list[list[Cell]]:
     return [[parse_cell(cell) for cell in line.split("|")] for line in table.rows.splitlines()]
 
 
-def scored(table: PublishedTable) -> list[tuple[int, Any, str]]:
+def score_columns(table: PublishedTable) -> list[tuple[int, Any, str]]:
     """Return number, column and data set of each column of scores."""
     numbered = enumerate(table.columns)
     return [(n, x, x.get("data_set", table.get("data_set"))) for n, x in numbered if x.key in METRICS]
@@ -83,7 +83,7 @@ def parse_cell(cell: str) -> Cell:
     return Cell(" ".join([text, *signs]), next((word for word in words if word in (BEST, SECOND)), UNMARKED))
 
 
-def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
+def comparison_table(table: PublishedTable, entries: Sequence[Entry]) -> Table:
     """Return the published rows, followed by entries of ours.
 
     Times are of one sequence, warm, for the complete pipeline.
@@ -95,13 +95,13 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
     for row in printed_rows(table):
         cells = {"resolution": Cell(table.get("resolution", ABSENT))}
         cells |= {column.key: cell for column, cell in zip(table.columns, row, strict=True)}
-        scores = [row[number] for number, _, _ in scored(table)]
+        scores = [row[number] for number, _, _ in score_columns(table)]
         rows.append(TableRow("paper", [*(cells.get(key, Cell(ABSENT)) for key in keys), *scores]))
-    names = [f"{table.region}_{table.view}_{column.key}" for _, column, _ in scored(table)]
-    data_sets = [None if table.get("options") else data_set for *_, data_set in scored(table)]
+    names = [f"{table.region}_{table.view}_{column.key}" for _, column, _ in score_columns(table)]
+    data_sets = [None if table.get("options") else data_set for *_, data_set in score_columns(table)]
     columns = list(zip(names, data_sets, strict=True))
     rows += score_rows(entries, keys, columns, notes, marked=False)
-    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in scored(table))]
+    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in score_columns(table))]
     source = f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
     signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.get("legend", {}).items()]
     apart = ([APART] if entries else []) if table.get("options") else [VIEWS]
@@ -109,7 +109,7 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
     return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
 
 
-def belongs(table: PublishedTable, entry: Entry) -> bool:
+def is_comparable(table: PublishedTable, entry: Entry) -> bool:
     """Return whether an entry was measured like the table's figures.
 
     The run followed one of the table's evaluations: the same views, resolution and number of scenes (all scenes of the
@@ -123,7 +123,7 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
         return False
     if protocol.get("background") is not None or protocol.get("skip_weight") not in (None, 1):
         return False
-    if protocol["data_set"] not in {data_set for *_, data_set in scored(table)}:
+    if protocol["data_set"] not in {data_set for *_, data_set in score_columns(table)}:
         return False
     if "subset" in table and protocol.get("subset") != table.subset:
         return False
@@ -137,7 +137,7 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
 def sweep_entries(table: PublishedTable, name: str, jobs: Sequence[Job]) -> list[Entry]:
     """Return a sweep's means over seeds by protocol, with the paper's names of their settings."""
     entries = []
-    for group in alike((job, job.protocol) for job in jobs):
+    for group in group_by_protocol((job, job.protocol) for job in jobs):
         protocol = group[0].protocol
         note = f"{name}: mean ± sample deviation over seeds; {protocol_line(protocol, ALIKE)}."
         for row in sweep_rows(group):
@@ -157,21 +157,21 @@ def published_tables(tree: RunTree | None) -> list[Table]:
         CompleteSplatError: there are no results.
     """
     if tree is None:
-        return [beside(table, []) for table in published()]
+        return [comparison_table(table, []) for table in read_tables()]
     if not (tree.scores or tree.modes or tree.warnings):
         raise CompleteSplatError(f"runs={tree.folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
-    options = {option for table in published() for option in table.get("options", [])}
+    options = {option for table in read_tables() for option in table.get("options", [])}
     jobs = {folder: [job for job in collect(folder) if job.protocol] for folder in tree.sweeps}
     sweeps = {
         folder: tested for folder, tested in jobs.items() if any(options & set(job.label.split(", ")) for job in tested)
     }
     single = entries_of(run for run in tree.scores if run.folder.parent not in sweeps)
     made, placed = [], []
-    for table in published():
+    for table in read_tables():
         if table.get("options"):
             named = [(str(folder.relative_to(tree.folder)), tested) for folder, tested in sweeps.items()]
             entries = [entry for name, tested in named for entry in sweep_entries(table, name, tested)]
         else:
-            placed += (entries := [entry for entry in single if belongs(table, entry)])
-        made.append(beside(table, entries))
+            placed += (entries := [entry for entry in single if is_comparable(table, entry)])
+        made.append(comparison_table(table, entries))
     return [*made, *score_tables([entry for entry in single if entry not in placed]), *mode_tables(tree.modes)]

@@ -23,7 +23,7 @@ MODEL, UPPER_BOUND = "model", "upper_bound"
 SEED = "seed"
 HOW = "make them with `completesplat test ckpt=RUN/checkpoints/last.ckpt out=DIR`"
 
-Scores = dict[str, float]  # scores of a predictor: `full_novel_psnr`, `seconds_inference`, `scenes`, `upper_bound`
+FlatScores = dict[str, float]  # scores of a predictor: `full_novel_psnr`, `seconds_inference`, `scenes`, `upper_bound`
 
 
 class Record(TypedDict, total=False):
@@ -62,25 +62,25 @@ def read_record(folder: Path) -> Record:
     return cast(Record, read_mapping(folder / RECORD))
 
 
-def flat(entry: Mapping[str, object]) -> Scores:
+def flat_scores(entry: Mapping[str, object]) -> FlatScores:
     """Flatten a predictor's entry in `Evaluation.results`: join the keys of all levels, and drop nulls."""
-    scores: Scores = {}
+    scores: FlatScores = {}
     for key, value in entry.items():
         if isinstance(value, Mapping):
-            scores |= {f"{key}_{name}": number for name, number in flat(value).items()}
+            scores |= {f"{key}_{name}": number for name, number in flat_scores(value).items()}
         elif isinstance(value, int | float):
             scores[key] = value
     return scores
 
 
 @dataclass(frozen=True)
-class Result:
+class ResultsFile:
     """File of results: its folder, the folder's name, how it was measured, and its scores by predictor."""
 
     folder: Path
     name: str
     protocol: Protocol
-    entries: dict[str, Scores]
+    entries: dict[str, FlatScores]
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,8 @@ class RunTree:
 
     folder: Path
     sweeps: list[Path] = field(default_factory=list)
-    scores: list[Result] = field(default_factory=list)
-    modes: list[Result] = field(default_factory=list)
+    scores: list[ResultsFile] = field(default_factory=list)
+    modes: list[ResultsFile] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
 
@@ -113,13 +113,13 @@ def find_results(folder: Path) -> RunTree:
     return tree
 
 
-def _result(path: Path, root: Path) -> Result:
+def _result(path: Path, root: Path) -> ResultsFile:
     """Read a file of results; raise ValueError, with the reason, if it is unusable."""
     content = read_mapping(path)
     if not content:
         raise ValueError("it cannot be read as a mapping in JSON")
     test = content if path.name == MODES or PROTOCOL in content else content.get("test")
-    entries = {key: flat(entry) for key, entry in _mapping(test).items() if isinstance(entry, Mapping)}
+    entries = {key: flat_scores(entry) for key, entry in _mapping(test).items() if isinstance(entry, Mapping)}
     entries.pop(PROTOCOL, None)
     statement = read_mapping(path.with_name("protocol.json")) if path.name == MODES else _mapping(test).get(PROTOCOL)
     protocol = _mapping(statement)
@@ -128,14 +128,14 @@ def _result(path: Path, root: Path) -> Result:
         raise ValueError(f"it does not say how it was measured; {HOW}")
     if not entries:
         raise ValueError("it holds no scores by predictor")
-    return Result(path.parent, str(path.parent.relative_to(root)), cast(Protocol, protocol), entries)
+    return ResultsFile(path.parent, str(path.parent.relative_to(root)), cast(Protocol, protocol), entries)
 
 
 def _mapping(value: object) -> Mapping[str, object]:
     return value if isinstance(value, Mapping) else {}
 
 
-def typed(command: Sequence[str]) -> str:
+def shell_command(command: Sequence[str]) -> str:
     """Return a command as it could be typed; its first part is the program and its verb."""
     return " ".join([*command[:1], *map(shlex.quote, command[1:])])
 
@@ -153,7 +153,7 @@ class Job:
     record: Record = field(default_factory=Record)
     finished: bool = False
     steps: int = 0
-    test: dict[str, Scores] = field(default_factory=dict)
+    test: dict[str, FlatScores] = field(default_factory=dict)
     protocol: Protocol = field(default_factory=Protocol)
     label: str = ""
 
@@ -242,7 +242,7 @@ def _job(folder: Path, name: str) -> Job:
         return Job(name)
     config = cast(Mapping[str, object], OmegaConf.to_container(OmegaConf.load(folder / CONFIG)))
     tested = _mapping(metrics.get("test"))
-    test = {name: flat(_mapping(entry)) for name, entry in tested.items() if name != PROTOCOL}
+    test = {name: flat_scores(_mapping(entry)) for name, entry in tested.items() if name != PROTOCOL}
     steps, protocol = cast(int, metrics.get("steps", 0)), cast(Protocol, _mapping(tested.get(PROTOCOL)))
     return Job(name, _pairs(record["overrides"]), config, record, bool(metrics), steps, test, protocol)
 

@@ -13,7 +13,7 @@ from hydra.types import RunMode
 
 from completesplat.results.machine import machine
 from completesplat.results.measured import Entry, score_rows
-from completesplat.results.runs import MODEL, SEED, UPPER_BOUND, Job, collect, typed
+from completesplat.results.runs import MODEL, SEED, UPPER_BOUND, Job, collect, shell_command
 from completesplat.results.tables import (
     SHOWN,
     SSIM_NOTE,
@@ -145,7 +145,8 @@ def _remarks(jobs: Sequence[Job], rows: Sequence[Entry]) -> list[str]:
     hardware = f"{here['processor']}, {here['cores']} cores{', ' + here['gpu'] if 'gpu' in here else ''}"
     software = f"{here['system']}, Python {here['python']}, torch {here['torch']}"
     remarks.append(f"Summary of {here['date']}, made on {hardware}, {software}.")
-    return [*remarks, *(f"Command: {command}" for command in dict.fromkeys(typed(r["command"]) for r in recorded))]
+    commands = dict.fromkeys(shell_command(record["command"]) for record in recorded)
+    return [*remarks, *(f"Command: {command}" for command in commands)]
 
 
 def write_summary(folder: Path, *parts: Path) -> Table:

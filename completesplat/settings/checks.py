@@ -33,7 +33,7 @@ Precision = Literal["32-true", "bf16-mixed", "16-mixed", 32, "bf16", 16]
 """Lightning's precisions with weights in float32, which Gaussians and cameras need."""
 
 
-class Trainer(TypedDict):
+class TrainerSettings(TypedDict):
     """Settings whose ranges Lightning does not check."""
 
     precision: Precision
@@ -49,10 +49,10 @@ class EvaluationSettings(TypedDict):
     precision: Precision
 
 
-class Fit(TypedDict):
+class FitSettings(TypedDict):
     """Settings of `completesplat fit`."""
 
-    trainer: Trainer
+    trainer: TrainerSettings
     evaluation: EvaluationSettings
     seed: Annotated[int, Range(0, 2**32 - 1)]
     ckpt_path: str | None
@@ -60,7 +60,7 @@ class Fit(TypedDict):
     optimized_metric: str | None
 
 
-class Plan(Fit):
+class PlanSettings(FitSettings):
     """Settings of `completesplat plan`."""
 
     gpu: str
@@ -89,7 +89,7 @@ class SceneSettings(TypedDict):
     background: Share | Literal["remove"] | None
 
 
-class Predict(SceneSettings):
+class PredictSettings(SceneSettings):
     """Settings of `completesplat predict`. All samples of an image, or frames of a video, are in memory at once."""
 
     samples: Annotated[int, Range(1, 1000)]
@@ -102,7 +102,7 @@ class Predict(SceneSettings):
     maps: bool
 
 
-class View(SceneSettings):
+class ViewSettings(SceneSettings):
     """Settings of `completesplat view`."""
 
     samples: Annotated[int, Range(1, 8)]
@@ -120,8 +120,8 @@ class ModelSettings(TypedDict):
     trust: bool
 
 
-class Tested(ModelSettings, total=False):
-    """Settings of `completesplat test`, all of which `Trained` takes."""
+class TestSettings(ModelSettings, total=False):
+    """Settings of `completesplat test`, all of which `TrainedModel` takes."""
 
     scenes: str | None
     frame: Literal["opencv", "opengl"]
@@ -132,7 +132,13 @@ class Tested(ModelSettings, total=False):
     sampler: Mapping[str, object]
 
 
-VERBS: dict[str, type] = {"fit": Fit, "plan": Plan, "predict": Predict, "view": View, "test": Tested}
+VERBS: dict[str, type] = {
+    "fit": FitSettings,
+    "plan": PlanSettings,
+    "predict": PredictSettings,
+    "view": ViewSettings,
+    "test": TestSettings,
+}
 """Settings of verbs; the settings of a task are the arguments of its function."""
 
 

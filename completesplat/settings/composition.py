@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.arguments import for_hydra
 from completesplat.settings.checks import part_arguments
-from completesplat.settings.options import LEAST_LIKE, conf_folder, did_you_mean, options, search
+from completesplat.settings.options import LEAST_LIKE, conf_folder, did_you_mean, options, search_settings
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 NOT_THERE = re.compile(r"Could not override '([^']+)'")
@@ -110,12 +110,12 @@ def _misspelt(error: Exception, verb: str, arguments: Sequence[str]) -> str | No
 
 
 def _nearest(verb: str, key: str, names: Sequence[str]) -> str:
-    """Return an ending for a message about an unknown key: settings near its last name, or that `search` finds."""
+    """Return an ending for a message about an unknown key: settings near its last name, or found by words."""
     top, last, lasts = key.partition(".")[0], key.rpartition(".")[2], {name: name.rpartition(".")[2] for name in names}
     known = set(lasts.values())
     close = [last] if last in known else get_close_matches(last, known, cutoff=LEAST_LIKE)
     likely = [name for near in close for name in names if lasts[name] == near]
-    likely = likely or [setting.key for setting, _, _ in search(verb, None, [last]) if setting.key in lasts]
+    likely = likely or [setting.key for setting, _, _ in search_settings(verb, None, [last]) if setting.key in lasts]
     likely = [name for name in likely if name.startswith(f"{top}.")] or likely
     nearest = get_close_matches(key, likely, cutoff=LEAST_LIKE) or likely[:3]
     return f"; did you mean {' or '.join(nearest)}?" if nearest else ""

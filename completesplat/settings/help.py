@@ -14,15 +14,15 @@ from completesplat.settings.checks import VERBS
 from completesplat.settings.options import (
     REFERRING,
     TASKS,
-    Choice,
+    GroupDefault,
     Setting,
     about_groups,
     choices_of_verb,
     conf_folder,
     did_you_mean,
     options,
-    read,
-    search,
+    read_conf_file,
+    search_settings,
     settings_of_option,
     settings_of_verb,
     with_bases,
@@ -37,7 +37,7 @@ ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {6,}\S.*)*)", re.MULTILINE)
 """An entry of a docstring's `Args:`, for one argument or several."""
 
 
-def page(verb: str, arguments: Sequence[str]) -> str:
+def help_page(verb: str, arguments: Sequence[str]) -> str:
     """Return the help text of a verb, a task (`data toy --help`), a group (`fit --help data`), or of words to search.
 
     Raises:
@@ -46,7 +46,7 @@ def page(verb: str, arguments: Sequence[str]) -> str:
     words = [argument for argument in arguments if argument not in FLAGS and not argument.startswith("-")]
     task = None
     if verb in TASKS:
-        default = next(choice.option for choice in read(verb).choices if choice.group == f"{verb}_task")
+        default = next(choice.option for choice in read_conf_file(verb).choices if choice.group == f"{verb}_task")
         task = words.pop(0) if words and words[0] in options(f"{verb}_task") else default
     groups = {choice.place: choice for choice in choices_of_verb(verb, task)}
     for word in words:
@@ -62,7 +62,8 @@ def page(verb: str, arguments: Sequence[str]) -> str:
 def _body(verb: str, task: str | None) -> Iterator[str]:
     command = verb if task is None else f"{verb} {task}"
     if task is not None:
-        rows = [(name, _first_sentence(read(f"{verb}_task/{name}").about)) for name in options(f"{verb}_task")]
+        files = {name: read_conf_file(f"{verb}_task/{name}") for name in options(f"{verb}_task")}
+        rows = [(name, _first_sentence(file.about)) for name, file in files.items()]
         yield _table(f"Tasks (completesplat {verb} TASK --help shows one):", rows)
     hints = _hints(verb, task)
     rows = [_line(setting, hints.get(setting.key), {}, verb) for setting in settings_of_verb(verb, task)]
@@ -77,19 +78,19 @@ def _body(verb: str, task: str | None) -> Iterator[str]:
 
 
 def search_page(verb: str, task: str | None, words: Sequence[str]) -> str:
-    """Return the help text of the settings that `search` finds; raise CompleteSplatError if there are none."""
+    """Return the help text of the settings that `search_settings` finds; raise CompleteSplatError if there are none."""
     own, rows = _hints(verb, task), []
-    for setting, part, option in search(verb, task, words):
+    for setting, part, option in search_settings(verb, task, words):
         key, text = _part_line(setting, part) if part else _line(setting, own.get(setting.key), {}, verb)
         rows.append((key, text + option))
     if not rows:
-        known = {setting.key.rpartition(".")[2] for setting, _, _ in search(verb, task, [])}
+        known = {setting.key.rpartition(".")[2] for setting, _, _ in search_settings(verb, task, [])}
         known |= {choice.place for choice in choices_of_verb(verb, task)} | set(options(f"{verb}_task"))
         raise CompleteSplatError(f"nothing to say on {' '.join(words)!r}{did_you_mean(words[0], sorted(known))}")
     return _table(f"Settings of completesplat {verb} on {' '.join(words)} (key=value):", rows)
 
 
-def part_page(verb: str, choice: Choice, option: str) -> str:
+def part_page(verb: str, choice: GroupDefault, option: str) -> str:
     """Return the help text of one option of a group; raise CompleteSplatError if the group has no such option."""
     known = options(choice.group)
     if option == "null":
@@ -167,7 +168,7 @@ def _kind_of(value: str) -> str:
     return next((kind for pattern, kind in kinds.items() if re.fullmatch(pattern, value)), "")
 
 
-def _about(choice: Choice, about: Mapping[str, str]) -> str:
+def _about(choice: GroupDefault, about: Mapping[str, str]) -> str:
     text = (choice.comment or about.get(choice.group, "")).replace("`", "").rstrip(".")
     return f"{text} [{', '.join(options(choice.group))}]".strip()
 

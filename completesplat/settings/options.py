@@ -29,7 +29,7 @@ class Setting(NamedTuple):
     comment: str
 
 
-class Choice(NamedTuple):
+class GroupDefault(NamedTuple):
     """An entry of a file's defaults list: a config group, the place of its settings, and the default option."""
 
     group: str
@@ -44,7 +44,7 @@ class ConfFile(NamedTuple):
     about: str
     package: str | None
     settings: list[Setting]
-    choices: list[Choice]
+    choices: list[GroupDefault]
     bases: list[str]
     """Files from which it inherits settings."""
 
@@ -76,7 +76,7 @@ def about_groups() -> dict[str, str]:
     return {name: about for names, about in NAMED.findall(text) for name in re.findall(r"`(\w+)`", names)}
 
 
-def read(name: str) -> ConfFile:
+def read_conf_file(name: str) -> ConfFile:
     """Read a file of `conf/` by its name without suffix (`data/toy_objects`); raise FileNotFoundError if missing."""
     for folder in folders():
         if (folder / f"{name}.yaml").is_file():
@@ -105,7 +105,7 @@ def parse(text: str) -> ConfFile:
         if isinstance(entry, yaml.MappingNode):
             ((name, option),) = entry.value
             group, _, place = name.value.removeprefix("override ").removeprefix("/").partition("@")
-            choices.append(Choice(group, place or group, option.value, comment(entry)))
+            choices.append(GroupDefault(group, place or group, option.value, comment(entry)))
         elif entry.value != "_self_":
             bases.append(entry.value)
     settings = [setting for setting in _settings(root, text, comment) if not setting.key.startswith("defaults")]
@@ -148,7 +148,7 @@ def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
     return list({setting.key: setting for setting in settings}.values())
 
 
-def search(verb: str, task: str | None, words: Sequence[str]) -> list[tuple[Setting, list[Setting], str]]:
+def search_settings(verb: str, task: str | None, words: Sequence[str]) -> list[tuple[Setting, list[Setting], str]]:
     """Return settings with all the words, those with the words in their names first.
 
     Each entry has the settings of its part, and ends with its option, unless that is the default.
@@ -167,7 +167,7 @@ def search(verb: str, task: str | None, words: Sequence[str]) -> list[tuple[Sett
 
 def with_bases(group: str, option: str) -> ConfFile:
     """Return an option's file, or a verb's in the group "", with the settings and choices that it inherits."""
-    written = read(f"{group}/{option}".lstrip("/"))
+    written = read_conf_file(f"{group}/{option}".lstrip("/"))
     inherited = [with_bases(group, base) for base in written.bases]
     choices = [choice for entry in inherited for choice in entry.choices] + written.choices
     settings: dict[str, Setting] = {}
@@ -176,7 +176,7 @@ def with_bases(group: str, option: str) -> ConfFile:
     return written._replace(settings=list(settings.values()), choices=choices)
 
 
-def choices_of_verb(verb: str, task: str | None = None) -> list[Choice]:
+def choices_of_verb(verb: str, task: str | None = None) -> list[GroupDefault]:
     """Return the config groups of a verb and its task with their default options, without the group of tasks."""
     choices = [choice for choice in with_bases("", verb).choices if choice.group != f"{verb}_task"]
     return choices + ([] if task is None else with_bases(f"{verb}_task", task).choices)

@@ -71,7 +71,7 @@ Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], Entries(most=8)]
 Few = Annotated[int, Range(1, 16)]
 
 
-class Refused(NamedTuple):
+class Violation(NamedTuple):
     """A refused value: its place inside the setting (`.key`, empty for the setting itself) and the reason."""
 
     place: str
@@ -95,7 +95,7 @@ def check_settings(function: object, settings: Mapping[str, object]) -> None:
 
 def check_value(key: str, annotation: object, value: object) -> None:
     """Raise CompleteSplatError, with the values that are allowed, if a setting does not fit an annotation."""
-    for place, part, reason in refused(annotation, value):
+    for place, part, reason in violations(annotation, value):
         example = f", such as {key}{place}=[{part}]" if reason == "must be a list" else ""
         raise CompleteSplatError(f"{key}{place}={'null' if part is None else part}: {reason}{example}")
 
@@ -135,39 +135,39 @@ def start_weights(kind: object) -> Mapping[str, str]:
     return getattr(kind, "start_weights", {})
 
 
-def refused(annotation: object, value: object) -> list[Refused]:
+def violations(annotation: object, value: object) -> list[Violation]:
     """Return the parts of a value that do not fit an annotation, with the reasons."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
-        unfit = refused(kind, value)
-        return unfit or [Refused("", value, reason) for rule in rules if (reason := rule.refusal(value))]
+        unfit = violations(kind, value)
+        return unfit or [Violation("", value, reason) for rule in rules if (reason := rule.refusal(value))]
     members = arguments if origin in (Union, UnionType) else (annotation,)
     if annotation is not NoneType and all(get_origin(m) is Literal or m is NoneType for m in members):
         choices = [choice for member in members for choice in get_args(member) or (None,)]
         written = ", ".join("null" if choice is None else str(choice) for choice in choices)
-        return [] if value in choices else [Refused("", value, f"choose one of {written}")]
+        return [] if value in choices else [Violation("", value, f"choose one of {written}")]
     if origin in (Union, UnionType):
         # A setting is never a `Tensor`, so `float | Tensor` means float. Without numbers, other classes accept all.
         plain = [member for member in arguments if not isinstance(member, type) or member in KINDS]
         numbers = {int, float} & set(arguments) and isinstance(value, str | int | float | Sequence)
-        attempts = [refused(member, value) for member in (plain if numbers else arguments)]
+        attempts = [violations(member, value) for member in (plain if numbers else arguments)]
         return [] if [] in attempts else attempts[0]
     if origin is Sequence:  # if an entry does not fit, the whole list is reported
         if isinstance(value, str) or not isinstance(value, Sequence):
-            return [Refused("", value, "must be a list")]
-        return [Refused("", value, bad.reason) for entry in value for bad in refused(arguments[0], entry)]
+            return [Violation("", value, "must be a list")]
+        return [Violation("", value, bad.reason) for entry in value for bad in violations(arguments[0], entry)]
     if origin is Mapping or is_typeddict(annotation):
         if not isinstance(value, Mapping):
-            return [Refused("", value, "must be a mapping")]
+            return [Violation("", value, "must be a mapping")]
         typed = get_type_hints(annotation, include_extras=True) if is_typeddict(annotation) else {}
         kinds = [(key, part, typed.get(key, object) if typed else arguments[1]) for key, part in value.items()]
-        return [bad._replace(place=f".{key}{bad.place}") for key, part, kind in kinds for bad in refused(kind, part)]
+        return [bad._replace(place=f".{key}{bad.place}") for key, part, kind in kinds for bad in violations(kind, part)]
     if isinstance(annotation, type) and annotation in KINDS and not _is_a(annotation, value):
-        return [Refused("", value, f"must be {KINDS[annotation]}")]
+        return [Violation("", value, f"must be {KINDS[annotation]}")]
     is_part = isinstance(annotation, type) and annotation not in (*KINDS, object, typing.Any)
     if value is None and (is_part or origin is Callable):
-        return [Refused("", value, "must not be null; leave it out")]
+        return [Violation("", value, "must not be null; leave it out")]
     return []
 
 

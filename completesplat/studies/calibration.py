@@ -15,16 +15,18 @@ from torch import Tensor
 
 from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
 from completesplat.metrics.scoring import novel_values
-from completesplat.studies.controls import Scenes, Tick
+from completesplat.studies.controls import OnProgress, Scenes
 from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import SampleRenderer, mean_over_scenes
 
-Samples = Float[Tensor, "sample value"]
-Truth = Float[Tensor, " value"]
+SampledValues = Float[Tensor, "sample value"]
+TrueValues = Float[Tensor, " value"]
 BINS = 10
 
 
-def calibration_rows(renderer: SampleRenderer, scenes: Scenes, tick: Tick, **settings: float) -> list[dict[str, Any]]:
+def calibration_rows(
+    renderer: SampleRenderer, scenes: Scenes, tick: OnProgress, **settings: float
+) -> list[dict[str, Any]]:
     """Return a row for each region of novel views (`novel_values`), with means over the scenes.
 
     `energy_N` is the energy score of N samples, `below_all` and `above_all` are the ends of the rank histogram `ranks`.
@@ -50,19 +52,19 @@ def calibration_rows(renderer: SampleRenderer, scenes: Scenes, tick: Tick, **set
     return results
 
 
-def energies(samples: Samples, truth: Truth) -> dict[str, float]:
+def energies(samples: SampledValues, truth: TrueValues) -> dict[str, float]:
     """Return the fair energy scores of 2, 4, 8, ... and all samples: means over disjoint groups of this size."""
     counts = {2**power: 1 for power in range(1, len(samples).bit_length())} | {len(samples): 1}
     groups = {n: samples[: len(samples) // n * n].view(-1, n, len(truth)) for n in counts}
     return {f"energy_{n}": sum(energy_score(part, truth) for part in parts) / len(parts) for n, parts in groups.items()}
 
 
-def squares(samples: Samples, truth: Truth) -> tuple[Truth, Truth]:
+def squares(samples: SampledValues, truth: TrueValues) -> tuple[TrueValues, TrueValues]:
     """Return the variance of k samples times (k + 1) / k, and the squared error of their mean; ideally equal."""
     return samples.var(0) * (len(samples) + 1) / len(samples), (samples.mean(0) - truth).square()
 
 
-def halves(samples: Samples, truth: Truth) -> Float[Tensor, "3 value"]:
+def halves(samples: SampledValues, truth: TrueValues) -> Float[Tensor, "3 value"]:
     """Return the variance of the first half of the samples, which orders `bins`, and the `squares` of the second half.
 
     If the same samples gave both, the lowest bin would hold values whose variance is small by chance, and calibrated
@@ -72,7 +74,7 @@ def halves(samples: Samples, truth: Truth) -> Float[Tensor, "3 value"]:
     return torch.stack([samples[: max(half, 2)].var(0), *squares(samples[min(half, len(samples) - 2) :], truth)])
 
 
-def binned(order: Truth, spreads: Truth, errors: Truth) -> list[list[float]]:
+def binned(order: TrueValues, spreads: TrueValues, errors: TrueValues) -> list[list[float]]:
     """Return root mean spread and error of `BINS` equally large bins of the values, sorted by `order`."""
     values = torch.stack([spreads, errors])[:, order.argsort(stable=True)].double()
     return [part.mean(1).sqrt().tolist() for part in values.tensor_split(min(BINS, len(order)), 1)]

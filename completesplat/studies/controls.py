@@ -13,12 +13,12 @@ from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import diversity
 from completesplat.scene import SceneBatch
 from completesplat.studies.figures import written_figure
-from completesplat.studies.samples import SampleRenderer, farthest, mean_over_scenes, near, object_psnr
+from completesplat.studies.samples import SampleRenderer, farthest, mean_over_scenes, near_reference, object_psnr
 
-Settings = Sequence[tuple[float, float]]  # skip and guidance weights
+WeightPairs = Sequence[tuple[float, float]]  # skip and guidance weights
 Scenes = Sequence[SceneBatch]  # batches of one
 Row = dict[str, float | None]
-Tick = Callable[[str], None]
+OnProgress = Callable[[str], None]
 Measure = Callable[[SceneBatch, float, float], Mapping[str, float | None]]
 
 # From faithful to diverse (supplement, "Diverse Sampling").
@@ -31,7 +31,7 @@ def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> li
 
 
 def controls_rows(
-    renderer: SampleRenderer, settings: Settings, scenes: Scenes, near_degrees: float, tick: Tick
+    renderer: SampleRenderer, settings: WeightPairs, scenes: Scenes, near_degrees: float, tick: OnProgress
 ) -> list[Row]:
     """Return a row for each setting, with means over the scenes.
 
@@ -42,7 +42,7 @@ def controls_rows(
     def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> dict[str, float | None]:
         images = renderer(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
         reference, targets = scene.reference, scene.targets[0]
-        seen = near(reference.cameras[0], targets.cameras, near_degrees)
+        seen = near_reference(reference.cameras[0], targets.cameras, near_degrees)
         return {
             "reference_psnr": psnr(images[:, 0], reference.images.expand_as(images[:, 0])).mean().item(),
             "near_object_psnr": object_psnr(images[:, 1:][:, seen], targets.images[seen], targets.masks[seen]),
@@ -52,7 +52,7 @@ def controls_rows(
     return over_settings(settings, scenes, measure, tick)
 
 
-def over_settings(settings: Settings, scenes: Scenes, measure: Measure, tick: Tick) -> list[Row]:
+def over_settings(settings: WeightPairs, scenes: Scenes, measure: Measure, tick: OnProgress) -> list[Row]:
     """Return a row for each setting: means over the scenes, measured with its skip and guidance weight."""
     results: list[Row] = []
     for skip_weight, guidance_weight in settings:
@@ -63,7 +63,7 @@ def over_settings(settings: Settings, scenes: Scenes, measure: Measure, tick: Ti
     return results
 
 
-def controls_strips(renderer: SampleRenderer, settings: Settings, scene: SceneBatch, samples: int) -> Sheet:
+def controls_strips(renderer: SampleRenderer, settings: WeightPairs, scene: SceneBatch, samples: int) -> Sheet:
     """Return rows by skip weight and columns by guidance weight: one sample's reference view, several far views.
 
     The far view is the target whose direction differs most from the reference's. The first row is the truth.

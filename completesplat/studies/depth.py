@@ -7,8 +7,8 @@ from torch import Tensor
 from completesplat.export.images import NOTHING, Sheet, color_depth, color_normals, ramp, strip, surface_depth
 from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.scene import SceneBatch
-from completesplat.studies.controls import Row, Scenes, Settings, Tick, over_settings
-from completesplat.studies.samples import SampleRenderer, farthest, near
+from completesplat.studies.controls import OnProgress, Row, Scenes, WeightPairs, over_settings
+from completesplat.studies.samples import SampleRenderer, farthest, near_reference
 
 
 def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tensor, "*view 1 height width"]:
@@ -23,7 +23,7 @@ def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tens
 
 
 def depth_rows(
-    renderer: SampleRenderer, settings: Settings, scenes: Scenes, far_degrees: float, tick: Tick
+    renderer: SampleRenderer, settings: WeightPairs, scenes: Scenes, far_degrees: float, tick: OnProgress
 ) -> list[Row]:
     """Return a row for each (skip weight, guidance weight), with means over the scenes.
 
@@ -46,7 +46,7 @@ def deviations(
 ) -> dict[str, float | None]:
     """Return the figures of `depth_rows` for one scene (a batch of one), given depths of all its views."""
     maps, masks = deviation(depth), scene.all_views().masks[0]
-    far = 1 + torch.nonzero(~near(scene.reference.cameras[0], scene.targets.cameras[0], far_degrees))[:, 0]
+    far = 1 + torch.nonzero(~near_reference(scene.reference.cameras[0], scene.targets.cameras[0], far_degrees))[:, 0]
     figures: dict[str, float | None] = {}
     for name, views in (("reference", far.new_zeros(1)), ("far", far)):
         figures[f"{name}_deviation"] = _mean(maps[views])

@@ -29,11 +29,13 @@ Renders = Float[Tensor, "sample view 3 height width"]
 Predictor = Callable[[SceneBatch, SceneBatch, int], Renders]
 """Function from a scene, another scene (batches of one) and a seed to renders of all targets in [0, 1]."""
 
-Rung = Callable[[SceneBatch, SceneBatch, int], Gaussians]
+Method = Callable[[SceneBatch, SceneBatch, int], Gaussians]
 """Function from the same arguments to Gaussians [sample], or [1] if it draws nothing."""
 
 
-def rungs(model: VariationalAutoReconstructor, samples: int, batch: int, masked: bool = False) -> dict[str, Rung]:
+def decoding_methods(
+    model: VariationalAutoReconstructor, samples: int, batch: int, masked: bool = False
+) -> dict[str, Method]:
     """Return, by name, functions that decode different latents with the skips of the scene's image.
 
     `posterior_mean` and `posterior_samples` take latents from the scene's posterior, `other_scene` from another
@@ -68,7 +70,7 @@ def rungs(model: VariationalAutoReconstructor, samples: int, batch: int, masked:
         noise = torch.randn(samples, *q.mean.shape[1:], generator=torch.Generator().manual_seed(seed))
         return decode(q.mean + noise.to(q.mean) * q.std, scene)
 
-    methods: dict[str, Rung] = {
+    methods: dict[str, Method] = {
         "posterior_mean": lambda scene, other, seed: decode(encode(scene).mean, scene),
         "posterior_samples": lambda scene, other, seed: decode_samples(scene, scene, seed),
         "other_scene": lambda scene, other, seed: decode_samples(scene, other, seed),
@@ -79,19 +81,19 @@ def rungs(model: VariationalAutoReconstructor, samples: int, batch: int, masked:
 
 
 def predictors(module: Scorer, samples: int, batch: int) -> dict[str, Predictor]:
-    """Return `model` as it is tested, and the `rungs` of its autoreconstructor, which show where modes are lost.
+    """Return `model` as it is tested, and its autoreconstructor's `decoding_methods`, which show where modes are lost.
 
     A posterior that sees views knows the true mode. If the posterior's samples show the modes and the model's do not,
     stage 2 is at fault; if neither do, stage 1 is. A deterministic method returns `samples` equal renders. Samples are
     computed and rendered `batch` at a time.
     """
-    methods: dict[str, Rung] = {"model": lambda scene, other, seed: module.draw(scene, [seed], samples, batch)}
+    methods: dict[str, Method] = {"model": lambda scene, other, seed: module.draw(scene, [seed], samples, batch)}
     frozen = module.completesplat.autoreconstructor if isinstance(module, DiffusionScorer) else None
     network = frozen or getattr(module, "model", None)
     if isinstance(network, VariationalAutoReconstructor):
-        methods |= rungs(network, samples, batch, getattr(module, "masked", False))
+        methods |= decoding_methods(network, samples, batch, getattr(module, "masked", False))
 
-    def render(method: Rung, scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
+    def render(method: Method, scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
         gaussians, cameras = method(scene, other, seed), scene.targets.cameras[0]
         parts = [gaussians[i : i + batch] for i in range(0, len(gaussians.means), batch)]
         renders = torch.cat([module.render_from(part, cameras).over(module.background) for part in parts])
@@ -104,7 +106,7 @@ REGIONS = ("hidden", "visible")
 
 
 @dataclass
-class Measured:
+class ModeMeasurements:
     """Measurements of the scenes so far, in the views that show the modes.
 
     `scores` has each scene's `mode_coverage.scores` and energy scores (of pixels that the reference hides, and of the
@@ -118,19 +120,19 @@ class Measured:
 
     def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
         """Add the scores of renders of the views that show the modes."""
-        pixels, modes = in_region(images, scene.region), in_region(scene.truths, scene.region)
+        pixels, modes = region_pixels(images, scene.region), region_pixels(scene.truths, scene.region)
         figures: dict[str, float | None] = dict(scores(pixels, modes, scene.probabilities))
         alike = self.classes.setdefault(method, {}).setdefault(tuple(scene.probabilities.tolist()), [])
         alike.append(classify(pixels, modes, scene.probabilities))
         unseen, truth = scene.unseen[list(scene.views)], scene.truths[scene.true_mode]
         for name, region in zip(REGIONS, (unseen, ~unseen), strict=True):
-            drawn, true = in_region(images, region).flatten(1), in_region(truth[None], region)[0].flatten()
+            drawn, true = (region_pixels(images, region).flatten(1), region_pixels(truth[None], region)[0].flatten())
             figures[f"energy_{name}"] = energy_score(drawn, true) if region.any() else None
         self.scores.setdefault(method, []).append(figures)
 
     def show(self, images: Renders, scene: HiddenModes, count: int) -> None:
         """Keep the input, every mode, and some samples with their modes, in the view that shows the modes best."""
-        pixels, modes = in_region(images[:count], scene.region), in_region(scene.truths, scene.region)
+        pixels, modes = region_pixels(images[:count], scene.region), region_pixels(scene.truths, scene.region)
         labels = [f"{name} (true)" if mode == scene.true_mode else name for mode, name in enumerate(scene.modes)]
         classes = classify(pixels, modes, scene.probabilities).tolist()
         labels += ["rejected" if mode == REJECTED else scene.modes[mode] for mode in classes]
@@ -167,7 +169,7 @@ class Measured:
         return rows
 
 
-def in_region(images: Renders, region: Bool[Tensor, "view height width"]) -> Float[Tensor, "sample pixel 3"]:
+def region_pixels(images: Renders, region: Bool[Tensor, "view height width"]) -> Float[Tensor, "sample pixel 3"]:
     """Return the region's pixels of all views in one row."""
     return images.movedim(2, -1)[:, region]
 
@@ -181,13 +183,13 @@ def measure(
     shown_scenes: int,
     shown_samples: int,
     progress: Callable[[Sequence[HiddenModes]], Iterable[HiddenModes]] = iter,
-) -> Measured:
+) -> ModeMeasurements:
     """Score all predictors on all scenes; the seed of a scene is that of the scene before it plus one.
 
     Two predictors that know all modes are added: `true_sampler` draws by their probabilities, `mean_predictor` repeats
     their mean. The other scene for a predictor is the previous one (for the first, the last). The figure shows `model`.
     """
-    measured = Measured()
+    measured = ModeMeasurements()
     for index, scene in enumerate(progress(scenes)):
         mean = mean_of(scene.truths, scene.probabilities)
         measured.add("true_sampler", draw_modes(scene.truths, scene.probabilities, samples, seed + index), scene)
@@ -202,7 +204,7 @@ def measure(
     return measured
 
 
-def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenModes], list[str]]:
+def usable_scenes(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenModes], list[str]]:
     """Return the usable ones of the first `count` scenes (None: all), and the reasons why others are not."""
     selected, skipped = [], []
     for index in range(len(scenes) if count is None else min(count, len(scenes))):
@@ -216,7 +218,7 @@ def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenMode
     return selected, skipped
 
 
-def write_modes(measured: Measured, samples: int, path: Path) -> None:
-    """Write a PNG with a row for each scene of `Measured.rows`."""
+def write_modes(measured: ModeMeasurements, samples: int, path: Path) -> None:
+    """Write a PNG with a row for each scene of `ModeMeasurements.rows`."""
     title = f"Hidden modes: {len(measured.names)} scenes, {samples} samples each. Input; then from behind: every mode, "
     write_png(path, image_sheet(None, measured.rows, f"{title}samples with their modes"))

@@ -70,7 +70,7 @@ def object_psnr(
     return -10 * math.log10(max(error, 10 ** (-PSNR_LIMIT / 10))) if inside.any() else None
 
 
-def near(reference: Cameras, targets: Cameras, degrees: float) -> Bool[Tensor, " view"]:
+def near_reference(reference: Cameras, targets: Cameras, degrees: float) -> Bool[Tensor, " view"]:
     """Return a mask of the targets [view] whose optical axes are at most this far from the reference's."""
     return _cosines(reference, targets) >= math.cos(math.radians(degrees))
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from completesplat.data.loading.distributed import gathered, mean_of_processes
+from completesplat.data.loading.distributed import gather_values, mean_of_processes
 from completesplat.errors import DivergenceError
 from completesplat.scene import Batch
 from completesplat.settings.schema import Positive, Share
@@ -105,7 +105,7 @@ def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:
     terms = [f"{name} is {value.item()}" for name, value in logged.items() if not value.isfinite()]
     terms.sort(key=lambda term: term.startswith("loss "))  # the sum says less than its terms
     layers = [n for n, p in module.named_parameters() if p.grad is not None and not p.grad.isfinite().all()]
-    results = gathered((terms, layers))
+    results = gather_values((terms, layers))
     term = next((f"loss term {terms[0]}" for terms, _ in results if terms), "the last losses are finite")
     layer = next((f"that of {layers[0]} is the first" for _, layers in results if layers), "their norm is too large")
     return (

@@ -26,10 +26,10 @@ from completesplat.baselines.fitting import (
     relocate,
 )
 from completesplat.data.packed.manifest import is_packed
-from completesplat.data.sequences import PosedSequence, shortened
+from completesplat.data.sequences import PosedSequence, first_names
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED
-from completesplat.export.prediction import FileUnits, Shot, Wanted, write_fitted_scene, write_scene
+from completesplat.export.prediction import FileUnits, OutputFiles, Shot, write_fitted_scene, write_scene
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -79,7 +79,7 @@ class CaptureFit(Stage):
     Args:
         scene_folder: folder of the result in the capture's own world and units, by `write_fitted_scene` and
             `write_scene`; None: nothing is written.
-        formats, videos, frames: as in `Wanted`, without `ply`. A format that cannot be written is left out.
+        formats, videos, frames: as in `OutputFiles`, without `ply`. A format that cannot be written is left out.
     """
 
     without_effect = ("optimizer", "schedule")
@@ -98,7 +98,7 @@ class CaptureFit(Stage):
         self.loss = loss
         self.fitting = fitting
         self.scene_folder = None if scene_folder is None else Path(scene_folder)
-        self.wanted = Wanted(formats, videos, frames, self.background)
+        self.wanted = OutputFiles(formats, videos, frames, self.background)
         shapes = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "logits": (), "harmonics": (3,)}
         self.raw = nn.ParameterDict({name: torch.zeros(fitting.most, *shape) for name, shape in shapes.items()})
         self.count: Tensor
@@ -113,7 +113,7 @@ class CaptureFit(Stage):
         """Return the frames of a split of the capture; raise CompleteSplatError unless there is exactly one capture."""
         names = self.data.store(split).names
         if len(names) != 1 or not self.data.splits_share_sequences or is_packed(self.data.root):
-            found = "is prepared" if is_packed(self.data.root) else f"has {len(names)} sequences ({shortened(names)})"
+            found = "is prepared" if is_packed(self.data.root) else f"has {len(names)} sequences ({first_names(names)})"
             advice = "model=capture fits one capture: give data=capture and its folder, as it was taken"
             raise CompleteSplatError(f"data.root={self.data.root} {found}; {advice}")
         return self.data.store(split).source.read(names[0])

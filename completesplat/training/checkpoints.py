@@ -15,7 +15,7 @@ from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
-from completesplat.data.loading.distributed import gathered
+from completesplat.data.loading.distributed import gather_values
 from completesplat.errors import DivergenceError, WeightsError
 from completesplat.files import atomic_path, make_folder
 from completesplat.settings.schema import Positive
@@ -149,7 +149,7 @@ class Checkpoints(Checkpoint):
         return trainer.strategy.broadcast(monotonic() - self.saved_at >= 60 * self.every_minutes)
 
     def _save(self, trainer: Trainer, module: LightningModule) -> None:
-        if (name := next(filter(None, gathered(not_finite(module.state_dict()))), None)) is not None:
+        if (name := next(filter(None, gather_values(not_finite(module.state_dict()))), None)) is not None:
             message = f"{name} is not finite; no checkpoint is written of it, earlier ones stay in {self.folder}"
             raise DivergenceError(f"step {trainer.global_step}: {message}")
         self.due = False

@@ -19,7 +19,7 @@ from torch import nn
 
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.data.loading.distributed import gathered, processes
+from completesplat.data.loading.distributed import gather_values, processes
 from completesplat.data.loading.latent_cache import (
     FILE,
     CachedSequence,
@@ -84,7 +84,7 @@ def check_cache(store: LatentCache, autoreconstructor: VariationalAutoReconstruc
 
 
 @torch.no_grad()
-def encoded(
+def encode_scenes(
     scenes: SceneBatch,
     autoreconstructor: VariationalAutoReconstructor,
     conditioning: nn.Module | None,
@@ -156,7 +156,7 @@ def encode_training_set(
     out.mkdir(parents=True, exist_ok=True)
     frozen, features = autoreconstructor.to(device).eval(), None if conditioning is None else conditioning.to(device)
     encode = partial(
-        encoded, autoreconstructor=frozen, conditioning=features, precision=PRECISIONS[precision], device=device
+        encode_scenes, autoreconstructor=frozen, conditioning=features, precision=PRECISIONS[precision], device=device
     )
     load = partial(_loaded, SceneStore(source), views)
     blank = encode(stack([load(next(_references(source, 1, [], False)))]))
@@ -167,7 +167,7 @@ def encode_training_set(
         _write_store(out, origin, blank, batches, sequences)
     else:
         deque(batches, maxlen=0)
-    gathered(None)  # the other processes wait until the manifest is written
+    gather_values(None)  # the other processes wait until the manifest is written
     return LatentCache(out)
 
 
@@ -215,7 +215,7 @@ def _encoded_batches(
                 result = rows, moment_sums(rows["mean"], rows["log_variance"])
             except DataError as error:  # all processes raise it below
                 result = error
-        for rank_result in gathered(result):
+        for rank_result in gather_values(result):
             if isinstance(rank_result, DataError):
                 raise rank_result
             if rank_result is not None:

@@ -78,7 +78,7 @@ class DrawsFixedScenes(Callback):
         self.drawn = trainer.global_step
         if not trainer.is_global_zero:
             return
-        with untouched(trainer, module):
+        with restored_afterwards(trainer, module):
             if not self.scenes:
                 self.scenes = fixed_scenes(module.data.val_dataloader(), self.count, self.views)
             sheet, figures = self.draw(trainer, module, self.scenes)
@@ -94,7 +94,7 @@ class DrawsFixedScenes(Callback):
 
 
 @contextmanager
-def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
+def restored_afterwards(trainer: Trainer, module: LightningModule) -> Iterator[None]:
     """Switch to evaluation mode and averaged weights, if any; then restore them and the random generators."""
     modes = {part: part.training for part in module.modules()}
     devices = [module.device] if module.device.type == "cuda" else []

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.loading.distributed import gathered
+from completesplat.data.loading.distributed import gather_values
 from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
@@ -185,7 +185,7 @@ class LatentDiffusion(DiffusionScorer, Stage):
                     "conditioning.channels and autoreconstructor.encoder.channels must have as many levels"
                 )
             drawn.append(latent.double().cpu())
-        latents = torch.cat(gathered(torch.cat(drawn) if drawn else torch.zeros(1, 1, 1, 1)))
+        latents = torch.cat(gather_values(torch.cat(drawn) if drawn else torch.zeros(1, 1, 1, 1)))
         mean, std = latents.mean((0, 2, 3)), latents.std((0, 2, 3), correction=0)
         if not (std > 0).all():
             raise CompleteSplatError("the latents do not vary: no training images, or an encoder that ignores them")
@@ -228,7 +228,7 @@ class LatentDiffusion(DiffusionScorer, Stage):
         """Log the mean of the samples' losses, and that of each quarter of the timesteps that is among them."""
         self.log_step({"train/loss": errors.mean()}, batch_size=len(errors))
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
-            ranks = zip(*gathered((errors.cpu(), timestep.cpu())), strict=True)
+            ranks = zip(*gather_values((errors.cpu(), timestep.cpu())), strict=True)
             errors, timestep = (torch.cat(parts) for parts in ranks)
             values = losses_by_timestep(errors, timestep, self.completesplat.sampler.training_timesteps)
             # Lightning would repeat the loss of a quarter in the rows of later steps that have no sample in it.

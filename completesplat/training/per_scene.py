@@ -17,7 +17,7 @@ from torch import Tensor
 from completesplat.baselines.fitting import FittingSettings, fit_gaussians
 from completesplat.baselines.preoptimized import project_to_splatter_image
 from completesplat.baselines.sparse_vae import SparseVAE
-from completesplat.data.loading.distributed import gathered, processes
+from completesplat.data.loading.distributed import gather_values, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.errors import CompleteSplatError
 from completesplat.export.prediction import Shot, write_fitted_scene
@@ -112,7 +112,7 @@ class Preoptimized(PerScene):
     def test_results(self) -> dict[str, dict[str, Any]]:
         """Return the results of `Scorer` and `empty_pixels`, the mean over the scenes of all processes."""
         results = super().test_results()
-        empty = {name: share for shares in gathered(self._empty) for name, share in shares.items()}
+        empty = {name: share for shares in gather_values(self._empty) for name, share in shares.items()}
         results["model"]["empty_pixels"] = sum(empty.values()) / max(len(empty), 1)
         return results
 

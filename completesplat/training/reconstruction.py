@@ -15,7 +15,7 @@ from completesplat.baselines.autodecoder import AutoDecoder, Codes, optimize_cod
 from completesplat.baselines.splatter_image.model import PublishedSplatterImage, write_trained
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.gaussians import Gaussians
-from completesplat.generator import OneAnswer
+from completesplat.generator import DeterministicModel
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch, Views
@@ -105,7 +105,7 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         assert self.config is not None
         trained = {f"network.{name}": tensor for name, tensor in self.model.state_dict().items()}
         try:
-            model = OneAnswer(self.config["model"]["model"], self.data.image_size)
+            model = DeterministicModel(self.config["model"]["model"], self.data.image_size)
             model.load_state_dict(trained | camera_tensors(self.camera))
         except WeightsError as error:
             return logger.warning("no weights are written to %s: %s", folder, error)
@@ -113,7 +113,7 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         model.save_pretrained(folder)
 
     def on_fit_start(self) -> None:
-        """Measure the camera of a typical photo, for photos of unknown cameras (`OneAnswer`).
+        """Measure the camera of a typical photo, for photos of unknown cameras (`DeterministicModel`).
 
         Raises:
             CompleteSplatError: there is a latent cache, which is for stage 2, the posterior gets too few views, or

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.data.loading.distributed import gathered
+from completesplat.data.loading.distributed import gather_values
 from completesplat.data.loading.loader import SceneLoader
 from completesplat.errors import CompleteSplatError, PlyError
 from completesplat.export.images import surface_depth
@@ -55,7 +55,7 @@ def repeat_image(image: Float[Tensor, "3 height width"], scenes: SceneBatch) -> 
     return image.to(scenes.reference.images).expand_as(scenes.all_views().images)
 
 
-def now() -> float:
+def synchronized_time() -> float:
     """Return the time in seconds, after the GPU, if there is one, has finished its work."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
@@ -154,9 +154,9 @@ class Scorer(LightningModule):
 
     def timed(self, name: str, work: Callable[[], Result], scenes: int) -> Result:
         """Do the work for this number of scenes, and note its seconds for each."""
-        start = now()
+        start = synchronized_time()
         result = work()
-        self.seconds[name].append((now() - start) / scenes)
+        self.seconds[name].append((synchronized_time() - start) / scenes)
         return result
 
     def scene_scored(self, name: str, gaussians: Gaussians, cameras: Cameras, images: Renders, truth: Views) -> None:
@@ -176,7 +176,7 @@ class Scorer(LightningModule):
             self.evaluation.missing["depth"] = f"missing: {loader.refused_depths[-1]}"
         self.evaluation.gather()
         local, self.seconds = dict(self.seconds), defaultdict(list)
-        for name, values in (item for seconds in gathered(local) for item in seconds.items()):
+        for name, values in (item for seconds in gather_values(local) for item in seconds.items()):
             self.seconds[name] += values
         for predictor, scores in self.test_results().items():
             prefix = "test" if predictor == MODEL else f"test/{predictor}"

@@ -23,7 +23,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses.ssim import blur_matrix
-from completesplat.rasterizers import Rendering, as_seen
+from completesplat.rasterizers import Rendering, with_view_colors
 from completesplat.scene import Batch, CachedScene, SceneBatch
 from completesplat.training.capture import CaptureFit
 from completesplat.training.latent_diffusion import LatentDiffusion
@@ -69,7 +69,7 @@ class StepCounts:
         return sum(self.memory.values())
 
 
-class Unfilled(TorchFunctionMode):
+class WithoutInitialWeights(TorchFunctionMode):
     """Mode in which modules are built without initial weights; samplers, which read values, read ones."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -141,13 +141,13 @@ class _Store(torch.autograd.Function):
         return None, None, *results
 
 
-class StoreOnly:
+class MemoryOnlyRasterizer:
     """Rasterizer that takes the memory of the `cuda` backend on a GPU, or of `tiled`, and draws nothing."""
 
     def __init__(self, gpu: bool) -> None:
         self.floats = RASTERIZER_FLOATS["gpu" if gpu else "cpu"]
 
-    @as_seen
+    @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Return empty images of scenes [batch] from cameras [batch view]."""
         image = _Store.apply(self.floats, cameras, *vars(gaussians).values())  # type: ignore[no-untyped-call]
@@ -169,7 +169,7 @@ def count_step(
     Raises CompleteSplatError if nothing is trained, or a step decides by the values of tensors.
 
     Args:
-        build: makes the module, whose rasterizer should be `StoreOnly`, without reading weights.
+        build: makes the module, whose rasterizer should be `MemoryOnlyRasterizer`, without reading weights.
         batch, targets: number of scenes of a batch of this process, and of target views of each.
         precision: precision in Lightning's notation.
         accumulated: number of batches of a step.
@@ -177,7 +177,7 @@ def count_step(
         gpu: whether to store what autocast stores on a GPU.
     """
     with fake_tensors(), LiveMemory() as live:
-        with Unfilled():
+        with WithoutInitialWeights():
             module = build()
         if not any(parameter.requires_grad for parameter in module.parameters()):
             raise CompleteSplatError(f"{type(module).__name__} has nothing to train in steps: nothing to plan")

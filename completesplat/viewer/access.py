@@ -110,7 +110,7 @@ def start_server(port: int) -> GuardedServer:
         server = GuardedServer(port)
     show_background(server, 0.5)
     server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would use the internet
-    say(server, LOADING)
+    show_status(server, LOADING)
     server.gui.main_panel.dock_right()
     return server
 
@@ -120,7 +120,7 @@ def show_background(server: viser.ViserServer, grey: float) -> None:
     server.scene.set_background_image(np.full((1, 1, 3), round(255 * grey), np.uint8), format="png")
 
 
-def say(server: viser.ViserServer, text: str) -> None:
+def show_status(server: viser.ViserServer, text: str) -> None:
     """Show what the page does or did as its panel's title, all that narrow windows first show."""
     server.gui.set_panel_label(f"{TITLE}: {text}" if text else TITLE)
 

@@ -10,11 +10,11 @@ import viser
 
 from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
-from completesplat.export.images import to_bytes
+from completesplat.export.images import to_pixels
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
-from completesplat.viewer.access import say
+from completesplat.viewer.access import show_status
 from completesplat.viewer.page import Page
 from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps, preview_of
 from completesplat.viewer.sample import Sample
@@ -38,7 +38,7 @@ class Completion:
         """Show this photo in the panel, and draw its samples."""
         self.photograph = name, photograph
         label = f"{name}, field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"
-        self.controls.preview.content = preview_of(to_bytes(photograph.image), label)
+        self.controls.preview.content = preview_of(to_pixels(photograph.image), label)
         self.page.view.set_up(self.model.up.tolist())
         self.request(client)
 
@@ -87,7 +87,7 @@ class Completion:
                 self.page.show(arranged([estimate[i] for i in range(settings["samples"])], finished=False), "drawing")
                 last_shown = time.monotonic()
 
-        say(self.page.server, f"drawing from {name}")
+        show_status(self.page.server, f"drawing from {name}")
         progress.animated, progress.visible, progress.value = not forming, True, 0.0 if forming else 100.0
         try:
             scenes = self.model(photograph, on_step=formed if forming else None, **settings)

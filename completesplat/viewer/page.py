@@ -13,18 +13,18 @@ import viser
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED, FORMATS, suffix, write_formats
-from completesplat.export.images import to_bytes
+from completesplat.export.images import to_pixels
 from completesplat.export.splat_transform import PageView, find_splat_transform
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.files import SPLATS, printable, write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer
-from completesplat.viewer.access import GuardedServer, say, stop_server, with_head
+from completesplat.viewer.access import GuardedServer, show_status, stop_server, with_head
 from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Pixels, add_looking, add_opening, add_saving, thumbnail_row
 from completesplat.viewer.sample import Sample, read_scene
 from completesplat.viewer.splat_view import SplatView
 
-Job = Callable[[], None]
+Task = Callable[[], None]
 
 THUMBNAIL, MOST_THUMBNAILS = 96, 24  # px
 
@@ -40,12 +40,12 @@ class Worker:
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         self._failed = failed
-        self._waiting: dict[str, Job] = {}
+        self._waiting: dict[str, Task] = {}
         self._changed = threading.Condition()
         self._busy = self._closed = False
         threading.Thread(target=self._run, name="completesplat-viewer", daemon=True).start()
 
-    def submit(self, kind: str, job: Job) -> None:
+    def submit(self, kind: str, job: Task) -> None:
         """Add a job after the waiting ones, or replace the waiting job of the same kind."""
         with self._changed:
             self._waiting[kind] = job
@@ -101,7 +101,7 @@ class Saver:
             raise CompleteSplatError("there is nothing to save yet: draw samples first")
         self.folder.mkdir(parents=True, exist_ok=True)
         if kind == "html":
-            return [write_page(self.view.server, self._next("page", ".html"))]
+            return [write_viewer_page(self.view.server, self._next("page", ".html"))]
         return [self._video(sample) if kind == VIDEO else self._scene(kind, sample) for sample in samples]
 
     def thumbnail(self, sample: Sample, size: int) -> Pixels:
@@ -112,7 +112,7 @@ class Saver:
         intrinsics = camera.intrinsics * camera.intrinsics.new_tensor([[factor], [factor], [1.0]])
         small = Cameras(camera.world_to_camera, intrinsics, (height, width))
         views, _ = render_views(self.rasterizer(), scene, small[None], self.background)
-        return to_bytes(views[0].nan_to_num())
+        return to_pixels(views[0].nan_to_num())
 
     def _scene(self, kind: str, sample: Sample) -> Path:
         """Write all layers of a sample, in its reference camera's frame."""
@@ -168,13 +168,13 @@ class Page:
         layers = max((sample.layers for sample in samples), default=0)
         for i, box in enumerate(self.looking.layers):
             box.visible = i < layers
-        say(self.server, status)
+        show_status(self.server, status)
         if all(sample.finished for sample in samples):
             self.worker.submit("thumbnails", partial(self._draw_thumbnails, samples))
 
     def open(self, path: Path, name: str) -> None:
         """Show what `read_scene` reads instead of the samples, from the front."""
-        say(self.server, f"reading {name}")
+        show_status(self.server, f"reading {name}")
         samples, up = read_scene(path)
         self.view.set_up(up)
         self.show(samples, name)
@@ -225,7 +225,7 @@ class Page:
 
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
         """Show an error in one browser or in all; log it as well if it is a fault of the program."""
-        say(self.server, "")  # what was waited for
+        show_status(self.server, "")  # what was waited for
         text = str(error)
         if not isinstance(error, CompleteSplatError):
             text = f"{type(error).__name__}: {text}"
@@ -278,7 +278,7 @@ class Page:
         self.worker.submit(kind, save)
 
 
-def write_page(server: viser.ViserServer, path: Path) -> Path:
+def write_viewer_page(server: viser.ViserServer, path: Path) -> Path:
     """Write the server's scene, without controls, as one HTML file that needs no server."""
     write_text(path, with_head(server.get_scene_serializer().as_html()))
     return path

@@ -59,7 +59,7 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
             samples=slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
             skip_weight=slider("Skip weight", 0.0, 1.0, 0.05, start["skip_weight"], hint=free),
             guidance_weight=slider("Guidance", 0.0, 1.0, 0.05, start["guidance_weight"], hint=diverse),
-            color_fits=slider("Colour fits", 0, 10, 1, start["color_fits"], hint="rounds of fitting to the image"),
+            color_fits=slider("Fits", 0, 50, 1, start["color_fits"], hint="rounds of fitting to the image"),
             steps=slider("Steps", 1, most_steps, 1, first_steps, hint="denoising steps"),
             seed=slider("Seed", 0, max(MOST_SEED, start["seed"]), 1, start["seed"]),
             live=gui.add_checkbox("Draw when a slider moves", True, visible=draws),

@@ -12,7 +12,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.data.images.files import MOST_PIXELS
-from completesplat.data.validation import BadAnnotation, BadCamera, at, field, finite_array, read_json, require_rotation
+from completesplat.data.validation import (
+    BadAnnotation,
+    BadCamera,
+    errors_at,
+    field,
+    finite_array,
+    read_json,
+    require_rotation,
+)
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import LARGEST, with_screen_space_dilation
 from completesplat.export.reading import read_gaussians
@@ -79,7 +87,7 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     description = (path.parent if path.is_file() else path) / "scene.json"
     if not description.is_file() or not all(file.name.startswith(("sample_", "scene.")) for file in files):
         return [Sample(scene, 1, framing_camera(scene)) for scene in scenes], UP
-    with at(description):
+    with errors_at(description):
         data = read_json(description)
         reference, settings = _camera(field(data, "reference_camera", dict)), field(data, "settings", dict)
         up = _up(settings)
@@ -90,7 +98,7 @@ def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
     """Return a run's newest step, scenes and direction up (`write_newest`); raise CompleteSplatError if unreadable."""
     path = folder / NEWEST_FILE
     samples = []
-    with at(path):
+    with errors_at(path):
         data = read_json(path)
         step, up = field(data, "step", int), _up(data)
         for row in field(data, "scenes", list):

@@ -1,12 +1,15 @@
 """`completesplat bench paper`: what it writes, prints and refuses."""
 
+import os
+from pathlib import Path
+
 import pytest
 import torch
 from omegaconf import OmegaConf
 from support import compose_config, strict_json
 
 from completesplat.benchmarks import paper
-from completesplat.benchmarks.paper import FIGURES, WAYS, compile_networks, is_as_in_the_paper, measured
+from completesplat.benchmarks.paper import COMPUTE_MODES, FIGURES, compile_networks, is_as_in_the_paper, time_and_memory
 from completesplat.settings.checks import complete_task
 
 CHANNELS = "channels=[8,8,16,16]"
@@ -22,15 +25,11 @@ QUICK = [
 def test_both_stages_are_measured_written_and_printed(command, tmp_path, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # starting workers costs more than writing a few images
     monkeypatch.setattr(paper, "WARM_UP", 0)
-    finished = command(*QUICK, f"out={tmp_path / 'out'}")
-    assert finished.status == 0, finished.err
+    finished = command.succeeds(*QUICK, f"out={tmp_path / 'out'}")
     results = strict_json(tmp_path / "out/paper.json")
-    assert [(row["name"], row["way"]) for row in results["rows"]] == [
-        (name, way)
-        for names in (("reconstruct", "render", "stage1_step"), ("sample", "samples", "stage2_step"))
-        for way in ("float32", "bfloat16")
-        for name in names
-    ]
+    stages = (["reconstruct", "render", "stage1_step"], ["sample", "samples", "stage2_step"])
+    works = [(name, way) for names in stages for way in ("float32", "bfloat16") for name in names]
+    assert [(row["name"], row["way"]) for row in results["rows"]] == works
     # Less work than the paper's, so its durations do not stand beside these.
     assert all(set(row) == {"name", "way", "ms"} and row["ms"] > 0 for row in results["rows"])
     work = {"device": "cpu", "image_size": 32, "batch": 2, "samples": 3, "steps": 2, "repeats": 1}
@@ -58,7 +57,7 @@ def test_the_work_is_the_papers_unless_something_is_changed():
 def test_networks_are_compiled_in_the_way_s_mode(monkeypatch):
     modes = []
     monkeypatch.setattr(torch, "compile", lambda call, mode: modes.append(mode) or call)
-    for way in WAYS:
+    for way in COMPUTE_MODES:
         network = torch.nn.Linear(1, 1)
         compile_networks([network], way)
         assert (network._compiled_call_impl is not None) == (way.compile is not None)
@@ -69,4 +68,21 @@ def test_failing_work_has_the_reason_in_its_row():
     def fail() -> None:
         raise RuntimeError("out of memory\nand a long story")
 
-    assert measured(fail, 1, torch.device("cpu")) == {"not_measured": "RuntimeError: out of memory"}
+    assert time_and_memory(fail, 1, torch.device("cpu")) == {"not_measured": "RuntimeError: out of memory"}
+
+
+def children() -> int:
+    return len(Path(f"/proc/self/task/{os.getpid()}/children").read_text().split())
+
+
+@pytest.mark.processes
+def test_work_is_measured_beside_busy_processes_which_end_with_it():
+    busy = []
+
+    def work() -> None:
+        busy.append(children())
+
+    row = time_and_memory(work, 2, torch.device("cpu"), busy=3)
+    assert busy == [0] * (paper.WARM_UP + 2) + [3] * 2
+    assert row["times"] == row["busy_ms"] / row["ms"]
+    assert children() == 0

@@ -6,13 +6,7 @@ import pytest
 from support import compose_config, strict_json
 
 from completesplat.benchmarks import rasterizers, workloads
-from completesplat.benchmarks.rasterizers import (
-    BACKENDS,
-    LONGEST_SECONDS,
-    side_by_side,
-    speed_rows,
-    working_backends,
-)
+from completesplat.benchmarks.rasterizers import BACKENDS, LONGEST_SECONDS, side_by_side, speed_rows, working_backends
 from completesplat.benchmarks.workloads import Backend, splatter_scene
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
@@ -86,9 +80,8 @@ def test_there_is_one_row_for_each_backend_and_workload(clock: Clock, monkeypatc
     rows = speed_rows(backends, [8, 12], [1, 3], 2, messages.append)
     works = [(size, 2 * size**2, views, o) for size in (8, 12) for views in (1, 3) for o in ("trained", "initial")]
     keys = [tuple(row[key] for key in ("size", "gaussians", "views", "opacity", "backend")) for row in rows]
-    assert keys == [
-        (*work, name) for work in works for name in milliseconds if name != "reference" or work in works[:2]
-    ]
+    expected = [(*work, name) for work in works for name in milliseconds if name != "reference" or work in works[:2]]
+    assert keys == expected
     for row in rows:
         assert row["forward_ms"] == row["forward_backward_ms"] == milliseconds[row["backend"]]
         assert row["peak_mb"] is None or row["peak_mb"] >= 0
@@ -112,12 +105,7 @@ def test_backends_take_turns_and_the_time_is_the_median_without_the_first_run(cl
 
 def test_backends_are_compared_with_tiled_on_the_same_workload(clock: Clock) -> None:
     backends = [clock.backend(name, seconds) for name, seconds in {"reference": 0.5, "tiled": 0.25}.items()]
-    assert [row["times_tiled"] for row in speed_rows(backends, [4], [1], 1, print)] == [
-        2,
-        1,
-        2,
-        1,
-    ]
+    assert [row["times_tiled"] for row in speed_rows(backends, [4], [1], 1, print)] == [2, 1] * 2
     assert not any("times_tiled" in row for row in speed_rows(backends[:1], [4], [1], 1, print))
 
 
@@ -127,14 +115,12 @@ QUICK = ["bench", "rasterizers", "sizes=[16]", "views=[1]", "repeats=1"]
 def test_results_are_written_and_printed(command, tmp_path, monkeypatch):
     """A backend that does not work on this machine is named with the reason."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    finished = command(*QUICK, "backends=[tiled,reference,cuda]", f"out={tmp_path / 'out'}")
-    assert finished.status == 0, finished.err
+    finished = command.succeeds(*QUICK, "backends=[tiled,reference,cuda]", f"out={tmp_path / 'out'}")
     assert finished.out.splitlines()[-1] == str(tmp_path / "out")
     results = strict_json(tmp_path / "out/rasterizers.json")
     assert "CUDA device" in results["not_measured"]["cuda"]
-    assert [(row["backend"], row["opacity"]) for row in results["rows"]] == [
-        (name, opacity) for opacity in ("trained", "initial") for name in ("tiled", "reference")
-    ]
+    works = [(name, opacity) for opacity in ("trained", "initial") for name in ("tiled", "reference")]
+    assert [(row["backend"], row["opacity"]) for row in results["rows"]] == works
     assert {(row["size"], row["gaussians"], row["views"]) for row in results["rows"]} == {(16, 512, 1)}
     missing = f"cuda: not measured, because {results['not_measured']['cuda']}"
     texts = ("Speed", results["machine"]["processor"], missing)

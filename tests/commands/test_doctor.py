@@ -63,10 +63,9 @@ def test_weights_are_broken_if_changed_or_incomplete(tmp_path):
     weights.write_bytes(bytes(1000))
     write_sums(folder)
     assert states(doctor.check_weights(tmp_path)) == {"small": "yes"}
-    weights.write_bytes(bytes(999) + b"\1")
-    assert states(doctor.check_weights(tmp_path)) == {"small": "broken"}
-    weights.unlink()
-    assert states(doctor.check_weights(tmp_path)) == {"small": "broken"}
+    for damage in (lambda: weights.write_bytes(bytes(999) + b"\1"), weights.unlink):
+        damage()
+        assert states(doctor.check_weights(tmp_path)) == {"small": "broken"}
 
 
 def test_missing_node_and_blender_are_no_errors_but_ffmpeg_and_space_are_needed(tmp_path, monkeypatch):

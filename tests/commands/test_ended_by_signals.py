@@ -55,8 +55,7 @@ def test_fit_goes_on_with_the_command_that_it_says(command, toy_root, tmp_path, 
     assert checkpoint == f"{tmp_path}/run/checkpoints/last.ckpt"
     assert read_checkpoint(checkpoint)["global_step"] == 3
     assert not (tmp_path / "run/metrics.json").exists()
-    finished = command(*again)
-    assert finished.status == 0, finished.err
+    command.succeeds(*again)
     assert strict_json(tmp_path / "run/metrics.json")["steps"] == 5
 
 
@@ -87,8 +86,7 @@ def test_latents_leave_no_half_store(command, pipeline, packed_toys, tmp_path, s
     finished = command("data", *given)
     assert finished.status == 143, finished.err
     assert not list((tmp_path / "latents").glob("*.arrow*"))
-    finished = command(*message(finished, signal.SIGTERM)[1])
-    assert finished.status == 0, finished.err
+    command.succeeds(*message(finished, signal.SIGTERM)[1])
 
 
 STARTED = """
@@ -118,22 +116,17 @@ def test_a_process_of_a_job_does_not_outlive_the_one_that_started_it():
 def test_lightning_starts_processes_that_know_which_one_started_them(command, toy_root, tmp_path, monkeypatch):
     given = []
     monkeypatch.setattr("completesplat.commands.fit.run", lambda config, out: given.extend(sys.argv))
-    assert command("fit", *FIT, f"data.root={toy_root}", f"out={tmp_path / 'run'}").status == 0
+    command.succeeds("fit", *FIT, f"data.root={toy_root}", f"out={tmp_path / 'run'}")
     assert given[2] == f"--process-of={os.getpid()}:{tmp_path / 'run'}"
     ended, started = [], []
     monkeypatch.setattr("completesplat.commands.end_with", ended.append)
     monkeypatch.setattr("completesplat.commands.fit.run", lambda config, out: started.append(out))
-    assert command("fit", given[2]).status == 0
+    command.succeeds("fit", given[2])
     assert (ended, started) == ([os.getpid()], [tmp_path / "run"])
 
 
-def test_a_signal_while_the_run_s_own_files_are_written_leaves_none_of_them_half(
-    command, toy_root, tmp_path, monkeypatch
-):
-    def record(*_):
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr("completesplat.commands.jobs._record", record)
+def test_a_signal_while_a_run_s_own_files_are_written_leaves_no_half_one(command, toy_root, tmp_path, monkeypatch):
+    monkeypatch.setattr("completesplat.commands.jobs._record", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
     finished = command("fit", *FIT, f"data.root={toy_root}", f"out={tmp_path / 'run'}")
     assert finished.status == 143
     assert message(finished, signal.SIGTERM)[0] == ""

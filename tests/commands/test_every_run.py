@@ -13,11 +13,11 @@ from omegaconf import OmegaConf
 from PIL import Image
 from support import SMALL, compose_config, strict_json
 
-from completesplat.commands.trained import Trained
+from completesplat.commands.trained import TrainedModel
 from completesplat.commands.view import setting_of_path
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
-from completesplat.generator import CompleteSplat, OneAnswer
+from completesplat.generator import CompleteSplat, DeterministicModel
 from completesplat.weights import CONFIG_FILE, SUMS_FILE
 
 QUICK = [*SMALL, "callbacks.images=null"]
@@ -34,9 +34,7 @@ def splatter(pipeline, built_once):
 
 @pytest.fixture
 def run(pipeline, request):
-    return {"var": pipeline.var, "diffusion": pipeline.diffusion}.get(request.param) or request.getfixturevalue(
-        "splatter"
-    )
+    return getattr(pipeline, request.param, None) or request.getfixturevalue("splatter")
 
 
 @pytest.mark.parametrize(("run", "samples"), [("var", 1), ("splatter", 1), ("diffusion", 2)], indirect=["run"])
@@ -50,22 +48,12 @@ def test_a_runs_folder_its_weights_and_its_checkpoint_give_the_same_scenes(pipel
             assert all(torch.equal(value, getattr(other, name)) for name, value in vars(scene).items())
 
 
-def test_a_prediction_of_stage_one_gives_one_answer(command, pipeline, tmp_path):
-    photograph = pipeline.photograph()
-    given = [f"image={photograph}", f"weights={pipeline.var}", "samples=2", f"out={tmp_path}", "video=[]"]
-    finished = command("predict", *given)
-    assert finished.status == 0, finished.err
-    assert "draws no samples" in finished.out
-    assert len(list(tmp_path.glob(f"{photograph.stem}/sample_*.ply"))) == 1
-    assert strict_json(tmp_path / photograph.stem / "scene.json")["settings"]["samples"] == 1
-
-
 @pytest.mark.parametrize("run", ["var", "splatter"], indirect=True)
 def test_scenes_of_stage_one_are_those_that_its_test_scores(pipeline, run):
     model = CompleteSplat.from_pretrained(run)
-    assert isinstance(model, OneAnswer)
+    assert isinstance(model, DeterministicModel)
     assert not model.draws_samples
-    module, data = Trained(str(run / "checkpoints/last.ckpt"), [f"data.root={pipeline.toy}"], trust=True).open()
+    module, data = TrainedModel(str(run / "checkpoints/last.ckpt"), [f"data.root={pipeline.toy}"], trust=True).open()
     data.setup("test")
     batch = next(iter(data.test_dataloader()))
     with torch.no_grad():
@@ -92,38 +80,21 @@ def test_hidden_pixels_have_no_influence_on_stage_one(pipeline):
     assert not torch.equal(model(photograph)[0].means, model(changed)[0].means)
 
 
-def test_weights_of_stage_one_are_scored_as_its_checkpoint_is(command, pipeline, tmp_path):
-    data = ["data=toy_objects", f"data.root={pipeline.toy}", "data.evaluation_targets=2", "trainer.accelerator=cpu"]
-    finished = command("test", f"weights={pipeline.var}", *data, f"out={tmp_path / 'test'}")
-    assert finished.status == 0, finished.err
-    scores, own = (strict_json(path / "metrics.json") for path in (tmp_path / "test", pipeline.var))
-    novel, expected = (result["model"]["full"]["novel"] for result in (scores, own["test"]))
-    assert novel["psnr"] == pytest.approx(expected["psnr"], abs=1e-3)
-
-
-def test_another_sampler_is_refused_where_nothing_is_drawn(command, pipeline, tmp_path):
-    given = [f"image={pipeline.photograph()}", f"weights={pipeline.var}", "sampler=dpm20", f"out={tmp_path / 'out'}"]
-    refused = command("predict", *given)
-    assert (refused.status, refused.err.count("\n")) == (2, 1)
-    assert "these weights draw no samples: leave out sampler" in refused.err
-
-
 def test_a_run_of_fitted_scenes_leaves_them_and_says_so_when_a_photograph_is_given(command, pipeline, tmp_path):
     fitting = ["model=per_scene", "model.fitting.count=300", "model.fitting.steps=3"]
     run = tmp_path / "run"
     used = [setting for setting in QUICK if not setting.startswith(("trainer.max_", "trainer.val_check"))]
     settings = [f"data.root={pipeline.toy}", *used, *fitting, f"out={run}"]
-    assert command("fit", "experiment=toy_var", *settings).status == 0
+    command.succeeds("fit", "experiment=toy_var", *settings)
     (folder,) = (run / "scenes").iterdir()
     assert {path.name for path in folder.iterdir()} == {"scene.ply", "sheet.png", "scene.json"}
     assert 0 < read_ply(folder / "scene.ply").count <= 300
     Image.open(folder / "sheet.png").verify()
     assert strict_json(folder / "scene.json")["settings"]["scene"] in folder.name
     assert setting_of_path(run) == {"scene": str(run)}
-    refused = command("predict", f"image={pipeline.photograph()}", f"weights={run}", f"out={tmp_path / 'out'}")
-    assert (refused.status, refused.err.count("\n")) == (2, 1)
-    assert "PerScene" in refused.err
-    assert f"{run / 'scenes'}" in refused.err
+    refused = command.refuses("predict", f"image={pipeline.photograph()}", f"weights={run}", "out=out")
+    assert "PerScene" in refused
+    assert f"{run / 'scenes'}" in refused
 
 
 @pytest.fixture

@@ -1,14 +1,19 @@
+"""Runs of `completesplat fit`: their files, scores and refusals, and stage 1 of the paper from CO3D's files."""
+
 import csv
 import shlex
 from pathlib import Path
 
 import pytest
 import torch
+from co3d_trees import CATEGORY, write_tree
+from hydra.utils import instantiate
 from lightning import Trainer
 from omegaconf import OmegaConf
+from pretrained_vaes import random_vae
 from support import SMALL, compose_config, strict_json
 
-from completesplat.commands.fit import refuse_missing, run
+from completesplat.commands.fit import run
 from completesplat.errors import CompleteSplatError
 
 
@@ -51,14 +56,11 @@ def test_a_fit_has_the_scores_of_a_test_of_its_checkpoint(command, pipeline, tmp
     """In the test's precision, with the protocol's changes to the data, and at its resolution."""
     fit = ["trainer.precision=bf16-mixed", "trainer.max_steps=1", f"data.root={pipeline.toy}"]
     run = tmp_path / "run"
-    trained = command("fit", "experiment=toy_var", *SMALL, *fit, *SCORED, f"out={run}")
-    assert trained.status == 0, trained.err
-    checkpoint = run / "checkpoints/last.ckpt"
-    tested = command("test", f"ckpt={checkpoint}", *SCORED, "trainer.accelerator=cpu", f"out={tmp_path / 'scores'}")
-    assert tested.status == 0, tested.err
+    command.succeeds("fit", "experiment=toy_var", *SMALL, *fit, *SCORED, f"out={run}")
+    typed = [f"ckpt={run / 'checkpoints/last.ckpt'}", *SCORED, "trainer.accelerator=cpu", f"out={tmp_path / 'scores'}"]
+    command.succeeds("test", *typed)
     ours, theirs = strict_json(run / "metrics.json")["test"], strict_json(tmp_path / "scores/metrics.json")
     assert shlex.split(ours["protocol"]["command"])[:2] == ["completesplat", "fit"]
-    typed = [f"ckpt={checkpoint}", *SCORED, "trainer.accelerator=cpu", f"out={tmp_path / 'scores'}"]
     assert shlex.split(theirs["protocol"]["command"]) == ["completesplat", "test", *typed]
     for scores in (ours, theirs):
         del scores["protocol"]["command"]
@@ -77,33 +79,12 @@ def test_a_protocol_that_does_not_fit_is_refused_before_training(toy_root, tmp_p
         run(compose_config("fit", *given, f"out={tmp_path}"), tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("experiment", "place", "asked"),
-    [
-        (
-            "paper_var_stage1",
-            "autoreconstructor.pretrained",
-            "CompVis/stable-diffusion-v1-4, or null for random weights",
-        ),
-        ("toy_var_masked", "model.checkpoint", "RUN/checkpoints/last.ckpt"),
-        ("paper_diffusion", "data.root", "DIR"),
-        ("toy_diffusion", "model.autoreconstructor_checkpoint", "RUN/checkpoints/last.ckpt of stage 1"),
-    ],
-)
-def test_a_missing_setting_is_asked_for(experiment, place, asked):
-    given = ["data=toy_objects"] if place == "autoreconstructor.pretrained" else []
-    with pytest.raises(CompleteSplatError) as caught:
-        refuse_missing(compose_config("fit", f"experiment={experiment}", *given))
-    assert str(caught.value) == f"{place} is needed: give {place}={asked}"
-
-
 def test_a_checkpoint_that_is_missing_or_cut_off_is_refused_before_data_are_made(command, pipeline, tmp_path):
     damaged = tmp_path / "damaged.ckpt"
     damaged.write_bytes((pipeline.var / "checkpoints/last.ckpt").read_bytes()[:-100])
     for path, reason in ((tmp_path / "nowhere.ckpt", "no such checkpoint"), (damaged, "not a readable checkpoint")):
-        finished = command("fit", f"ckpt_path={path}", f"data.root={tmp_path / 'new'}", "data.make=true", *SMALL)
-        assert finished.status == 2
-        assert finished.err.startswith(f"error: {path}: {reason}")
+        refused = command.refuses("fit", f"ckpt_path={path}", f"data.root={tmp_path / 'new'}", "data.make=true", *SMALL)
+        assert refused.startswith(f"{path}: {reason}")
     assert not (tmp_path / "new").exists()
 
 
@@ -112,9 +93,7 @@ def test_a_checkpoint_that_is_missing_or_cut_off_is_refused_before_data_are_made
 def test_a_run_without_callbacks_or_loggers_is_trained_and_scored(command, toy_root, tmp_path, left_out):
     given = [setting for setting in SMALL if not setting.startswith(("callbacks", "trainer.max_steps"))]
     given += ["experiment=toy_var", f"data.root={toy_root}", "trainer.max_steps=1", left_out, f"out={tmp_path / 'run'}"]
-    given += [] if left_out == "~callbacks" else ["callbacks.images=null"]
-    finished = command("fit", *given)
-    assert finished.status == 0, finished.err
+    command.succeeds("fit", *given, *([] if left_out == "~callbacks" else ["callbacks.images=null"]))
     metrics = strict_json(tmp_path / "run/metrics.json")
     assert (metrics["steps"], metrics["test"]["model"]["scenes"]) == (1, 1)
     assert (tmp_path / "run/metrics.csv").is_file() == (left_out != "~logger")
@@ -123,3 +102,30 @@ def test_a_run_without_callbacks_or_loggers_is_trained_and_scored(command, toy_r
 @pytest.mark.slow
 def test_a_training_without_callbacks_is_planned(command):
     assert command("plan", "experiment=toy_var", "~callbacks", "data.image_size=32").status == 0
+
+
+LISTS = {"train": "abcdef", "val": "g", "test": "hi"}
+
+
+def test_stage1_starts_from_a_vae_tests_on_unseen_sequences_and_resumes_without_the_vae(command, tmp_path):
+    write_tree(tmp_path / "co3d", dict.fromkeys("abcdefghi", 4), LISTS)
+    random_vae().save_pretrained(tmp_path / "vae")
+    run = tmp_path / "run"
+    fit = ["fit", "experiment=paper_var_stage1", f"data.root={tmp_path / 'co3d'}", f"data.category={CATEGORY}"]
+    fit += ["data.image_size=32", "data.batch_size=2", "data.workers=0", "rasterizer=tiled", "trainer.accelerator=cpu"]
+    fit += ["trainer.max_steps=2", "trainer.max_epochs=null", "trainer.val_check_interval=2", "callbacks.progress=null"]
+    fit += ["callbacks.images=null"]
+    fit += [f"autoreconstructor.encoder.{name}" for name in ("channels=[8,8,16,16]", "layers_per_block=1")]
+    fit += ["autoreconstructor.encoder.norm_groups=4"]
+
+    command.succeeds(*fit, f"out={run}", f"autoreconstructor.pretrained={tmp_path / 'vae'}")
+    results = strict_json(run / "metrics.json")
+    protocol = results["test"]["protocol"]
+    assert results["steps"] == 2
+    assert (protocol["subset"], protocol["scenes"], protocol["scenes_listed"]) == ("fewview_dev", 2, 2)
+    data = instantiate(OmegaConf.load(run / "config.yaml").data, _convert_="all")
+    assert data.source("test").names == list(LISTS["test"])
+    assert not set(data.source("train").names) & set(data.source("test").names)
+    resume = [f"ckpt_path={run / 'checkpoints/last.ckpt'}", "trainer.max_steps=3", "test=false"]
+    command.succeeds(*fit, *resume, f"out={tmp_path / 'more'}")
+    assert strict_json(tmp_path / "more/metrics.json")["steps"] == 3

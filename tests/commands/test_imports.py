@@ -8,8 +8,7 @@ import pytest
 pytestmark = pytest.mark.processes
 
 IMPORTED = """
-import copy, pickle, sys
-from completesplat.commands.imports import POSTPONED, postponing
+import copy, pickle
 with postponing():
     import numba.np.arraymath, torch
     from diffusers import FlowMatchEulerDiscreteScheduler, UNet2DModel
@@ -70,9 +69,8 @@ assert importlib.metadata.packages_distributions.__module__ == "importlib.metada
 assert import_utils._package_map == importlib.metadata.packages_distributions()
 """,
 }
-OTHERS = """
-import sys
-from completesplat.commands.imports import POSTPONED, postponing
+ALONE = {
+    "another library gets the modules themselves, which exist once and lie in their packages": """
 with postponing():
     import torch._dynamo.config as config
     import scipy.stats.qmc
@@ -84,43 +82,27 @@ assert config is torch._dynamo.config is sys.modules["torch._dynamo.config"]
 assert torch._dynamo.allow_in_graph.__module__ == "torch._dynamo.decorators"
 assert scipy.stats.qmc is sys.modules["scipy.stats.qmc"] and norm is scipy.stats.norm
 assert requests is not sys.modules["requests"] and requests.get is sys.modules["requests"].get
-"""
-LOADED = """
-import sys, torch._dynamo, scipy.stats
+""",
+    "what is imported already stays": """
+import torch._dynamo, scipy.stats
 before = sys.modules["torch._dynamo"], sys.modules["scipy.stats"]
-from completesplat.commands.imports import postponing
 with postponing():
     assert (sys.modules["torch._dynamo"], sys.modules["scipy.stats"]) == before
 assert (sys.modules["torch._dynamo"], sys.modules["scipy.stats"]) == before
-"""
-CALLED = """
-from completesplat.commands.imports import postponing
+""",
+    "what torch excludes from compilation can be called meanwhile": """
 with postponing():
     import torch
     from torch.utils.checkpoint import checkpoint
     assert checkpoint(torch.cos, torch.zeros(2), use_reentrant=False).tolist() == [1, 1]
 assert torch._dynamo.allow_in_graph.__module__ == "torch._dynamo.decorators"
-"""
+""",
+}
+PROGRAMS = {name: IMPORTED + script for name, script in SCRIPTS.items()} | ALONE
 
 
-def run(program: str) -> None:
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_libraries_work_with_postponed_imports(name: str) -> None:
+    program = f"import sys\nfrom completesplat.commands.imports import POSTPONED, postponing\n{PROGRAMS[name]}"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-
-
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_libraries_work_with_postponed_imports(name: str) -> None:
-    run(IMPORTED + SCRIPTS[name])
-
-
-def test_another_library_gets_the_modules_themselves() -> None:
-    """Modules below a postponed one, as transformers imports them, exist once and lie in their packages."""
-    run(OTHERS)
-
-
-def test_what_is_imported_already_stays() -> None:
-    run(LOADED)
-
-
-def test_what_torch_excludes_from_compilation_can_be_called_meanwhile() -> None:
-    run(CALLED)

@@ -53,6 +53,17 @@ def test_the_nearest_to_the_first_image_that_can_be_read_are_chosen_and_the_othe
         nearest_weights([red], False)
 
 
+@pytest.mark.parametrize(("border", "chosen"), [("white", "reds"), ("red", "blues")])
+def test_weights_of_objects_on_white_are_for_images_whose_border_is_white(package, tmp_path, border, chosen):
+    config = json.loads((package["reds"] / "config.json").read_text())
+    config["training"]["background"] = 1.0
+    (package["reds"] / "config.json").write_text(json.dumps(config))
+    image = Image.new("RGB", (60, 60), border)
+    image.paste("red", (3, 3, 60, 57))  # the object touches the right side
+    image.save(tmp_path / "object.png")
+    assert next(iter(distances_to_shipped(tmp_path / "object.png"))) == chosen
+
+
 def test_distances_are_of_the_image_at_the_size_of_each_model(package, tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (48, 48, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(tmp_path / "noise.png")
@@ -70,8 +81,7 @@ def test_distances_are_of_the_image_at_the_size_of_each_model(package, tmp_path)
 
 def test_the_default_chooses_and_says_so_in_one_line(command, tmp_path):
     quick = ["samples=1", "steps=1", "color_fits=0", "video=[]"]
-    finished = command("predict", f"image={COUCH}", f"out={tmp_path / 'out'}", *quick)
-    assert finished.status == 0, finished.err
+    finished = command.succeeds("predict", f"image={COUCH}", f"out={tmp_path / 'out'}", *quick)
     (line,) = [line for line in finished.out.splitlines() if line.startswith("weights: ")]
     assert line.startswith("weights: rendered_couches, which come with the package and know renders of ")
     assert "nearest to held_out.jpg (" in line

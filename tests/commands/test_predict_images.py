@@ -15,10 +15,10 @@ from fake_converter import calls, install
 from PIL import Image
 from support import compose_config, some_gaussians, strict_json
 
-from completesplat.commands.predict import find_images, remarks, run, unusual_field_of_view, wanted_files
+from completesplat.commands.predict import find_images, output_files, photo_warnings, run, unusual_field_of_view
 from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.generator import CompleteSplat
 
 QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
@@ -26,7 +26,7 @@ QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
 
 def draw(model: CompleteSplat, photograph: Photograph, visible: object, **settings: object) -> list[Gaussians]:
     """In place of the networks, which other tests run: a few splats in the photograph's colour."""
-    scene = concatenate([some_gaussians(1)[0]] * 10)
+    scene = merge_gaussians([some_gaussians(1)[0]] * 10)
     place = torch.linspace(-0.5, 0.5, 20)
     means = torch.stack([place, place.sin(), place + 3], dim=-1)
     return [replace(scene, means=means, colors=photograph.image.mean((1, 2)).expand(20, 3).contiguous())]
@@ -63,12 +63,13 @@ def test_a_folder_is_its_images_sorted(tmp_path):
     assert find_images(f"{folder}/*") == find_images(f"{tmp_path}/**/[ab]*.*") + images[2:] == images
     (folder / "[a].png").symlink_to("a.PNG")
     assert find_images(f"{folder}/[a].png") == [folder / "[a].png"]  # a file's own name is no pattern
-    with pytest.raises(CompleteSplatError, match=r"\*\.gif: no image fits"):
-        find_images(f"{folder}/*.gif")
-    with pytest.raises(CompleteSplatError, match="no image in this folder"):
-        find_images(str(folder / "c.png"))
-    with pytest.raises(CompleteSplatError, match="at least one"):
-        find_images([])
+    no_list = "give an image, a folder, or a list of them"
+    refusals = [([], "at least one"), *((odd, no_list) for odd in (None, "", ["a.png", None], {"a": 1}))]
+    refusals += [("nofile.jpg", r"^nofile\.jpg: no such file"), ("a" * 5000, "^a{200,500}: no such file$")]
+    refusals += [(f"{folder}/*.gif", r"gif: no image fits \(\.jpg, "), (f"{folder}/c.png", "no image in this folder")]
+    for given, message in refusals:
+        with pytest.raises(CompleteSplatError, match=message):
+            find_images(given)
 
 
 ODD_NAMES = [b"...png", b"\xff.png", b"[red].png", b"new\nline.png", b"a" * 250 + b".png", b"\x1b[31m.png", b"a\\b.png"]
@@ -98,41 +99,49 @@ def test_names_that_are_no_utf_8_are_printed_by_a_process_that_prints_utf_8(tmp_
     program = "from completesplat.cli import main; main()"
     given = [f"image='{name}'", f"weights={tiny_weights}", f"out='{out}'", *QUICK]  # as hydra wants them
     environment = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": "utf-8:strict"}
-    done = subprocess.run(
-        [sys.executable, "-c", program, "predict", *given], cwd=tmp_path, env=environment, capture_output=True
-    )
+    started = [sys.executable, "-c", program, "predict", *given]
+    done = subprocess.run(started, cwd=tmp_path, env=environment, capture_output=True)
     assert (done.returncode, done.stderr) == (0, b"")
     assert done.stdout.endswith(b"/out\\udcff\n")
     assert (tmp_path / out / "_" / "sheet.png").is_file()
 
 
-def test_a_fault_at_one_image_does_not_stop_the_others(predict, tmp_path, monkeypatch):
+def test_images_that_fail_are_named_and_do_not_stop_the_others(predict, tmp_path, monkeypatch):
+    """One cannot be read, one is not there, and one lets the program fail."""
+
     def faulty(model, photograph, visible, **settings):
-        if photograph.image[0].mean() < 0.5:
+        if photograph.image[1].mean() > 0.4:
             raise ValueError("a fault\nof the program")
         return draw(model, photograph, visible, **settings)
 
     monkeypatch.setattr(CompleteSplat, "forward", faulty)
-    finished = predict(f"[{save(tmp_path / 'a.png', 'blue')},{save(tmp_path / 'b.png')}]")
+    save(tmp_path / "x/a.png")
+    (tmp_path / "x/b.jpg").write_bytes(b"\xff\xd8\xff\xe0 truncated")
+    lime, blue = save(tmp_path / "lime.png", "lime"), save(tmp_path / "y/a.png", "blue")
+    finished = predict(f"[{tmp_path / 'x'},nowhere.png,{lime},{blue}]")
     assert finished.status == 2
-    first, summary = finished.err.splitlines()
-    assert first == f"error: {tmp_path / 'a.png'}: a fault of the program"
-    assert "1 of 2 images failed (a.png)" in summary
+    broken, missing, fault, summary = finished.err.splitlines()
+    assert re.match("error: .*b.jpg", broken)
+    assert "nowhere.png: no such file" in missing
+    assert fault == f"error: {lime}: a fault of the program"
     assert "Traceback" in finished.out
-    assert (tmp_path / "out/b/sheet.png").is_file()
+    failed = "3 of 5 images failed (b.jpg, nowhere.png, lime.png)"
+    assert summary == f"error: {failed}; the others are in {tmp_path / 'out'}"
+    done = [line.partition(":")[0] for line in finished.out.splitlines() if "/5 " in line]
+    assert done == ["1/5 a.png", "5/5 a.png"]
+    result = [(path.parent.name, path.name) for path in (tmp_path / "out").glob("*/*")]
+    assert sorted(result) == [(a, name) for a in ("a", "a_2") for name in ("sample_00.ply", "scene.json", "sheet.png")]
+    assert (tmp_path / "out/a/sample_00.ply").read_bytes() != (tmp_path / "out/a_2/sample_00.ply").read_bytes()
 
 
-@pytest.mark.parametrize("image", [None, "", ["a.png", None], {"a": 1}])
-def test_what_is_no_image_is_refused(image):
-    with pytest.raises(CompleteSplatError, match="give an image, a folder, or a list of them"):
-        find_images(image)
-
-
-def test_a_name_that_is_too_long_is_refused_in_a_short_line(predict):
-    finished = predict("a" * 5000)
+def test_if_all_fail_nothing_is_said_to_be_left(predict, command, tmp_path):
+    for name in ("x.png", "y.png"):
+        (tmp_path / name).write_text("no image")
+    assert predict("[x.png,y.png]").err.splitlines()[-1] == "error: 2 of 2 images failed (x.png, y.png)"
+    finished = predict(tmp_path / "x.png")
     assert (finished.status, finished.err.count("\n")) == (2, 1)
-    assert len(finished.err) < 600
-    assert finished.err.endswith("aaa: no such file\n")
+    assert re.match("error: .*x.png", finished.err)
+    assert not list((tmp_path / "out").glob("*/"))
 
 
 def model_with(tiny_weights: Path, **facts: object) -> CompleteSplat:
@@ -155,18 +164,16 @@ def test_one_warning_says_that_the_weights_were_not_trained_with_hidden_parts(
     assert (finished.status, finished.out.count(warning)) == (0, times)
 
 
-def test_a_photo_unlike_the_training_images_gets_a_warning(tiny_weights, tmp_path):
+def test_a_photo_unlike_the_training_images_gets_a_warning_that_names_nearer_weights(
+    tiny_weights, tmp_path, monkeypatch
+):
     model = model_with(tiny_weights, picture_mean=[1.0, 0, 0, 0, 0, 0, 0, 0], picture_std=[0.1] * 8)
     red, blue = (model.read(save(tmp_path / f"{color}.png", color), 15) for color in ("red", "blue"))
-    fov, unlike = remarks(blue, model, whole=True)
+    fov, unlike = photo_warnings(blue, model, whole=True)
     assert "field of view is 15" in fov
     assert unlike.startswith("colours, contrast or detail lie 5.0 standard deviations from the training images'")
-    assert len(remarks(red, model, whole=True)) == len(remarks(blue, model, whole=False)) == 1
-    assert len(remarks(blue, model_with(tiny_weights), whole=True)) == 1  # nothing is known of the training
-
-
-def test_shipped_weights_that_are_nearer_to_a_photo_are_named(tiny_weights, tmp_path, monkeypatch):
-    model = model_with(tiny_weights, picture_mean=[1.0, 0, 0, 0, 0, 0, 0, 0], picture_std=[0.1] * 8)
+    assert len(photo_warnings(red, model, whole=True)) == len(photo_warnings(blue, model, whole=False)) == 1
+    assert len(photo_warnings(blue, model_with(tiny_weights), whole=True)) == 1  # nothing is known of the training
     folders = {}
     for name, mean in (("reds", [0.9, 0, 0]), ("blues", [0, 0, 1.0]), ("greens", [0, 0.5, 0]), ("unknown", None)):
         folders[name] = tmp_path / name
@@ -174,20 +181,15 @@ def test_shipped_weights_that_are_nearer_to_a_photo_are_named(tiny_weights, tmp_
         training = {} if mean is None else {"picture_mean": mean + [0.0] * 5, "picture_std": [0.1] * 8}
         (folders[name] / "config.json").write_text(json.dumps({"image_size": 24, "training": training}))
     monkeypatch.setattr("completesplat.scene_model.shipped", lambda: folders)
-    blue, red = (model.read(save(tmp_path / f"{color}.png", color)) for color in ("blue", "red"))
-    (unlike,) = remarks(blue, model, whole=True)
-    assert unlike.endswith("; weights=blues were trained on images that are nearer (0.0)")
-    assert remarks(red, model, whole=True) == []
+    assert photo_warnings(blue, model, whole=True)[1].endswith(
+        "; weights=blues were trained on images that are nearer (0.0)"
+    )
     monkeypatch.setattr("completesplat.scene_model.shipped", lambda: {"reds": folders["reds"]})
-    (unlike,) = remarks(blue, model, whole=True)
+    unlike = photo_warnings(blue, model, whole=True)[1]
     near, elsewhere = unlike.partition("expect little of it in the scenes; ")[2].split("; ", 1)
     assert near == "weights=reds were trained on images that are nearer (4.8)"  # but not near
-    for name in (
-        "weights=splatter_image:objaverse background=remove (MIT, ",
-        "TripoSplat",
-        "github.com/apple/ml-sharp",
-    ):
-        assert name in elsewhere
+    others = "weights=splatter_image:objaverse background=remove (MIT, ", "TripoSplat", "github.com/apple/ml-sharp"
+    assert all(name in elsewhere for name in others)
 
 
 def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
@@ -202,44 +204,6 @@ def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
         assert predict(save(tmp_path / "a.png"), setting).status == 0
         settings = strict_json(tmp_path / "out/a/scene.json")["settings"]
         assert (given["removed"], settings.get("background")) == (removed, "remove" if removed else None)
-
-
-def test_an_image_that_fails_is_named_and_does_not_stop_the_others(predict, tmp_path):
-    save(tmp_path / "x/a.png")
-    (tmp_path / "x/b.jpg").write_text("no image")
-    finished = predict(f"[{tmp_path / 'x'},nowhere.png,{save(tmp_path / 'y/a.png', 'blue')}]")
-    assert finished.status == 2
-    broken, missing, summary = finished.err.splitlines()
-    assert re.match("error: .*b.jpg", broken)
-    assert "nowhere.png: no such file" in missing
-    assert summary == f"error: 2 of 4 images failed (b.jpg, nowhere.png); the others are in {tmp_path / 'out'}"
-    done = [line.partition(":")[0] for line in finished.out.splitlines() if "/4 " in line]
-    assert done == ["1/4 a.png", "4/4 a.png"]
-    result = [(path.parent.name, path.name) for path in (tmp_path / "out").glob("*/*")]
-    assert sorted(result) == [(a, name) for a in ("a", "a_2") for name in ("sample_00.ply", "scene.json", "sheet.png")]
-    assert (tmp_path / "out/a/sample_00.ply").read_bytes() != (tmp_path / "out/a_2/sample_00.ply").read_bytes()
-
-
-def test_missing_images_are_refused_before_the_model_is_loaded(command, monkeypatch):
-    monkeypatch.setattr(CompleteSplat, "from_pretrained", lambda *_: pytest.fail("loaded"))
-    for given, message in (
-        (["nofile.jpg"], "nofile.jpg: no such file"),
-        (["*.png"], "*.png: no image fits (.jpg, "),
-    ):
-        refused = command("predict", *given)
-        assert (refused.status, refused.err.count("\n")) == (2, 1)
-        assert refused.err.startswith(f"error: {message}")
-
-
-def test_if_all_fail_nothing_is_said_to_be_left(predict, tmp_path):
-    for name in ("x.png", "y.png"):
-        (tmp_path / name).write_text("no image")
-    assert predict("[x.png,y.png]").err.splitlines()[-1] == "error: 2 of 2 images failed (x.png, y.png)"
-    (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 truncated")
-    finished = predict(tmp_path / "broken.jpg")
-    assert (finished.status, finished.err.count("\n")) == (2, 1)
-    assert re.match("error: .*broken.jpg", finished.err)
-    assert not (tmp_path / "out/broken").exists()
 
 
 def test_videos_and_formats_are_written_and_recorded_and_a_strange_field_of_view_told(predict, tmp_path, monkeypatch):
@@ -260,29 +224,24 @@ def test_videos_and_formats_are_written_and_recorded_and_a_strange_field_of_view
     assert len(calls(program)) == 3  # its version, before the model runs
 
 
-def test_a_converter_that_is_missing_is_told_before_the_model_is_loaded(predict, tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(CompleteSplat, "from_pretrained", lambda *_: pytest.fail("loaded"))
-    finished = predict(save(tmp_path / "a.png"), "formats=html")
-    assert finished.status == 2
-    assert finished.err.startswith("error: formats spz, sog and html need Node.js")
-
-
 def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage", None)
+    monkeypatch.setenv("PATH", str(tmp_path))
     for setting, message in (
         ("formats=[ply,obj]", "formats=obj: choose from ply, splat, glb, mesh, spz, sog, html"),
+        ("formats=html", "formats spz, sog and html need Node.js"),
         ("formats=mesh", 'formats=[mesh] needs scikit-image: pip install "completesplat[mesh]"'),
         ("formats=[]", "formats=[] video=[]: choose a format (ply, splat, glb, mesh, spz, sog, html) or a video"),
         ("video=zoom", "video=zoom: choose from orbit, swipe, wobble"),
         ("mask=x.png", "mask=FILE belongs to one image"),
+        ("image=nofile.jpg", "nofile.jpg: no such file"),
     ):
         images = f"image=[{save(tmp_path / 'a.png')},{save(tmp_path / 'b.png')}]"
         video = ["video=[]"] if setting == "formats=[]" else []
         config = compose_config("predict", images, "weights=nowhere", setting, *video)
         with pytest.raises(CompleteSplatError, match=re.escape(message)):
             run(config, tmp_path)
-    only_videos = wanted_files(compose_config("predict", "image=a.png", "formats=[]"))
+    only_videos = output_files(compose_config("predict", "image=a.png", "formats=[]"))
     assert (only_videos.formats, only_videos.videos) == ((), ("orbit",))
 
 

@@ -8,8 +8,8 @@ from PIL import Image
 from published_weights import write_published
 from support import SMALL, compose_config, strict_json
 
-from completesplat.baselines.splatter_image.model import PublishedOneAnswer
-from completesplat.commands.trained import Trained
+from completesplat.baselines.splatter_image.model import PublishedModel
+from completesplat.commands.trained import TrainedModel
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
 from completesplat.gaussians import DirectionalGaussians
@@ -27,7 +27,7 @@ def cut_out(path, size=(60, 40)):
 
 def test_a_cut_out_object_lies_on_what_the_weights_know_as_large_as_in_training(tmp_path):
     image = cut_out(tmp_path / "a.png")
-    of_objects = PublishedOneAnswer(str(write_published(tmp_path / "objects", "objaverse", size=40)))
+    of_objects = PublishedModel(str(write_published(tmp_path / "objects", "objaverse", size=40)))
     photograph = of_objects.read(image)
     assert (photograph.fov_degrees, photograph.fov_source) == (pytest.approx(49.1343, abs=1e-3), "default")
     orange = photograph.image[2] < 0.5
@@ -37,7 +37,7 @@ def test_a_cut_out_object_lies_on_what_the_weights_know_as_large_as_in_training(
     assert abs(rows.float().mean() - 19.5) <= 1
     assert abs(columns.float().mean() - 19.5) <= 1
     assert photograph.image[:, 0, 0].tolist() == [1, 1, 1]
-    of_captures = PublishedOneAnswer(str(write_published(tmp_path / "captures", "hydrants", size=40)))
+    of_captures = PublishedModel(str(write_published(tmp_path / "captures", "hydrants", size=40)))
     seen = of_captures.read(image, 60)
     assert (seen.fov_degrees, seen.fov_source) == (60, "given")
     assert seen.image[:, 0, 0].tolist() == [0, 0, 0]  # the central square, its left border cuts the object
@@ -50,9 +50,8 @@ def test_a_cut_out_object_lies_on_what_the_weights_know_as_large_as_in_training(
 def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tmp_path):
     weights = write_published(tmp_path / "objects", "objaverse")
     image = cut_out(tmp_path / "a.png")
-    given = [f"image={image}", f"weights={weights}", f"out={tmp_path / 'out'}", "frames=2", "samples=4"]
-    finished = command("predict", *given)
-    assert finished.status == 0, finished.err
+    given = [f"image={image}", f"weights={weights}", "out=out", "frames=2", "samples=4"]
+    finished = command.succeeds("predict", *given)
     assert "one answer for each image and draws no samples" in finished.out
     assert "give images that are transparent or white around one, or background=remove" in finished.out
     folder = tmp_path / "out/a"
@@ -62,18 +61,16 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
     assert not {"sampler", "steps"} & settings.keys()
     assert settings["samples"] == 1
     model = CompleteSplat.from_pretrained(weights)
-    assert isinstance(model, PublishedOneAnswer)
-    scene = model(image, color_fits=2)[0]
+    assert isinstance(model, PublishedModel)
+    scene = model(image, color_fits=40)[0]
     stored, center = read_ply(folder / "sample_00.ply"), torch.zeros(3)
     assert isinstance(stored, DirectionalGaussians)
     torch.testing.assert_close(stored.seen_from(center).colors, scene.seen_from(center).colors, atol=1e-4, rtol=0)
     for settings, message in (
-        (["fov=40"], "image as of 49 degrees"),
-        (["sampler=dpm20"], "these weights draw no samples: leave out sampler"),
+        ("fov=40", "image as of 49 degrees"),
+        ("sampler=dpm20", "these weights draw no samples: leave out sampler"),
     ):
-        refused = command("predict", *given, *settings)
-        assert (refused.status, len(refused.err.splitlines())) == (2, 1)
-        assert message in refused.err
+        assert message in command.refuses("predict", *given, settings)
     with pytest.raises(CompleteSplatError, match="samples=2: this model draws none"):
         model(image, samples=2)
     with pytest.raises(WeightsError, match="copy these"):
@@ -82,16 +79,12 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
 
 def test_a_photograph_of_an_object_becomes_a_scene_without_its_background(rembg, command, tmp_path):
     weights = write_published(tmp_path / "objects", "objaverse", size=40)
-    Image.new("RGB", (120, 80), "red").save(tmp_path / "a.png")
-    with Image.open(tmp_path / "a.png") as photo:
-        photo.paste((0, 128, 255), (5, 8, 25, 18))
-        photo.save(tmp_path / "a.png")
-    given = [f"image={tmp_path / 'a.png'}", f"weights={weights}", f"out={tmp_path / 'out'}", "video=[]"]
-    finished = command("predict", *given, "background=remove")
-    assert finished.status == 0, finished.err
+    photo = Image.new("RGB", (120, 80), "red")
+    photo.paste((0, 128, 255), (5, 8, 25, 18))
+    photo.save(tmp_path / "a.png")
+    command.succeeds("predict", "a.png", f"weights={weights}", "out=out", "video=[]", "background=remove")
     model = CompleteSplat.from_pretrained(weights)
-    with Image.open(tmp_path / "a.png") as photo:
-        seen = model.read(photo, remove_background=True)
+    seen = model.read(tmp_path / "a.png", remove_background=True)
     blue = seen.image[0] < 0.5
     assert blue.sum() == pytest.approx(26 * 13, rel=0.1)
     assert (seen.image[:, ~blue] > 0.5).all()  # no red is left
@@ -113,14 +106,13 @@ def test_what_is_hidden_counts_as_background(tmp_path):
 def test_a_test_sees_objects_only_at_their_depths_and_its_figures_stand_apart(command, pipeline, tmp_path):
     weights = write_published(tmp_path / "captures", "hydrants", size=32)
     given = ["ckpt=null", f"weights={weights}", "data=toy_objects", f"data.root={pipeline.toy}"]
-    finished = command("test", *given, "trainer.accelerator=cpu", f"out={tmp_path / 'out'}")
-    assert finished.status == 0, finished.err
+    command.succeeds("test", *given, "trainer.accelerator=cpu", "out=out")
     metrics = strict_json(tmp_path / "out/metrics.json")
     assert (metrics["protocol"]["method"], metrics["protocol"]["background"]) == ("PublishedSplatterImage", 0)
     assert metrics["protocol"]["checkpoint"]["path"] == str(weights)
     assert metrics["model"]["full"]["novel"]["psnr"] > 0
     config = compose_config("test", *given)
-    trained = Trained(None, weights=str(weights), data=config.data, rasterizer=config.rasterizer)
+    trained = TrainedModel(None, weights=str(weights), data=config.data, rasterizer=config.rasterizer)
     module, data = trained.open()
     assert not isinstance(module, Stage)  # nothing is trained, so there is no optimizer
     data.prepare_data()
@@ -139,18 +131,14 @@ def test_what_is_trained_on_is_predicted_with_from_its_run(command, toy_root, tm
     weights = write_published(tmp_path / "captures", "hydrants", size=32)
     given = ["experiment=toy_var", "model=splatter_image_published", f"model.model.weights={weights}", *SMALL]
     given += [f"data.root={toy_root}", "data.background=0", "callbacks.images=null", "test=false"]
-    refused = command("fit", *given, "data.image_size=64", "out=OTHER")
-    assert (refused.status, refused.err) == (2, "error: data.image_size=64: model_hydrants.pth needs 32\n")
-    trained = command("fit", *given, "optimizer.lr=1e-3", "out=RUN")
-    assert trained.status == 0, trained.err
-    assert {path.name for path in (tmp_path / "RUN/weights").iterdir()} == {
-        "config_hydrants.yaml",
-        "model_hydrants.pth",
-    }
+    refused = command.refuses("fit", *given, "data.image_size=64", "out=OTHER")
+    assert refused == "data.image_size=64: model_hydrants.pth needs 32"
+    command.succeeds("fit", *given, "optimizer.lr=1e-3", "out=RUN")
+    files = sorted(path.name for path in (tmp_path / "RUN/weights").iterdir())
+    assert files == ["config_hydrants.yaml", "model_hydrants.pth"]
     before, after = (CompleteSplat.from_pretrained(path).network.state_dict() for path in (weights, tmp_path / "RUN"))
     same = {name for name, value in before.items() if torch.equal(value, after[name])}
     assert same < set(before)
     quick = ["samples=1", "video=[]", "rasterizer=reference", "out=OUT"]
-    finished = command("predict", str(cut_out(tmp_path / "a.png")), "weights=RUN", *quick)
-    assert finished.status == 0, finished.err
+    command.succeeds("predict", str(cut_out(tmp_path / "a.png")), "weights=RUN", *quick)
     assert (tmp_path / "OUT/a/sample_00.ply").is_file()

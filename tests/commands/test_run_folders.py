@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from support import SMALL, strict_json
 
 from completesplat.commands import jobs
-from completesplat.commands.jobs import alone_in
+from completesplat.commands.jobs import hold_job_lock
 from completesplat.data.toy import write_objects
 from completesplat.errors import CompleteSplatError
 from completesplat.files import atomic_path
@@ -48,26 +48,21 @@ def holder(tmp_path):
 @pytest.mark.processes
 def test_a_second_process_is_refused_until_the_first_is_gone(command, toy_root, tmp_path, holder):
     given = ["data", "stats", "data=toy_objects", f"data.root={toy_root}", f"out={tmp_path}/run"]
-    refused = command(*given)
-    assert refused.status == 2
     named = f"process {holder.pid} on {os.uname().nodename}"
-    assert refused.err.startswith(f"error: {tmp_path}/run: {named} is at work in it: ")
-    assert refused.err.count("\n") == 1
+    assert command.refuses(*given).startswith(f"{tmp_path}/run: {named} is at work in it: ")
     assert not (tmp_path / "run/config.yaml").exists()
 
     os.kill(holder.pid, signal.SIGKILL)
     holder.wait()
     for _ in range(2):  # also after a process that ended by itself
-        assert command(*given).status == 0
+        command.succeeds(*given)
     assert (tmp_path / "run/.lock").read_text().split()[0] == str(os.getpid())
 
 
 @pytest.mark.parametrize("out", ["file", "file/below", "/dev/null", "x" * 300])
 def test_what_cannot_be_a_folder_is_refused_as_one(command, tmp_path, out):
     (tmp_path / "file").write_text("kept")
-    refused = command("data", "toy", "scenes=1", "size=16", f"out={out}")
-    assert (refused.status, refused.err.count("\n")) == (2, 1)
-    assert refused.err.startswith(f"error: {out}: cannot be used: ")
+    assert command.refuses("data", "toy", "scenes=1", "size=16", f"out={out}").startswith(f"{out}: cannot be used: ")
     assert (tmp_path / "file").read_text() == "kept"
 
 
@@ -81,7 +76,7 @@ def test_a_lock_that_is_no_file_is_refused(tmp_path, kind):
         lock.symlink_to(target)
     if kind == "link":
         target.write_text("kept")
-    with pytest.raises(CompleteSplatError, match=r"run/\.lock: is a link or a folder"), alone_in(lock.parent):
+    with pytest.raises(CompleteSplatError, match=r"run/\.lock: is a link or a folder"), hold_job_lock(lock.parent):
         pass
     assert (target.read_text() == "kept") if kind == "link" else not target.exists()
 
@@ -91,11 +86,10 @@ def test_a_removed_working_folder_is_named(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
     for given in (["data", "toy"], ["fit", "--help"]):
-        refused = command(*given)
-        assert (refused.status, refused.err) == (2, "error: the working folder was removed: go to another folder\n")
+        assert command.refuses(*given) == "the working folder was removed: go to another folder"
 
 
-def test_unfinished_files_of_a_killed_process_are_removed_by_the_next_one(command, toy_root, tmp_path):
+def test_unfinished_files_of_a_killed_process_are_removed_and_links_are_not_followed(command, toy_root, tmp_path):
     """As `predict` leaves them below its folder. Another job's folder within is left alone while it may be at work."""
     left, of_another = tmp_path / "run/photo", tmp_path / "run/other/photo"
     for folder in (left, of_another):
@@ -105,20 +99,14 @@ def test_unfinished_files_of_a_killed_process_are_removed_by_the_next_one(comman
         temporary.touch()  # again, as if the process had been killed before it gave the file its name
         (folder / ".mine.mp4").touch()
     (tmp_path / "run/other/.lock").touch()
-    assert command("data", "stats", "data=toy_objects", f"data.root={toy_root}", f"out={tmp_path}/run").status == 0
-    assert sorted(path.name for path in left.iterdir()) == [".mine.mp4", "orbit_01.mp4"]
-    assert temporary.is_file()
-
-
-def test_links_in_a_run_s_folder_are_not_followed(command, toy_root, tmp_path):
     run, kept = tmp_path / "run", tmp_path / "kept"
-    run.mkdir()
     kept.write_text("kept")
     written = ["commands.log", "config.yaml", "run.json", "stats.json", "stats.png"]
     for name in written:
         (run / name).symlink_to(kept)
-    given = ["data", "stats", "data=toy_objects", f"data.root={toy_root}", "splits=[val]", f"out={run}"]
-    assert command(*given).status == 0
+    command.succeeds("data", "stats", "data=toy_objects", f"data.root={toy_root}", "splits=[val]", f"out={run}")
+    assert sorted(path.name for path in left.iterdir()) == [".mine.mp4", "orbit_01.mp4"]
+    assert temporary.is_file()
     assert kept.read_text() == "kept"
     assert not any((run / name).is_symlink() for name in written)
 
@@ -138,15 +126,15 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     assert jobs.is_finished(tmp_path, config())
     for longer in ({"max_steps": 40}, {"max_steps": -1}, {"max_time": {"hours": 1}, "max_steps": 21}):
         assert not jobs.is_finished(tmp_path, config(**longer))
-    with pytest.raises(CompleteSplatError, match=r"max_steps=10: .* has 20 steps; give more"):
-        jobs.is_finished(tmp_path, config(max_steps=10))
-    with pytest.raises(CompleteSplatError, match="max_epochs=3 may end before the run in"):
-        jobs.is_finished(tmp_path, config(max_steps=40, max_epochs=3))
     again = f"completesplat fit optimizer.lr=2 ckpt_path={tmp_path}/checkpoints/last.ckpt out=MORE"
-    with pytest.raises(CompleteSplatError, match=f"another optimizer.lr: continue in another folder: {again}$"):
-        jobs.is_finished(tmp_path, config(rate=2, max_steps=40), ["out=R", "optimizer.lr=2", "ckpt_path=last"])
-    with pytest.raises(CompleteSplatError, match="another model: choose another out=DIR"):
-        jobs.is_finished(tmp_path, config() | {"model": {"_target_": "a.B"}})
+    for changed, message in (
+        (config(max_steps=10), r"max_steps=10: .* has 20 steps; give more"),
+        (config(max_steps=40, max_epochs=3), "max_epochs=3 may end before the run in"),
+        (config(rate=2, max_steps=40), f"another optimizer.lr: continue in another folder: {again}$"),
+        (config() | {"model": {"_target_": "a.B"}}, "another model: choose another out=DIR"),
+    ):
+        with pytest.raises(CompleteSplatError, match=message):
+            jobs.is_finished(tmp_path, changed, ["out=R", "optimizer.lr=2", "ckpt_path=last"])
     jobs._record(tmp_path, ["second"], [], config(max_steps=40))
     record = strict_json(tmp_path / "run.json")
     assert (record["started"], record["command"], len(record["continued"])) == ("then", ["second"], 1)
@@ -191,13 +179,10 @@ def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tm
     more.rename(root)
 
     before = content(run)
-    refused = command(*given)
-    assert content(run) == before
-    assert refused.status == 2
     message = f"{root}: not the training data that this run had before (2 sequences then, 5 now)"
-    assert refused.err == f"error: {message}; data.allow_changed=true goes on with these\n"
-    went_on = command(*given, "data.allow_changed=true")
-    assert went_on.status == 0, went_on.err
+    assert command.refuses(*given) == f"{message}; data.allow_changed=true goes on with these"
+    assert content(run) == before
+    command.succeeds(*given, "data.allow_changed=true")
     assert message in (run / "commands.log").read_text()
     assert strict_json(run / "metrics.json")["steps"] == 2
     assert OmegaConf.load(run / "config.yaml").data.allow_changed
@@ -209,10 +194,11 @@ def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tm
 
 
 def test_a_refused_job_leaves_an_earlier_ones_record_and_a_first_one_leaves_its_own(command, pipeline, tmp_path):
+    photo = pipeline.photograph()
     given = ["predict", "weights=toy_objects", f"out={tmp_path}/run", "video=[]", "steps=1", "samples=1"]
-    assert command(*given, str(pipeline.photograph())).status == 0
+    command.succeeds(*given, photo)
     before = content(tmp_path / "run")
-    for unfit in (["absent.jpg"], [str(pipeline.photograph()), "fov=500"], [str(pipeline.photograph()), "formats=[x]"]):
+    for unfit in (["absent.jpg"], [photo, "fov=500"], [photo, "formats=[x]"]):
         assert command(*given, *unfit).status == 2
         assert content(tmp_path / "run") == before
     assert command(*given[:2], "absent.jpg", f"out={tmp_path}/first").status == 2

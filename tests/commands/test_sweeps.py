@@ -1,6 +1,10 @@
-"""Sweeps: one directory a job, named by what is swept; a sweep that is started again continues."""
+"""Sweeps: a folder for each job, which continues, or tells sweepers that look for good settings a figure."""
 
+import csv
+import json
+import math
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -8,10 +12,10 @@ from pathlib import Path
 import pytest
 import torch
 from omegaconf import OmegaConf
-from support import SMALL, call, script, strict_json
+from support import LIMIT, SMALL, call, script, strict_json
 from vgg_weights import blank, saved
 
-from completesplat.commands.jobs import is_finished
+from completesplat.commands.jobs import is_finished, optimized
 from completesplat.errors import CompleteSplatError
 from completesplat.losses.lpips import load_vgg16
 from completesplat.settings.composition import LONGEST_NAME, job_name, swept_keys
@@ -44,14 +48,6 @@ def test_a_job_is_named_by_what_is_swept_plainly_and_like_no_other():
     assert swept_keys(given) == ["ablation", "seed", "x", "y"]
 
 
-def test_a_sweep_has_no_one_config_to_show(command):
-    finished = command("fit", "-m", "experiment=toy_var", "seed=0,1", "--cfg", "job")
-    assert (finished.status, finished.err) == (
-        2,
-        "error: --cfg and --info show the settings of one run: leave out -m\n",
-    )
-
-
 @pytest.fixture(scope="module")
 def whole(toy_root, tmp_path_factory) -> Path:
     """A sweep of one job that ran through."""
@@ -64,8 +60,7 @@ def whole(toy_root, tmp_path_factory) -> Path:
 def test_a_sweep_that_is_started_again_repeats_no_finished_job(command, toy_root, whole):
     jobs = [whole / "seed-0", whole / "seed-1"]
     before = (jobs[0] / LAST).stat().st_mtime_ns
-    again = command(*settings(toy_root), "seed=0,1", f"out={whole}")
-    assert again.status == 0
+    again = command.succeeds(*settings(toy_root), "seed=0,1", f"out={whole}")
     assert again.out.count("finished before, not repeated") == 1
     assert (jobs[0] / LAST).stat().st_mtime_ns == before
     assert (jobs[1] / "metrics.json").is_file()
@@ -80,31 +75,27 @@ def test_a_job_that_fails_does_not_stop_the_others(command, tmp_path):
     assert {path.parent.name for path in tmp_path.glob("sweep/*/toy_*")} == {"size-16"}
 
 
-def test_a_finished_run_is_not_overwritten_and_not_repeated(whole):
+def test_a_finished_run_is_not_overwritten_and_not_repeated_even_with_other_numbers_of_processes(whole):
     job = whole / "seed-0"
     config = OmegaConf.to_container(OmegaConf.load(job / "config.yaml"))
     assert config["ckpt_path"] == "last"
-    assert is_finished(job, config)
-    with pytest.raises(CompleteSplatError, match="continue it with ckpt_path=last"):
-        is_finished(job, config | {"ckpt_path": None})
-    with pytest.raises(CompleteSplatError, match="with another seed"):
-        is_finished(job, config | {"seed": 5})
+    trainer = config["trainer"]
+    for same in (config, config | {"trainer": trainer | {"devices": 2, "num_nodes": 3, "strategy": "ddp"}}):
+        assert is_finished(job, same)
+    for other, message in (
+        ({"ckpt_path": None}, "continue it with ckpt_path=last"),
+        ({"seed": 5}, "with another seed"),
+        ({"trainer": trainer | {"precision": "64-true"}}, r"with another trainer\.precision"),
+    ):
+        with pytest.raises(CompleteSplatError, match=message):
+            is_finished(job, config | other)
     assert not is_finished(whole, config)
 
 
 @pytest.mark.parametrize(("name", "value"), [("LOCAL_RANK", "0"), ("SLURM_STEP_NUM_TASKS", "2")])
 def test_a_sweep_is_not_started_by_each_process_of_a_launcher(command, monkeypatch, name, value):
     monkeypatch.setenv(name, value)
-    refused = command("fit", "-m", "experiment=toy_var", "seed=0,1")
-    assert (refused.status, "start it once" in refused.err) == (2, True)
-
-
-def in_a_process_of_its_own(arguments: list[str], folder: Path) -> None:
-    """Run the command as a shell would, with the modules in a folder at hand."""
-    environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
-    program = [sys.executable, script(folder), *arguments]
-    done = subprocess.run(program, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-3000:]
+    assert "start it once" in command.refuses("fit", "-m", "experiment=toy_var", "seed=0,1")
 
 
 NOTE = '''
@@ -131,7 +122,10 @@ def test_two_processes_a_job_train_the_same_job_and_start_no_sweep_of_their_own(
     sweep = tmp_path / "sweep"
     note = "+callbacks.note={_target_: process_notes.Note, folder: '${out}/notes', seed: '${seed}'}"
     more = ["trainer.devices=2", "trainer.strategy=ddp", "rasterizer=reference", note]
-    in_a_process_of_its_own([*settings(toy_root), "seed=3,4", f"out={sweep}", *more], tmp_path)
+    environment = os.environ | {"PYTHONPATH": str(tmp_path), "OMP_NUM_THREADS": "1"}
+    program = [sys.executable, script(tmp_path), *settings(toy_root), "seed=3,4", f"out={sweep}", *more]
+    done = subprocess.run(program, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
 
     assert sorted(job.name for job in sweep.iterdir() if job.is_dir()) == ["seed-3", "seed-4"]
     for seed in (3, 4):
@@ -151,9 +145,9 @@ def test_the_second_part_of_stage_one_is_swept_from_the_jobs_of_the_first(comman
     monkeypatch.setattr("completesplat.losses.lpips.load_vgg16", lambda weights, sha256: load_vgg16(str(vgg)))
     shared = [f"data.root={toy_root}", *SMALL, "callbacks.images=null", "ablation=full,no_lpips", "seed=choice(0)"]
     one, two = tmp_path / "PART1", tmp_path / "TABLE"
-    assert command("fit", "-m", "experiment=toy_var", *shared, "test=false", f"out={one}").status == 0
+    command.succeeds("fit", "-m", "experiment=toy_var", *shared, "test=false", f"out={one}")
     start = f"model.checkpoint={one}/ablation-${{hydra:runtime.choices.ablation}}+seed-${{seed}}/{LAST}"
-    assert command("fit", "-m", "experiment=toy_var_stage2", *shared, start, f"out={two}").status == 0
+    command.succeeds("fit", "-m", "experiment=toy_var_stage2", *shared, start, f"out={two}")
 
     jobs = ["ablation-full+seed-0", "ablation-no_lpips+seed-0"]
     first, second = ([weights(sweep / job) for job in jobs] for sweep in (one, two))
@@ -165,10 +159,105 @@ def test_the_second_part_of_stage_one_is_swept_from_the_jobs_of_the_first(comman
     assert len((two / "summary.csv").read_text().splitlines()) >= 3
 
 
-def test_a_run_goes_on_with_another_number_of_processes(whole, tmp_path):
-    job = whole / "seed-0"
-    config = OmegaConf.to_container(OmegaConf.load(job / "config.yaml"))
-    others = {"devices": 2, "num_nodes": 3, "strategy": "ddp"}
-    assert is_finished(job, config | {"trainer": config["trainer"] | others})
-    with pytest.raises(CompleteSplatError, match=r"with another trainer\.precision"):
-        is_finished(job, config | {"trainer": config["trainer"] | {"precision": "64-true"}})
+FIGURES = {"steps": 2, "val/psnr_novel": 20.5, "val/loss": None, "upper_bound": False, "test": {"x": 1.0}}
+
+
+def test_a_job_returns_the_figure_that_is_asked_for_and_names_those_that_it_has(tmp_path):
+    (tmp_path / "metrics.json").write_text(json.dumps(FIGURES | {"not_finite": ["val/loss: nan"]}))
+    assert optimized(None, tmp_path) is None
+    assert optimized("val/psnr_novel", tmp_path) == 20.5
+    assert math.isnan(optimized("val/loss", tmp_path))
+    there_are = r", there are val/psnr_novel, val/loss; did you mean val/psnr_nov"
+    for name, others in (("val/psnr", there_are), ("steps", ""), ("upper_bound", ""), ("test", "")):
+        with pytest.raises(CompleteSplatError, match=f"^optimized_metric={name}: no figure in .*{others}"):
+            optimized(name, tmp_path)
+
+
+def test_a_finished_run_is_asked_for_its_metric(command, pipeline):
+    settings = ["experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, "ckpt_path=last", f"out={pipeline.var}"]
+    refused = command.refuses("fit", *settings, "optimized_metric=val/psnr_novl")
+    assert refused.startswith("optimized_metric=val/psnr_novl: no figure in ")
+    assert "val/psnr_novel" in refused
+
+
+@pytest.mark.slow
+def test_optuna_finds_the_better_of_two_settings(command, toy_root, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="hydra-optuna-sweeper is not installed")
+    settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "callbacks.images=null", "test=false"]
+    sweep = ["-m", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "hydra.sweeper.direction=maximize"]
+    sweep += ["optimized_metric=val/psnr_novel", "model.background=choice(0.0,1.0)", "hydra.sweeper.sampler.seed=1"]
+    command.succeeds("fit", *sweep, *settings, "out=SEARCH")
+    best = OmegaConf.load(tmp_path / "SEARCH/optimization_results.yaml")
+    result = [strict_json(path)["val/psnr_novel"] for path in tmp_path.glob("SEARCH/*/metrics.json")]
+    assert best.best_value == max(result)
+
+
+PYTHON = f"#!{sys.executable}\n"
+SBATCH = '''"""Start all jobs of an array, or the one job, of the script of the last argument, and print the number.
+
+They wait, as in a queue, until whoever submits them has put everything in its place.
+"""
+import os, re, subprocess, sys
+script = sys.argv[-1]
+options = dict(re.findall(r"^#SBATCH --([\\w-]+)=(\\S+)", open(script).read(), re.M))
+first, last = re.match(r"(\\d+)-(\\d+)", options.get("array", "0-0")).groups()
+number = str(os.getpid())
+for task in range(int(first), int(last) + 1):
+    tasks = options.get("ntasks-per-node", "1")
+    told = {"SLURM_JOB_ID": f"{number}{task}", "SLURM_JOB_NAME": options["job-name"], "SLURM_NTASKS": tasks}
+    told |= {"SLURM_NTASKS_PER_NODE": tasks, "SLURM_NNODES": options["nodes"], "SLURM_JOB_NUM_NODES": "1"}
+    if "array" in options:
+        told |= {"SLURM_ARRAY_JOB_ID": number, "SLURM_ARRAY_TASK_ID": str(task)}
+    job = f"{number}_{task}" if "array" in options else number
+    waiting = f"[ ! -e {os.path.dirname(script)}/{job}/{job}_submitted.pkl ] && kill -0 {os.getppid()}"
+    run = ["bash", "-c", f"while {waiting}; do sleep 0.1; done; exec bash {script}"]
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    subprocess.Popen(run, env=os.environ | told, start_new_session=True, **silent)
+print("Submitted batch job", number)
+'''
+SRUN = '''"""Run a program once for each task, as srun does on one node."""
+import os, subprocess, sys
+count = int(os.environ["SLURM_NTASKS"])
+program = sys.argv[next(i for i, argument in enumerate(sys.argv) if "/python" in argument) :]
+shared = {"SLURM_STEP_NUM_TASKS": str(count), "SLURM_NODEID": "0", "SLURM_NODELIST": "localhost"}
+log = sys.argv[sys.argv.index("--error") + 1]
+job, task = (os.environ.get(f"SLURM_ARRAY_{name}_ID", "0") for name in ("JOB", "TASK"))
+processes = []
+for rank in range(count):
+    told = shared | {"SLURM_PROCID": str(rank), "SLURM_LOCALID": str(rank)}
+    with open(log.replace("%A", job).replace("%a", task).replace("%t", str(rank)), "w") as file:
+        processes.append(subprocess.Popen(program, env=os.environ | told, stdout=file, stderr=file))
+sys.exit(max(process.wait() for process in processes))
+'''
+
+
+@pytest.fixture
+def cluster(tmp_path, monkeypatch):
+    """SLURM's programs, first in the PATH."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for name, text in {"sbatch": SBATCH, "srun": SRUN, "sacct": "", "scontrol": "", "scancel": ""}.items():
+        (folder / name).write_text(PYTHON + text)
+        (folder / name).chmod(stat.S_IRWXU)
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+    monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")  # asked of `scontrol` by Lightning otherwise
+    return folder
+
+
+@pytest.mark.slow
+def test_slurm_runs_the_jobs_of_a_sweep_each_with_two_processes(toy_root, tmp_path, cluster):
+    out = tmp_path / "sweep"
+    given = ["fit", "-m", "experiment=toy_var", f"data.root={toy_root}", *SMALL, "data.workers=0", f"out={out}"]
+    given += ["trainer.max_steps=1", "callbacks.images=null", "rasterizer=reference", "trainer=slurm", "seed=0,1"]
+    given += ["hydra/launcher=submitit_slurm", "hydra.launcher.timeout_min=10", "hydra.launcher.tasks_per_node=2"]
+    program = [sys.executable, str(script(tmp_path)), *given, "trainer.precision=32-true"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=LIMIT, cwd=tmp_path)
+    logs = "".join(path.read_text()[-2000:] for path in out.glob(".submitit/*/*_log.err"))
+    assert done.returncode == 0, done.stderr[-3000:] + logs
+    with (out / "summary.csv").open(newline="") as file:
+        assert [row["seeds"] for row in csv.DictReader(file) if row["seeds"]] == ["2"]
+    for seed in (0, 1):
+        metrics = strict_json(out / f"seed-{seed}/metrics.json")
+        assert (metrics["steps"], metrics["data.batch_per_process"]) == (1, 1)
+    assert len(list(out.glob(".submitit/*/*_result.pkl"))) == 4

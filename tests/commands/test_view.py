@@ -14,7 +14,7 @@ from support import LIMIT
 from viewer_scenes import balls
 from written_commands import ROOT
 
-from completesplat.commands.jobs import alone_in
+from completesplat.commands.jobs import hold_job_lock
 from completesplat.commands.view import newest_scenes, scenes_in, setting_of_path, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
@@ -30,27 +30,28 @@ def folder(path, *names: str):
     return path
 
 
+PATHS = [
+    ("checkpoints/last.ckpt config.yaml scene.ply", "", "scene"),
+    ("config.json model.safetensors", "", "weights"),
+    ("weights/config.json weights/model.safetensors run.json", "", "weights of the run"),
+    ("sample_00.ply scene.json", "", "scene"),
+    ("photo/sample_00.ply run.json", "", "scene"),
+    ("A.PLY photo.jpg", "A.PLY", "scene"),
+    ("A.PLY photo.jpg", "", "scene"),
+    ("A.PLY photo.jpg", "photo.jpg", "image"),
+]
+
+
 def test_what_a_path_stands_for(tmp_path):
-    weights = folder(tmp_path / "w", "config.json", "model.safetensors")
-    run = folder(tmp_path / "run", "weights/config.json", "weights/model.safetensors", "run.json")
-    prediction = folder(tmp_path / "p", "sample_00.ply", "scene.json")
-    outer = folder(tmp_path / "o", "photo/sample_00.ply", "run.json")
-    files = folder(tmp_path / "f", "A.PLY", "photo.jpg")
-    fitted = folder(tmp_path / "c", "checkpoints/last.ckpt", "config.yaml", "scene.ply")
-    assert setting_of_path(fitted) == {"scene": str(fitted)}
-    assert setting_of_path(weights) == {"weights": str(weights)}
-    assert setting_of_path(run) == {"weights": str(run / "weights")}
-    assert setting_of_path(prediction) == {"scene": str(prediction)}
-    assert setting_of_path(outer) == {"scene": str(outer)}
-    assert setting_of_path(files / "A.PLY") == {"scene": str(files / "A.PLY")}
-    assert setting_of_path(files) == {"scene": str(files)}
-    assert setting_of_path(files / "photo.jpg") == {"image": str(files / "photo.jpg")}
+    for number, (written, given, setting) in enumerate(PATHS):
+        path = folder(tmp_path / str(number), *written.split()) / given
+        shown = path / "weights" if setting == "weights of the run" else path
+        assert setting_of_path(path) == {setting.partition(" ")[0]: str(shown)}
 
 
 def test_the_scenes_of_a_folder_can_be_chosen(tmp_path):
-    several = folder(
-        tmp_path / "s", "b/sample_00.ply", "a/scene.ply", "scenes/c/scene.ply", "A.PLY", "b.splat", "c.jpg"
-    )
+    written = "b/sample_00.ply a/scene.ply scenes/c/scene.ply A.PLY b.splat c.jpg"
+    several = folder(tmp_path / "s", *written.split())
     names = ["A.PLY", "a", "b", "b.splat", "scenes/c"]
     assert scenes_in(several) == {name: several / name for name in names}
     assert scenes_in(several / "b") == {"b": several / "b"}  # whose files are samples of one scene
@@ -59,13 +60,10 @@ def test_the_scenes_of_a_folder_can_be_chosen(tmp_path):
 
 
 def test_what_cannot_be_shown_is_refused(tmp_path):
+    known = "(config.json, model.safetensors, .ply, .splat, .spz, .sog, .ksplat)"
     for path, message in (
         ("nowhere.ply", "nowhere.ply: no such file or folder"),
-        (
-            ".",
-            "neither weights nor scenes in it or in weights/ "
-            "(config.json, model.safetensors, .ply, .splat, .spz, .sog, .ksplat)",
-        ),
+        (".", f"neither weights nor scenes in it or in weights/ {known}"),
     ):
         with pytest.raises(CompleteSplatError, match=re.escape(message)):
             setting_of_path(tmp_path / path)
@@ -92,7 +90,7 @@ def test_a_run_is_watched_while_a_process_is_at_work_in_it(tmp_path):
     assert setting_of_path(run) == {"weights": str(run)}
     (run / ".lock").touch()
     assert setting_of_path(run) == {"weights": str(run)}
-    with alone_in(run):
+    with hold_job_lock(run):
         assert setting_of_path(run) == {"watch": str(run)}
         assert (run / ".lock").read_text().split()[0] == str(os.getpid())  # as it was
     assert setting_of_path(run) == {"weights": str(run)}
@@ -101,9 +99,7 @@ def test_a_run_is_watched_while_a_process_is_at_work_in_it(tmp_path):
 def test_what_a_run_writes_is_shown_when_it_is_new(tmp_path, capsys):
     run, shown = run_in_training(tmp_path / "run"), []
     view = SimpleNamespace(samples=newest_scenes(run)[1])
-    page = SimpleNamespace(
-        view=view, show=lambda samples, message: (shown.append(message), setattr(view, "samples", samples))
-    )
+    page = SimpleNamespace(view=view, show=lambda *given: (shown.append(given[1]), setattr(view, "samples", given[0])))
     last = show_newest(page, run, None)
     assert (last, shown) == (2, [])
     for step in (4, 4, 6):
@@ -129,9 +125,8 @@ def test_a_run_without_scenes_is_waited_for(tmp_path, capsys, monkeypatch):
 
 def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "viser", None)
-    finished = command("view", f"out={tmp_path}")
-    assert finished.status == 2
-    assert finished.err == 'error: the viewer needs viser: pip install "completesplat[view]"\n'
+    refused = command.refuses("view", f"out={tmp_path}")
+    assert refused == 'the viewer needs viser: pip install "completesplat[view]"'
 
 
 @pytest.mark.processes
@@ -152,15 +147,11 @@ def test_the_page_is_there_before_torch_and_says_that_it_is_loading(tmp_path):
             assert process.stdout.readline() == "torch\n"
             assert build_opener(ProxyHandler({})).open(address, timeout=LIMIT).status == 200
             place, protocol = urlsplit(address), f"viser-v{viser.__version__}"
-            socket = connect(
-                address.replace("http:", "ws:"), origin=f"http://{place.netloc}", subprotocols=[protocol], proxy=None
-            )
-            with socket:
+            given = {"origin": f"http://{place.netloc}", "subprotocols": [protocol], "proxy": None}
+            with connect(address.replace("http:", "ws:"), **given) as socket:
                 page = socket.recv(timeout=LIMIT)  # behind its size, before and after compression
-            assert (
-                b"completesplat: loading the model or scene"
-                in _infra.zstandard.ZstdDecompressor().decompressobj().decompress(page[16:])
-            )
+            content = _infra.zstandard.ZstdDecompressor().decompressobj().decompress(page[16:])
+            assert b"completesplat: loading the model or scene" in content
         finally:
             process.kill()
 
@@ -169,15 +160,13 @@ def test_an_offline_page_is_written_from_a_scene_and_of_what_is_drawn(command, p
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
     out = f"out={tmp_path / 'out'}"
     write_ply(tmp_path / "my scene.ply", balls(points=5))
-    finished = command("view", "my scene.ply", "--export", "page.html", out)
-    assert finished.status == 0, finished.err
+    command.succeeds("view", "my scene.ply", "--export", "page.html", out)
     text = (tmp_path / "page.html").read_text()
     assert text.startswith("<!doctype html>")
     assert "__VISER_EMBED_DATA__" in text
     drawn = [pipeline.photograph(), f"weights={pipeline.weights}", "samples=2", "steps=2", "export=drawn.html"]
-    assert command("view", *drawn, out).status == 0
+    command.succeeds("view", *drawn, out)
     assert (tmp_path / "drawn.html").is_file()
-    finished = command("view", pipeline.weights, "export=other.html", out)
-    assert finished.status == 2
-    assert "there is nothing to export" in finished.err
+    refused = command("view", pipeline.weights, "export=other.html", out)
+    assert (refused.status, "there is nothing to export" in refused.err) == (2, True)
     assert not (tmp_path / "other.html").exists()

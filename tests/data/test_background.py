@@ -1,7 +1,8 @@
-"""Objects cut out of their background, by a stand-in for rembg; what tells images of one kind from others."""
+"""Objects cut out of their background by a stand-in for rembg, hidden parts, and what tells images of a kind apart."""
 
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -9,7 +10,13 @@ import skimage
 import torch
 from PIL import Image
 
-from completesplat.data.images.photograph import image_features, read_photograph, without_background
+from completesplat.data.images.photograph import (
+    image_features,
+    outside_of_box,
+    outside_of_mask,
+    read_photograph,
+    without_background,
+)
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.errors import CompleteSplatError, ImageError
 
@@ -59,20 +66,15 @@ def test_an_object_as_long_as_an_image_may_be_is_reduced_before_its_square_is_ma
 def test_without_rembg_or_its_network_it_is_said_what_to_do(rembg, tmp_path, monkeypatch, caplog):
     pytest.importorskip("cv2")
     photo(tmp_path / "a.png")
-
-    def offline(name):
-        raise OSError("no route to host\nand more")
-
-    monkeypatch.setattr(rembg, "new_session", offline)
+    monkeypatch.setattr(rembg, "new_session", Mock(side_effect=OSError("no route to host\nand more")))
     with caplog.at_level("INFO"):
         read_photograph(tmp_path / "a.png", 16, remove_background=True)
     assert "rembg fails with its network u2net (no route to host)\n" in caplog.text
     assert "removed by GrabCut" in caplog.text
     for name in ("rembg", "cv2"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(
-        CompleteSplatError, match=r'needs rembg or OpenCV: .* "completesplat\[background\]", or .*grabcut'
-    ):
+    advice = r'needs rembg or OpenCV: .* "completesplat\[background\]", or .*grabcut'
+    with pytest.raises(CompleteSplatError, match=advice):
         read_photograph(tmp_path / "a.png", 16, remove_background=True)
 
 
@@ -83,18 +85,72 @@ def test_without_rembg_grabcut_keeps_the_largest_piece_that_differs_from_the_bor
     object_mask = ((columns - 55) / 40) ** 2 + ((rows - 45) / 30) ** 2 < 1
     speck = (columns > 105) & (columns < 112) & (abs(rows - 12) < 4)
     pixels = np.where((object_mask | speck)[..., None], [200, 90, 30], [60, 110, 160])
-    noisy = Image.fromarray(
-        (pixels + np.random.default_rng(0).normal(0, 20, pixels.shape)).clip(0, 255).astype(np.uint8)
-    )
+    noisy = Image.fromarray(np.random.default_rng(0).normal(pixels, 20).clip(0, 255).astype(np.uint8))
     with caplog.at_level("INFO"):
         alpha = np.array(without_background(noisy).getchannel("A")) > 127
     assert (alpha & object_mask).sum() > 0.97 * (alpha | object_mask).sum()
     assert not alpha[speck].any()
     assert "removed by GrabCut" in caplog.text
     assert "rembg is better" in caplog.text
-    thin = Image.new("RGB", (3000, 8), "red")
     with pytest.raises(ImageError, match="no object is found"):
-        without_background(thin)
+        without_background(Image.new("RGB", (3000, 8), "red"))
+
+
+SHIPPED = (0.25, 0.5, 0.75, 1.0)
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """Two photographs (width, height) that differ in a box of their central square, and a mask of that box."""
+
+    def write(width: int, height: int) -> tuple[Path, Path, Path]:
+        rng = np.random.default_rng(0)
+        first, second = (rng.integers(0, 256, (height, width, 3), dtype=np.uint8) for _ in range(2))
+        side = min(width, height)
+        left, top = (width - side) // 2, (height - side) // 2
+        inside = np.zeros((height, width), dtype=bool)
+        x0, y0, x1, y1 = (round(edge * side) for edge in SHIPPED)
+        inside[top + y0 : top + y1, left + x0 : left + x1] = True
+        second[~inside] = first[~inside]
+        paths = tuple(tmp_path / f"{name}.png" for name in ("first", "second", "mask"))
+        for path, pixels in zip(paths, (first, second, np.uint8(255) * inside), strict=True):
+            Image.fromarray(pixels).save(path)
+        return paths
+
+    return write
+
+
+@pytest.mark.parametrize("form", ["box", "mask"])
+@pytest.mark.parametrize("size", [(32, 32), (100, 80), (61, 97), (20, 24)])
+def test_no_visible_pixel_holds_anything_hidden(photos, size, form):
+    first, second, mask = photos(*size)
+    visible = outside_of_box(first, SHIPPED, 32) if form == "box" else outside_of_mask(first, mask, 32)
+    images = [read_photograph(path, 32).image for path in (first, second)]
+    assert torch.equal(images[0] * visible, images[1] * visible)
+    assert not torch.equal(images[0], images[1])
+    assert visible.unique().tolist() == [0, 1]
+
+
+def test_an_image_of_the_right_size_is_hidden_to_the_pixel_and_others_three_pixels_more_at_most(photos):
+    expected, grown = torch.ones(2, 1, 32, 32)
+    expected[:, 16:, 8:24] = 0
+    grown[:, 13:, 5:27] = 0
+    first, _, mask = photos(32, 32)
+    assert torch.equal(outside_of_box(first, SHIPPED, 32), expected)
+    assert torch.equal(outside_of_mask(first, mask, 32), expected)
+    assert torch.equal(outside_of_box(photos(640, 640)[0], SHIPPED, 32), grown)
+
+
+def test_boxes_and_masks_that_are_none_are_refused(photos, tmp_path):
+    first = photos(32, 32)[0]
+    for box in ((0, 0, 1), (0, 0, 0, 1), (0.5, 0, 0.4, 1), (-0.1, 0, 1, 1), (0, 0, 1, 1.1)):
+        with pytest.raises(CompleteSplatError, match="box="):
+            outside_of_box(first, box, 32)
+    Image.new("L", (32, 32)).save(tmp_path / "black.png")
+    with pytest.raises(CompleteSplatError, match=r"black.png: hides nothing"):
+        outside_of_mask(first, tmp_path / "black.png", 32)
+    with pytest.raises(ImageError, match=r"nowhere.png: no such file"):
+        outside_of_mask(first, tmp_path / "nowhere.png", 32)
 
 
 def test_features_are_colours_their_spread_and_how_fine_they_are():
@@ -105,12 +161,8 @@ def test_features_are_colours_their_spread_and_how_fine_they_are():
     assert image_features(image.expand(2, 3, 4, 4)).shape == (2, 8)
 
 
-@pytest.fixture
-def toys(toy_root):
-    return ToyObjectsDataModule(str(toy_root), scenes=4, frames=4, image_size=32, box_masks={"probability": 0.25})
-
-
-def test_data_say_what_weights_are_to_know_of_them(toys):
+def test_data_say_what_weights_are_to_know_of_them(toy_root):
+    toys = ToyObjectsDataModule(str(toy_root), scenes=4, frames=4, image_size=32, box_masks={"probability": 0.25})
     facts = toys.training_facts()
     assert facts["box_masks"] == 0.25
     store = toys.store("train")
@@ -131,17 +183,9 @@ def test_photographs_lie_far_from_toy_objects_and_other_toy_objects_near(tmp_pat
     mean, deviation = (torch.tensor(facts[name]) for name in ("picture_mean", "picture_std"))
     own = torch.stack([store.image(store.source.read(name), 0) for name in store.names]).float() / 255
     folder = Path(skimage.__file__).parent / "data"
-    names = [
-        "astronaut.png",
-        "chelsea.png",
-        "coffee.png",
-        "motorcycle_left.png",
-        "rocket.jpg",
-        "retina.jpg",
-        "camera.png",
-    ]
+    names = [f"{name}.png" for name in ("astronaut", "chelsea", "coffee", "motorcycle_left", "camera")]
+    names += ["rocket.jpg", "retina.jpg"]
     photographs = torch.stack([read_photograph(folder / name, 64).image for name in names])
-    near, far = (
-        ((image_features(images) - mean) / deviation).square().mean(-1).sqrt() for images in (own, photographs)
-    )
+    features = map(image_features, (own, photographs))
+    near, far = (((feature - mean) / deviation).square().mean(-1).sqrt() for feature in features)
     assert near.max() < 2 < far.min()

@@ -15,7 +15,7 @@ from completesplat.data.validation import (
     UnreadableFile,
     field,
     finite_array,
-    inside,
+    path_below,
     read_json,
     read_text,
     require_rotation,
@@ -50,24 +50,20 @@ def test_bad_files_are_refused_by_name(name, tmp_path):
     assert part in caught.value.reason
 
 
-@pytest.mark.parametrize("file", ["a.json", "a.jgz"])
-def test_the_limit_on_bytes_is_on_the_text(tmp_path, file, monkeypatch):
-    (tmp_path / file).write_bytes(gzip.compress(TEXT) if file == "a.jgz" else TEXT)
+def test_good_files_are_read_up_to_a_limit_on_the_bytes_of_their_text_and_missing_ones_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(validation, "MOST_BYTES", len(TEXT))
-    assert read_json(tmp_path / file) == CONTENT
-    monkeypatch.setattr(validation, "MOST_BYTES", len(TEXT) - 1)
-    with pytest.raises(UnreadableFile, match=f"more than {len(TEXT) - 1:,} bytes"):
-        read_json(tmp_path / file)
-
-
-def test_good_files_are_read_and_missing_ones_refused(tmp_path):
     (tmp_path / "a.json").write_bytes(TEXT)
     (tmp_path / "a.jgz").write_bytes(gzip.compress(TEXT[:100]) + gzip.compress(TEXT[100:]))
     assert read_json(tmp_path / "a.json") == read_json(tmp_path / "a.jgz") == CONTENT
+    monkeypatch.setattr(validation, "MOST_BYTES", len(TEXT) + 3)
     (tmp_path / "mark.json").write_bytes(b"\xef\xbb\xbf" + TEXT)
     assert read_json(tmp_path / "mark.json") == json.loads(read_text(tmp_path / "mark.json")) == CONTENT
     (tmp_path / "nan.json").write_text("[NaN]")
     assert np.isnan(read_json(tmp_path / "nan.json", allow_nan=True)[0])
+    monkeypatch.setattr(validation, "MOST_BYTES", len(TEXT) - 1)
+    for file in ("a.json", "a.jgz"):
+        with pytest.raises(UnreadableFile, match=f"more than {len(TEXT) - 1:,} bytes"):
+            read_json(tmp_path / file)
     for path in (tmp_path / "b.json", tmp_path / "b.jgz", tmp_path):
         with pytest.raises(MissingFile):
             read_json(path)
@@ -78,7 +74,7 @@ def test_good_files_are_read_and_missing_ones_refused(tmp_path):
 )
 def test_paths_that_are_not_plainly_below_the_root_are_refused(tmp_path, relative):
     with pytest.raises(OutsidePath):
-        inside(tmp_path, relative)
+        path_below(tmp_path, relative)
 
 
 def test_backslashes_are_separators_and_absolute_paths_may_lead_inside(tmp_path: Path, monkeypatch):
@@ -86,15 +82,15 @@ def test_backslashes_are_separators_and_absolute_paths_may_lead_inside(tmp_path:
     (tmp_path / "root/a").mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
     for root in (tmp_path / "root", tmp_path / "link", Path("link")):
-        assert inside(root, "a\\b.png") == root / "a/b.png"
+        assert path_below(root, "a\\b.png") == root / "a/b.png"
         for absolute in ("root/a/b.png", "link/a/b.png"):
-            assert inside(root, str(tmp_path / absolute)) == root / "a/b.png"
+            assert path_below(root, str(tmp_path / absolute)) == root / "a/b.png"
     for elsewhere in ("/home/somebody/a.png", "C:\\Users\\somebody\\a.png", "D:/a.png"):
         with pytest.raises(OutsidePath, match="another machine; make it relative to link"):
-            inside(Path("link"), elsewhere)
+            path_below(Path("link"), elsewhere)
     (tmp_path / "b.png").touch()
     with pytest.raises(OutsidePath, match="outside of link"):
-        inside(Path("link"), str(tmp_path / "b.png"))
+        path_below(Path("link"), str(tmp_path / "b.png"))
 
 
 def test_links_must_not_leave_the_root_which_may_be_a_link(tmp_path: Path):
@@ -107,10 +103,10 @@ def test_links_must_not_leave_the_root_which_may_be_a_link(tmp_path: Path):
     alias.symlink_to(root)
     for relative in ("out", "sibling/x.png", "hop/x.png", "within/../out/x"):
         with pytest.raises(OutsidePath):
-            inside(root, relative)
+            path_below(root, relative)
     for relative in ("a/x.png", "within/x.png", "not_there/x.png", "...", "a/..x", "ring"):
-        assert inside(root, relative) == root / relative
-        assert inside(alias, relative) == alias / relative
+        assert path_below(root, relative) == root / relative
+        assert path_below(alias, relative) == alias / relative
 
 
 def test_fields_have_exactly_the_asked_type():

@@ -2,20 +2,10 @@
 
 from pathlib import Path
 
+import co3d_trees as trees
 import numpy as np
 import pytest
 import torch
-from co3d_trees import (
-    CATEGORY,
-    frame_entry,
-    look,
-    orbit,
-    pytorch3d_pixels,
-    sequence_entry,
-    splatter_image,
-    write_annotations,
-    write_cloud,
-)
 from PIL import Image
 from torch import Tensor
 
@@ -44,11 +34,11 @@ def blob_image(pixel: np.ndarray, size: tuple[int, int], number: int) -> np.ndar
 def viewpoints(name: str, layout: str, principal_point: list[float]) -> list[dict]:
     """Cameras that look past the object's centre, with focal lengths of their own for each axis and frame."""
     return [
-        look(
+        trees.look(
             eye, CENTER + np.array([0.1 * number, 0, 0]), layout,
             focal_length=[3.0 + 0.1 * number, 3.3], principal_point=principal_point,
         )
-        for number, eye in enumerate(CENTER + orbit(FRAMES, start=float("abc".index(name)), radius=12.0))
+        for number, eye in enumerate(CENTER + trees.orbit(FRAMES, start=float("abc".index(name)), radius=12.0))
     ]  # fmt: skip
 
 
@@ -57,16 +47,17 @@ def write(root: Path, size: tuple[int, int], layout: str, principal_point: list[
     entries = []
     for name in "abc":
         for part in ("images", "masks"):
-            (root / CATEGORY / name / part).mkdir(parents=True)
+            (root / trees.CATEGORY / name / part).mkdir(parents=True)
         for number, viewpoint in enumerate(viewpoints(name, layout, principal_point)):
-            entry = frame_entry(name, number, viewpoint, size)
-            (pixel,), _ = pytorch3d_pixels(viewpoint, size, POINT[None])
+            entry = trees.frame_entry(name, number, viewpoint, size)
+            (pixel,), _ = trees.pytorch3d_pixels(viewpoint, size, POINT[None])
             pixels = blob_image(pixel, size, number)
             Image.fromarray(pixels).save(root / entry["image"]["path"])
             Image.fromarray(pixels[..., 0]).save(root / entry["mask"]["path"])
             entries.append({**entry, "depth": None})
-        write_cloud(root / CATEGORY / name / "pointcloud.ply", CLOUD)
-    write_annotations(root, entries, [sequence_entry(n) for n in "abc"], {"train": "a", "val": "b", "test": "c"})
+        trees.write_cloud(root / trees.CATEGORY / name / "pointcloud.ply", CLOUD)
+    sequences = [trees.sequence_entry(name) for name in "abc"]
+    trees.write_annotations(root, entries, sequences, {"train": "a", "val": "b", "test": "c"})
 
 
 def centroid(values: Tensor) -> Tensor:
@@ -96,7 +87,7 @@ def mirrored(batch: SceneBatch) -> bool:
 def test_a_known_point_stays_on_its_pixel(tmp_path, size, layout, principal_point):
     write(tmp_path, SIZES[size], layout, PRINCIPAL_POINTS[principal_point])
     data = CO3DDataModule(
-        str(tmp_path), CATEGORY, image_size=48, batch_size=1, targets=3, on_bad="raise", horizontal_flip=True,
+        str(tmp_path), trees.CATEGORY, image_size=48, batch_size=1, targets=3, on_bad="raise", horizontal_flip=True,
         references_per_sequence=5,
     )  # fmt: skip
     training = list(data.train_dataloader())
@@ -107,26 +98,20 @@ def test_a_known_point_stays_on_its_pixel(tmp_path, size, layout, principal_poin
         views, (name,) = batch.all_views(), batch.names
         number = round(255 / 40 * batch.reference.images[0, 1].mean().item())
         around = viewpoints(name, layout, PRINCIPAL_POINTS[principal_point])
-        _, _, scale = splatter_image(CLOUD, around)
+        _, _, scale = trees.splatter_image(CLOUD, around)
         pixels, depth = project(views.cameras[0], point_in_reference(around[number], mirrored(batch), scale))
         for seen in (views.images[0, :, 0], views.masks[0, :, 0]):
             assert max((centroid(one) - pixel).norm() for one, pixel in zip(seen, pixels[:, 0], strict=True)) < 0.1
         assert batch.depth_range[0, 0] < depth[0] < batch.depth_range[0, 1]
 
 
-def random_viewpoint(rng: np.random.Generator, layout: str) -> dict:
-    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    rotation *= np.sign(np.linalg.det(rotation))
-    intrinsics = {"focal_length": [2.3, 2.9], "principal_point": [0.13, -0.21], "intrinsics_format": layout}
-    return {"R": rotation.tolist(), "T": [0.2, -0.1, 4.0], **intrinsics}
-
-
 @pytest.mark.parametrize("size", [(300, 400), (500, 320), (256, 256)])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_points_land_where_pytorch3d_puts_them(layout, size):
-    rng = np.random.default_rng(0)
-    viewpoint, points = random_viewpoint(rng, layout), rng.normal(size=(50, 3))
-    expected, expected_depth = pytorch3d_pixels(viewpoint, size, points)
+    intrinsics = {"focal_length": [2.3, 2.9], "principal_point": [0.13, -0.21]}
+    viewpoint = trees.look(np.array([3.0, -2, 4]), np.array([0.1, 0.3, -0.2]), layout, **intrinsics)
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    expected, expected_depth = trees.pytorch3d_pixels(viewpoint, size, points)
     camera = camera_from_viewpoint(viewpoint, size)
     pixels, depth = project(camera, torch.from_numpy(points))
     np.testing.assert_allclose(pixels.numpy(), expected, atol=1e-9)

@@ -11,7 +11,7 @@ from completesplat.data.co3d.annotations import CO3DFrame, DepthMap
 from completesplat.data.co3d.source import OBJECT_HALF_SIZE, object_placement
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
 from completesplat.data.images.crop import Square
-from completesplat.data.loading.scenes import Loaded, collate
+from completesplat.data.loading.scenes import LoadedScenes, collate
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.data.toy.writing import SUBSET
 from completesplat.data.validation import BadImage
@@ -67,10 +67,9 @@ def test_only_the_test_reads_depths_and_what_has_none_costs_no_scene(data, monke
 
 def test_depths_are_unknown_where_only_other_scenes_of_a_batch_have_them(data):
     known = scene_of(data)
-    unknown = replace(
-        known, reference=replace(known.reference, depths=None), targets=replace(known.targets, depths=None)
-    )
-    depths = collate([Loaded(unknown, ()), Loaded(known, ())]).scenes.all_views().depths
+    parts = {name: replace(getattr(known, name), depths=None) for name in ("reference", "targets")}
+    unknown = replace(known, **parts)
+    depths = collate([LoadedScenes(unknown, ()), LoadedScenes(known, ())]).scenes.all_views().depths
     assert torch.equal(depths[1], known.all_views().depths)
     assert depths[1].any()
     assert not depths[0].any()

@@ -7,18 +7,15 @@ from PIL import Image, ImageOps, TiffImagePlugin
 
 from completesplat.data.images.exif import crop_fov
 from completesplat.data.images.photograph import read_photograph
-from completesplat.errors import CompleteSplatError
 
 SIZE = 16
 RATIONAL = TiffImagePlugin.IFDRational
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-@pytest.mark.parametrize(("name", "options"), [("a.png", {}), ("a.tif", {})])
-def test_exif_orientation(tmp_path, orientation, name, options):
-    upright = np.zeros((2, 3, 3), np.uint8)
-    upright[0] = [[255, 0, 0], [0, 255, 0], [0, 0, 255]]
-    upright[1] = [[255, 255, 255], [0, 0, 0], [255, 255, 0]]
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_exif_orientation(tmp_path, orientation, name):
+    upright = np.random.default_rng(0).integers(0, 256, (2, 3, 3), dtype=np.uint8)
     upright = Image.fromarray(upright.repeat(32, 0).repeat(32, 1))
     # The inverse of what the orientation asks for gives the stored image (5 to 8 are wider than high when upright).
     exif = Image.Exif()
@@ -27,19 +24,13 @@ def test_exif_orientation(tmp_path, orientation, name, options):
     stored = ImageOps.exif_transpose(upright)
     exif[0x0112] = orientation
     stored.info.clear()
-    stored.save(tmp_path / name, exif=exif, **options)
+    stored.save(tmp_path / name, exif=exif)
     got = read_photograph(tmp_path / name, 64).image.permute(1, 2, 0).numpy()
     assert np.array_equal(got, np.float32(upright)[:, 16:80] / 255)
 
 
-NUMBERS = {
-    "equivalent": 0xA405,
-    "focal": 0x920A,
-    "resolution": 0xA20E,
-    "unit": 0xA210,
-    "width": 0xA002,
-    "height": 0xA003,
-}
+NUMBERS = {"equivalent": 0xA405, "focal": 0x920A, "width": 0xA002, "height": 0xA003}
+NUMBERS |= {"resolution": 0xA20E, "unit": 0xA210}
 
 
 def exif_of(**tags):
@@ -71,9 +62,6 @@ def test_full_frame_focal_length_gives_the_field_of_view_of_the_square(tmp_path,
         assert photograph.fov_degrees == pytest.approx(degrees(seen, focal))
     photograph = fov_of(tmp_path, exif_of(equivalent=50), name=name, fov_degrees=33.0)
     assert (photograph.fov_degrees, photograph.fov_source) == (33.0, "given")
-    for fov in (0.0, -5.0, 180.0, float("nan")):
-        with pytest.raises(CompleteSplatError, match="field of view"):
-            fov_of(tmp_path, exif_of(), fov_degrees=fov)
 
 
 def test_focal_length_with_the_resolution_of_the_sensor(tmp_path):
@@ -87,20 +75,13 @@ def test_focal_length_with_the_resolution_of_the_sensor(tmp_path):
         assert fov_of(tmp_path, exif_of(**tags)).fov_degrees == pytest.approx(degrees(24, 35), rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    "tags",
-    [
-        {},
-        {"equivalent": 0},
-        {"focal": RATIONAL(4)},
-        {"focal": RATIONAL(0, 0), "resolution": RATIONAL(100)},
-        {"focal": RATIONAL(4), "resolution": RATIONAL(100), "unit": 1},
-        {"equivalent": 60_000},
-    ],
-)
-def test_without_a_usable_focal_length_the_default_stands(tmp_path, tags):
-    photograph = fov_of(tmp_path, exif_of(**tags), default_fov_degrees=61.0)
-    assert (photograph.fov_degrees, photograph.fov_source) == (61.0, "default")
+def test_without_a_usable_focal_length_the_default_stands(tmp_path):
+    useless = [{}, {"equivalent": 0}, {"equivalent": 60_000}, {"focal": RATIONAL(4)}]
+    useless += [{"focal": RATIONAL(0, 0), "resolution": RATIONAL(100)}]
+    useless += [{"focal": RATIONAL(4), "resolution": RATIONAL(100), "unit": 1}]
+    for tags in useless:
+        photograph = fov_of(tmp_path, exif_of(**tags), default_fov_degrees=61.0)
+        assert (photograph.fov_degrees, photograph.fov_source) == (61.0, "default"), tags
     infinite = {0x920A: 35.0, 0xA20E: 100.0, 0xA002: math.inf, 0xA003: math.inf}
     assert crop_fov(infinite, (60, 40)) == pytest.approx(degrees(40, 35 * 100 / 25.4))
     assert crop_fov({0xA405: math.inf}, (60, 40)) is None

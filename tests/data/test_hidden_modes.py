@@ -1,5 +1,6 @@
-"""Hidden modes of toy objects, as they are written and read."""
+"""Hidden modes of toy objects and renders, as they are written and read."""
 
+import gzip
 import json
 import shutil
 from itertools import combinations
@@ -10,10 +11,12 @@ import pytest
 import torch
 
 from completesplat.data.hidden_modes import DIFFERENCE
+from completesplat.data.rendered.drawing import PAINTS
+from completesplat.data.rendered.module import RenderedDataModule
 from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS, render_frame
 from completesplat.data.toy.raytracing import trace
-from completesplat.data.toy.writing import draw
+from completesplat.data.toy.writing import draw_category
 from completesplat.data.validation import BadAnnotation
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
@@ -64,10 +67,8 @@ def test_versions_share_the_reference_and_show_the_stored_images_in_the_true_mod
     versions = scenes_of(toy_root)[0].versions(0)
     assert versions.names == scene.scene.names * len(PATCH_COLORS)
     assert (versions.reference.images == scene.scene.reference.images).all()
-    places = [
-        (scene.scene.targets.cameras.world_to_camera[0] == pose).all((1, 2)).nonzero().item()
-        for pose in versions.targets.cameras.world_to_camera[0]
-    ]
+    stored, shown = (part.targets.cameras.world_to_camera[0] for part in (scene.scene, versions))
+    places = [(stored == pose).all((1, 2)).nonzero().item() for pose in shown]
     assert len(places) == 3
     errors = (versions.targets.images - scene.scene.targets.images[:, places]).square().mean((1, 2, 3, 4)).sqrt()
     assert errors.argmin() == scene.true_mode
@@ -131,13 +132,52 @@ def traced_unseen(toy, reference: int, frame: int, size: int) -> torch.Tensor:
 def test_what_the_reference_hides_is_what_no_ray_from_its_camera_meets(toy_root: Path) -> None:
     (scenes, module), described = scenes_of(toy_root), json.loads((toy_root / "toy_objects/toy.json").read_text())
     scene, name = scenes[0], module.store("test").names[0]
-    toy = draw("toy_objects", described["seed"], int(name.split("_")[0]), described["frames"], np.ones(3))
+    toy = draw_category("toy_objects", described["seed"], int(name.split("_")[0]), described["frames"], np.ones(3))
     sequence = module.source("test").read(name)
-    views = [
-        view
-        for view in range(len(sequence.frames))
-        if any(torch.equal(sequence.read(view).image.float() / 255, image) for image in scene.scene.targets.images[0])
-    ]
+    images, shown = [sequence.read(view).image.float() / 255 for view in range(4)], scene.scene.targets.images[0]
+    views = [view for view in range(4) if any(torch.equal(images[view], image) for image in shown)]
     rays = torch.stack([traced_unseen(toy, sequence.frames[0], sequence.frames[view], 32) for view in views])
     assert 0.1 < rays.float().mean() < 0.9
     assert (rays == scene.unseen).float().mean() > 0.9
+
+
+@pytest.fixture
+def renders(toy_root: Path, tmp_path: Path) -> Path:
+    """Root of toy objects in the form of renders: files of every paint are those of every patch."""
+    category = shutil.copytree(toy_root / "toy_objects", tmp_path / "root/rendered")
+    (category / "rendered.json").write_text(json.dumps({"hidden": "modes"}))
+    for annotations in category.glob("*.jgz"):
+        content = gzip.decompress(annotations.read_bytes())
+        annotations.write_bytes(gzip.compress(content.replace(b"toy_objects", b"rendered")))
+    for record in category.glob("*_*/toy.json"):
+        hidden = json.loads(record.read_text())["hidden"]
+        record.with_name("object.json").write_text(json.dumps({"hidden": hidden}))
+        record.unlink()
+    return category.parent
+
+
+def test_modes_of_renders_are_the_images_of_every_paint_and_the_true_one_is_what_the_data_module_yields(
+    renders: Path,
+) -> None:
+    data = RenderedDataModule(str(renders), image_size=32, test_fraction=1.0)
+    data.setup("test")
+    painted = next(renders.glob("rendered/*/red")).parent.name  # the toys' test scene
+    scene = data.hidden_modes(2, 3)[data.store("test").names.index(painted)]
+    assert list(PAINTS) == list(PATCH_COLORS)
+    assert scene.modes == tuple(PAINTS)
+    assert scene.probabilities.tolist() == pytest.approx([0.4, 0.3, 0.2, 0.1])
+    told = json.loads((renders / "rendered" / painted / "object.json").read_text())
+    assert scene.modes[scene.true_mode] == told["hidden"]
+    errors = (scene.truths - scene.scene.targets.images[0, list(scene.views)]).abs().amax((1, 2, 3, 4))
+    assert errors[scene.true_mode] == 0
+    assert sorted(errors > 0.1) == [False, True, True, True]
+
+
+def test_renders_without_modes_are_refused(renders: Path) -> None:
+    data = RenderedDataModule(str(renders), image_size=32)
+    (renders / "rendered/rendered.json").write_text('{"hidden": "back"}')
+    with pytest.raises(CompleteSplatError, match="rendered with hidden=back; hidden modes need hidden=modes"):
+        data.hidden_modes(2, 3)
+    (renders / "rendered/rendered.json").unlink()
+    with pytest.raises(DataError, match="as they were rendered, not prepared"):
+        data.hidden_modes(2, 3)

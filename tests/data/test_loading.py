@@ -1,3 +1,4 @@
+import logging
 import multiprocessing
 from collections.abc import Iterator
 from pathlib import Path
@@ -6,11 +7,16 @@ import pytest
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
-from realestate10k_trees import FORMS, epoch, equal, make_clip, module, same, write_tree
+from realestate10k_trees import assert_refusal, epoch, equal, make_clip, module, same, write_tree
 
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.loader import EpochSampler, SceneLoader
+from completesplat.data.validation import BadCamera, BadImage
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import SceneBatch
+from completesplat.settings.schema import check_value, hints_of
 
+KEYS = [f"c{i}" for i in range(9)]
 AUGMENTED = {
     "color_jitter": {"brightness": 0.2, "contrast": 0.2, "saturation": 0.2, "hue": 0.1},
     "box_masks": {"probability": 0.7},
@@ -18,12 +24,22 @@ AUGMENTED = {
 }
 
 
-@pytest.fixture(scope="module", params=FORMS)
-def root(request, tmp_path_factory) -> Path:
-    """Nine clips, one of which has an image that cannot be read."""
-    clips = [make_clip(f"c{i}", frames=3) for i in range(9)]
-    clips[5].images[1] = b"<html>"
-    return write_tree(tmp_path_factory.mktemp("root"), request.param, clips, clips[:2])
+def make_tree(root: Path, broken: str = "", half_broken: str = "", cameras: str = "", form: str = "text") -> Path:
+    """Nine clips, of which some have one readable image, others two of three, others broken cameras."""
+    clips = {key: make_clip(key, frames=3) for key in KEYS}
+    for key in broken.split():
+        clips[key].images[1:] = [b"<html>", b"<html>"]
+    for key in half_broken.split():
+        clips[key].images[1] = b"<html>"
+    for key in cameras.split():
+        clips[key].rows[1, 0] = 0
+    return write_tree(root, form, [*clips.values()], [*clips.values()])
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    """Chunks of two clips, which are read together; one clip has an image that cannot be read."""
+    return make_tree(tmp_path_factory.mktemp("root"), half_broken="c5", form="chunks")
 
 
 def loader(root: Path, workers: int = 0, **settings) -> SceneLoader:
@@ -126,22 +142,20 @@ class Recorder(LightningModule):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
+QUIET = dict.fromkeys(("logger", "enable_progress_bar", "enable_model_summary"), False) | {"accelerator": "cpu"}
+
+
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory) -> Path:
     """Eight training clips: four batches an epoch."""
-    made = [make_clip(f"c{i}", frames=3) for i in range(9)]
-    return write_tree(tmp_path_factory.mktemp("clips"), "text", made, made[:2])
+    return make_tree(tmp_path_factory.mktemp("clips"))
 
 
 def train(root: Path, out: Path, steps: int, workers: int, resume: Path | None = None, **options) -> list[tuple]:
     recorder = Recorder()
     checkpoint = ModelCheckpoint(out, filename="{step}", every_n_train_steps=1, save_top_k=-1)
-    trainer = Trainer(
-        max_steps=steps, accelerator="cpu", logger=False, callbacks=[checkpoint], enable_progress_bar=False,
-        enable_model_summary=False, num_sanity_val_steps=0, **options,
-    )  # fmt: skip
-    data = module(root, workers=workers, val_fraction=0.0)
-    trainer.fit(recorder, data, ckpt_path=resume, weights_only=False)
+    trainer = Trainer(max_steps=steps, callbacks=[checkpoint], num_sanity_val_steps=0, **QUIET, **options)
+    trainer.fit(recorder, module(root, workers=workers, val_fraction=0.0), ckpt_path=resume, weights_only=False)
     return recorder.seen
 
 
@@ -165,3 +179,68 @@ def test_a_resumed_run_sees_the_rest_and_worker_processes_end_with_it(clips, tmp
     for done in (1, 4) if workers else (1, 3, 6):
         resumed = train(clips, tmp_path / f"{done}", 7, workers, tmp_path / f"whole/step={done}.ckpt", **options)
         assert resumed == whole[done:]
+
+
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.processes)])
+def test_a_refusal_reaches_the_main_process_with_its_place(tmp_path, workers):
+    root = make_tree(tmp_path, "c5", cameras="c2")
+    data = module(root, on_bad="raise", workers=workers, evaluation_batch_size=1)
+    with pytest.raises(DataError) as caught:
+        list(data.test_dataloader())
+    assert_refusal(caught.value, BadCamera, root / "test/c2.txt", "c2", 1)
+    with pytest.raises(DataError) as caught:
+        list(data.train_dataloader())
+    assert caught.value.sequence in ("c2", "c5")
+
+
+def test_an_epoch_tells_what_it_skipped_by_kind_and_counts_anew(tmp_path, caplog):
+    data = module(make_tree(tmp_path, "c5", cameras="c2"), val_fraction=0.0, max_bad_fraction=1.0)
+    loader = data.train_dataloader()
+    for number in (0, 1):
+        caplog.clear()
+        epoch(loader, number)
+        kinds = [type(error) for error in loader.refused]
+        assert kinds.count(BadImage) >= 1 <= kinds.count(BadCamera)
+        (message,) = [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
+        assert message.startswith(f"skipped {len(kinds)} of 8 items (")
+        assert f"{kinds.count(BadImage)} {BadImage.kind}" in message
+        assert f"{kinds.count(BadCamera)} {BadCamera.kind}" in message
+        assert message.endswith(f"the first: {loader.refused[0]}")
+
+
+def test_evaluation_drops_what_cannot_be_read_and_says_so(tmp_path, caplog):
+    data = module(make_tree(tmp_path, "c5", cameras="c2"), max_bad_fraction=0.5, evaluation_batch_size=2)
+    loader = data.test_dataloader()
+    assert [name for batch in loader for name in batch.names] == [key for key in KEYS if key not in ("c2", "c5")]
+    assert [error.sequence for error in loader.refused] == ["c2", "c5"]
+    assert [r.getMessage()[:20] for r in caplog.records if r.levelno >= logging.WARNING] == ["skipped 2 of 9 items"]
+
+
+def test_too_many_are_an_error_that_names_the_share_and_the_last(tmp_path):
+    root = make_tree(tmp_path, "c5", cameras="c2 c6")
+    with pytest.raises(DataError, match=r"3 of 9 items .* data\.max_bad_fraction=0\.25 .*last one: .*c6, frame 1"):
+        list(module(root, max_bad_fraction=0.25).test_dataloader())
+    with pytest.raises(DataError, match=r"data\.max_bad_fraction=0\.1"):
+        list(module(root, max_bad_fraction=0.1, val_fraction=0.0).train_dataloader())
+    assert len(list(module(root, max_bad_fraction=0.34, evaluation_batch_size=1).test_dataloader())) == 6
+    one_bad = module(make_tree(tmp_path / "one", "c5"), max_bad_fraction=0.0, evaluation_batch_size=1)
+    assert len(list(one_bad.test_dataloader())) == 8  # One is no share.
+
+
+def test_nothing_that_can_be_read_and_an_unknown_policy_are_errors(tmp_path):
+    data = module(make_tree(tmp_path, " ".join(KEYS)), max_bad_fraction=2.0)
+    for loader in (data.train_dataloader(), data.test_dataloader()):
+        with pytest.raises(DataError, match="items cannot be read"):
+            list(loader)
+    with pytest.raises(CompleteSplatError, match=r"data\.on_bad=ignore: choose one of skip, raise"):
+        check_value("data.on_bad", hints_of(SceneDataModule.__init__)["on_bad"], "ignore")
+
+
+@pytest.mark.parametrize("limit", [1.0, 3])
+def test_lightning_hears_it_at_the_end_of_each_epoch(tmp_path, caplog, limit):
+    data = module(make_tree(tmp_path, cameras="c1 c2 c5"), val_fraction=0.0, max_bad_fraction=10.0, batch_size=2)
+    trainer = Trainer(max_epochs=2, limit_train_batches=limit, enable_checkpointing=False, **QUIET)
+    with caplog.at_level(logging.WARNING, logger="completesplat"):
+        trainer.fit(Recorder(), data.train_dataloader())
+    messages = [record.getMessage() for record in caplog.records if record.name == "completesplat.data.loading.loader"]
+    assert [message[:7] for message in messages] == ["skipped", "skipped"]

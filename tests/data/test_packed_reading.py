@@ -12,22 +12,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
-from packed_sequences import SIZE, ListedSource, make_sequence, smooth_image
+from packed_sequences import SIZE, ListedSource, make_sequence, pack, smooth_image
 from PIL import Image
 
 from completesplat.data.packed.manifest import is_packed, read_manifest, settings_must_match
-from completesplat.data.packed.rows import EncodedImage, decode, encode, from_row, to_row
+from completesplat.data.packed.rows import EncodedImage, decode_square, encode, from_row, to_row
 from completesplat.data.packed.source import PackedSource
-from completesplat.data.packed.writing import prepare
 from completesplat.data.sequences import PosedSequence, SequenceSource
-from completesplat.data.validation import (
-    BadAnnotation,
-    BadImage,
-    ChangedFile,
-    MissingFile,
-    OutsidePath,
-    UnreadableFile,
-)
+from completesplat.data.validation import BadAnnotation, BadImage, ChangedFile, MissingFile, OutsidePath, UnreadableFile
 from completesplat.errors import DataError
 
 NAMES = ["s3", "s1", "s4", "s0", "s5", "s9", "s2"]
@@ -35,8 +27,7 @@ SHARD = "train-00000-of-00003.arrow"
 
 
 def make(out: Path, masked: bool = True, **options: Any) -> Path:
-    sources, settings = {"train": ListedSource(NAMES, masked=masked)}, {"image_size": SIZE}
-    return prepare(sources, settings, out, sequences_per_shard=3, workers=1, progress=False, **options)
+    return pack(ListedSource(NAMES, masked=masked), out, sequences_per_shard=3, **options)
 
 
 @pytest.fixture
@@ -94,7 +85,7 @@ def test_one_store_serves_smaller_images_as_pillow_makes_them(tmp_path: Path) ->
 def test_masks_of_some_frames_only_stay_with_them() -> None:
     image, mask = smooth_image(1, True)
     images = [EncodedImage(encode(image, "png"), content) for content in (None, encode(mask, "png"))]
-    read = from_row(to_row(make_sequence("s", frames=2), [0, 1], images), "file", "s").read
+    read = from_row(to_row(make_sequence("s", (10, 13)), [0, 1], images), "file", "s").read
     assert read(0).mask is None
     assert torch.equal(read(1).mask, mask)
 
@@ -104,7 +95,7 @@ def test_names_keep_the_order_of_the_source_though_chunks_lie_together(tmp_path:
         def groups(self, names: Any) -> list[list[int]]:
             return [list(range(0, len(names), 2)), list(range(1, len(names), 2))]
 
-    prepare({"val": Interleaved(NAMES)}, {}, tmp_path / "store", sequences_per_shard=4, workers=1, progress=False)
+    pack(Interleaved(NAMES), tmp_path / "store", "val", sequences_per_shard=4)
     source = PackedSource(tmp_path / "store", "val")
     assert [shard.sequences for shard in source.shards] == [tuple(NAMES[::2]), tuple(NAMES[1::2])]
     assert source.names == NAMES
@@ -197,7 +188,7 @@ def change(row: pa.Table, column: str, value: object) -> pa.Table:
     ],
 )
 def test_a_row_that_does_not_fit_is_refused_with_its_place(column: str, value: object, kind: type[DataError]) -> None:
-    row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedImage(b"", b"")] * 2)
+    row = to_row(make_sequence("s", (10, 13)), [0, 1], [EncodedImage(b"", b"")] * 2)
     with pytest.raises(kind) as caught:
         from_row(change(row, column, value), "shard.arrow", "s")
     assert (caught.value.file, caught.value.sequence) == ("shard.arrow", "s")
@@ -208,14 +199,14 @@ def test_bytes_that_are_not_the_image_are_refused_with_their_place() -> None:
     # Where the checksum is that of the wrong bytes, decoding them has to notice.
     for wrong in (image[: len(image) // 2], encode(smooth_image(0, True, size=SIZE + 1).image, "png")):
         images = [EncodedImage(image, None), EncodedImage(wrong, None)]
-        sequence = from_row(to_row(make_sequence("s", frames=2), [0, 1], images), "shard.arrow", "s")
+        sequence = from_row(to_row(make_sequence("s", (10, 13)), [0, 1], images), "shard.arrow", "s")
         sequence.read(0)
         with pytest.raises(BadImage) as caught:
             sequence.read(1)
         assert (caught.value.file, caught.value.sequence, caught.value.frame) == ("shard.arrow", "s", 13)
     flipped = image[:-20] + bytes([image[-20] ^ 1]) + image[-19:]
-    assert decode(flipped, 3, SIZE, SIZE).shape == (3, SIZE, SIZE)
-    row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedImage(image, None)] * 2)
+    assert decode_square(flipped, 3, SIZE, SIZE).shape == (3, SIZE, SIZE)
+    row = to_row(make_sequence("s", (10, 13)), [0, 1], [EncodedImage(image, None)] * 2)
     read = from_row(change(row, "images", [image, flipped]), "shard.arrow", "s").read
     read(0)
     with pytest.raises(BadImage, match="no longer"):
@@ -253,18 +244,16 @@ def test_other_settings_than_those_baked_in_are_refused_by_name(store: Path) -> 
 
 @pytest.mark.processes
 def test_reading_needs_no_network_and_writes_nothing_into_the_home_folder(store: Path, tmp_path: Path) -> None:
-    code = (
-        "import socket; socket.socket.connect = None\n"
-        "from pathlib import Path\n"
-        "from completesplat.data.packed.source import PackedSource\n"
-        f"root = Path({str(store)!r})\n"
-        "print(*PackedSource(root, 'train').read('s0').read(0).image.shape)\n"
-    )
-    home, variables = tmp_path / "home", ("HF_HOME", "HF_DATASETS_CACHE", "XDG_CACHE_HOME")
-    home.mkdir()
-    environment = {key: value for key, value in os.environ.items() if key not in variables}
-    environment |= {"HOME": str(home), "HF_HUB_OFFLINE": "1"}
-    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    lines = [
+        "import socket; socket.socket.connect = None",
+        "from pathlib import Path",
+        "from completesplat.data.packed.source import PackedSource",
+        f"print(*PackedSource(Path({str(store)!r}), 'train').read('s0').read(0).image.shape)",
+    ]
+    (home := tmp_path / "home").mkdir()
+    variables = ("HF_HOME", "HF_DATASETS_CACHE", "XDG_CACHE_HOME")
+    environment = {key: value for key, value in os.environ.items() if key not in variables} | {"HOME": str(home)}
+    result = subprocess.run([sys.executable, "-c", "\n".join(lines)], env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert result.stdout.split() == ["3", str(SIZE), str(SIZE)]
     assert list(home.rglob("*")) == []

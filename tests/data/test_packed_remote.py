@@ -8,7 +8,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from packed_sequences import SIZE, ListedSource
+from packed_sequences import ListedSource, pack
 from realestate10k_trees import equal
 
 from completesplat.data.co3d.module import CO3DDataModule
@@ -47,8 +47,7 @@ def served(tmp_path, monkeypatch) -> Iterator[tuple[str, Path, list[str]]]:
 
 
 def make(out: Path, content: str = "a") -> None:
-    sources = {"train": ListedSource(NAMES, content=content)}
-    prepare(sources, {"image_size": SIZE}, out, sequences_per_shard=2, workers=1, progress=False)
+    pack(ListedSource(NAMES, content=content), out)
 
 
 def shards_asked(asked: list[str]) -> list[str]:

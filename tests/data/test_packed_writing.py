@@ -3,23 +3,26 @@ import json
 import logging
 import pickle
 from pathlib import Path
+from typing import Any
 
 import pytest
-from packed_sequences import ListedSource, contents
+from packed_sequences import SIZE, ListedSource, contents, pack
 
 from completesplat.data.packed.manifest import read_manifest
 from completesplat.data.packed.source import PackedSource
-from completesplat.data.packed.writing import prepare
 from completesplat.data.validation import BadImage, TooFewFrames
 from completesplat.errors import CompleteSplatError, DataError
 
-SETTINGS = {"image_size": 16, "category": "chair", "crop": None}
+SETTINGS = {"image_size": SIZE, "category": "chair", "crop": None}
 NAMES = [f"s{number}" for number in range(8)]
 
 
-def make(source: ListedSource, out: Path, **options: object) -> Path:
-    keywords = {"sequences_per_shard": 2, "workers": 1, "progress": False, **options}
-    return prepare({"train": source}, SETTINGS, out, **keywords)  # type: ignore[arg-type]
+def make(source: ListedSource, out: Path, **options: Any) -> Path:
+    return pack(source, out, settings=SETTINGS, **options)
+
+
+def failing(*names: str) -> dict[str, BaseException]:
+    return {name: TooFewFrames("1 frame", f"{name}.txt") for name in names}
 
 
 @pytest.mark.slow
@@ -34,7 +37,7 @@ def test_an_interrupted_run_continues_with_the_shards_that_are_missing(tmp_path:
     out = tmp_path / "store"
     # Two shards are whole, the third has one of its two.
     with pytest.raises(KeyboardInterrupt):
-        make(ListedSource(NAMES, stop_after=5), out)
+        make(ListedSource(NAMES, failing={"s5": KeyboardInterrupt()}), out)
     assert not (out / "manifest.json").exists()
     assert not any(path.name.endswith(".unfinished") for path in out.iterdir())
     before = {path.name: path.stat().st_mtime_ns for path in out.glob("*.arrow")}
@@ -51,9 +54,9 @@ def test_an_interrupted_run_continues_with_the_shards_that_are_missing(tmp_path:
 def test_an_interrupted_run_is_not_continued_with_other_data_or_settings(tmp_path: Path) -> None:
     out = tmp_path / "store"
     with pytest.raises(KeyboardInterrupt):
-        make(ListedSource(NAMES, stop_after=3), out)
+        make(ListedSource(NAMES, failing={"s3": KeyboardInterrupt()}), out)
     with pytest.raises(DataError, match=r"image_size=16 \(asked for: 32\).*another folder"):
-        prepare({"train": ListedSource(NAMES)}, {**SETTINGS, "image_size": 32}, out, sequences_per_shard=2)
+        pack(ListedSource(NAMES), out, settings=SETTINGS | {"image_size": 32})
     for source, options in [
         (ListedSource(NAMES, content="b"), {}),
         (ListedSource(NAMES), {"codec": "jpeg"}),
@@ -99,9 +102,13 @@ def test_a_folder_with_other_shards_in_it_is_left_alone_and_another_codec_refuse
 
 
 def test_bad_frames_and_sequences_are_left_out_and_recorded(tmp_path: Path) -> None:
-    source = ListedSource(NAMES, bad_frames={"s1": [2], "s4": [0, 1, 3]}, bad_sequences=["s6"])
-    source.left_out = {"too short": ["a", "b"]}
-    source.refused = [DataError("no annotations", "x.json", "s9")]
+    source = ListedSource(
+        NAMES,
+        bad_frames={"s1": [2], "s4": [0, 1, 3]},
+        failing=failing("s6"),
+        left_out={"too short": ["a", "b"]},
+        refused=[DataError("no annotations", "x.json", "s9")],
+    )
     split = read_manifest(make(source, tmp_path / "store", max_bad_fraction=0.5)).splits["train"]
     assert split.names == ("s0", "s1", "s2", "s3", "s5", "s7")
     assert split.left_out == {"too short": 2}
@@ -128,7 +135,7 @@ def test_a_bad_frame_is_raised_with_its_place_if_that_is_asked_for_even_after_it
 
 
 @pytest.mark.parametrize(
-    "bad", [{"bad_frames": {name: [1] for name in NAMES[:4]}}, {"bad_sequences": ["s3"]}], ids=["frames", "sequences"]
+    "bad", [{"bad_frames": {name: [1] for name in NAMES[:4]}}, {"failing": failing("s3")}], ids=["frames", "sequences"]
 )
 def test_more_than_the_allowed_share_of_bad_input_is_an_error(bad: dict, tmp_path: Path) -> None:
     # 4 of 32 frames, or 1 of 8 sequences.
@@ -138,7 +145,7 @@ def test_more_than_the_allowed_share_of_bad_input_is_an_error(bad: dict, tmp_pat
     make(ListedSource(NAMES, **bad), tmp_path / "store", max_bad_fraction=0.13)
     assert (tmp_path / "store" / "manifest.json").exists()
     with pytest.raises(DataError, match="not one sequence"):
-        make(ListedSource(NAMES, bad_sequences=NAMES), tmp_path / "none", max_bad_fraction=1)
+        make(ListedSource(NAMES, failing=failing(*NAMES)), tmp_path / "none", max_bad_fraction=1)
 
 
 @pytest.mark.parametrize(("chunk", "most", "lengths"), [(3, 4, [3, 3, 2]), (8, 3, [3, 2, 3])])

@@ -29,24 +29,19 @@ def data_of(root: Path, content: object, folder: Path, setting: str = "evaluatio
     return module(root, evaluation_batch_size=1, **{setting: str(path)})
 
 
-@pytest.mark.parametrize(
-    ("content", "form", "tests"),
-    [
-        (PIXELSPLAT, "pixelSplat", [("test0", "test0", 2, [3, 5])]),
-        (MVSPLAT360, "MVSplat360", [("test0", "test0", 2, [3, 5])]),
-        (
-            LATENTSPLAT,
-            "latentSplat",
-            [("test0", "test0", 2, [3, 5]), ("test2#1", "test2", 2, [3, 5]), ("test2#2", "test2", 1, [0, 6])],
-        ),
-        (
-            FLASH3D,
-            "Flash3D",
-            [("test0", "test0", 2, [3, 5, 1]), ("test2#1", "test2", 2, [3, 5, 2]), ("test2#2", "test2", 1, [0, 6, 6])],
-        ),
-    ],
-)
-def test_each_format_gives_its_views(root, tmp_path, content, form, tests):
+FIRST, LAST = ("test0", "test0", 2, [3, 5]), ("test2#2", "test2", 1, [0, 6, 6])
+# a format: (content, name of each test, its clip, reference and targets)
+VIEWS = {
+    "pixelSplat": (PIXELSPLAT, [FIRST]),
+    "MVSplat360": (MVSPLAT360, [FIRST]),
+    "latentSplat": (LATENTSPLAT, [FIRST, ("test2#1", "test2", 2, [3, 5]), ("test2#2", "test2", 1, [0, 6])]),
+    "Flash3D": (FLASH3D, [(*FIRST[:3], [3, 5, 1]), ("test2#1", "test2", 2, [3, 5, 2]), LAST]),
+}
+
+
+@pytest.mark.parametrize("form", VIEWS)
+def test_each_format_gives_its_views(root, tmp_path, form):
+    content, tests = VIEWS[form]
     data = data_of(root, content, tmp_path)
     read, scene = data.source("test").read, data.store("test").scene
     for batch, (name, clip, reference, targets) in zip(data.test_dataloader(), tests, strict=True):

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from realestate10k_trees import (
-    FORMS,
     StoredClip,
     assert_refusal,
     chunk_entry,
@@ -30,10 +29,7 @@ from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
-    BadImage,
-    MissingFile,
     OutsidePath,
-    TooFewFrames,
     UnreadableFile,
 )
 from completesplat.data.validation.audit import check
@@ -50,117 +46,6 @@ def write(folder: Path, form: str = "chunks", changed: list[StoredClip] = CLIPS)
     """One clip a chunk, the broken one in the first; returns the folder."""
     write_text_form(folder, changed) if form == "text" else write_chunk_form(folder, changed, clips_per_chunk=1)
     return folder
-
-
-def assert_only_refusal(folder: Path, kind: type[DataError], file: str, frame: int | None) -> None:
-    """All training clips are read whole, and one fault is found."""
-    source = module(folder.parent, val_fraction=0.0).open("train")["train"]
-    assert source.refused == []
-    source.names = [BAD, *INTACT]
-    (error,) = check({"train": source}, workers=1, progress=False).refused
-    assert_refusal(error, kind, folder / file, BAD, frame)
-
-
-def entry(row: int, column: int | slice, value: float) -> Callable[[StoredClip], object]:
-    return lambda clip: clip.rows[row].__setitem__(column, value)
-
-
-def stored_image(frame: int, make: Callable[[bytes], bytes]) -> Callable[[StoredClip], object]:
-    return lambda clip: clip.images.__setitem__(frame, make(clip.images[frame]))
-
-
-def mirrored(clip: StoredClip) -> None:
-    clip.rows[2, 6:10] *= -1
-
-
-def first(count: int) -> Callable[[StoredClip], object]:
-    return lambda clip: vars(clip).update({k: v[:count] for k, v in vars(clip).items() if k != "key"})
-
-
-# name: (change, kind, frame), in whichever form a clip is stored.
-BAD_CLIPS: dict[str, tuple[Callable[[StoredClip], object], type[DataError], int | None]] = {
-    "nan_in_a_pose": (entry(2, 9, np.nan), BadAnnotation, 2),
-    "a_pose_beyond_float32_squared": (entry(2, 9, 1e30), BadAnnotation, 2),
-    "reflection": (mirrored, BadCamera, 2),
-    "sheared_rotation": (entry(2, 6, 1.01), BadCamera, 2),
-    "zero_focal_length": (entry(3, 1, 0), BadCamera, 3),
-    "lens_distortion": (entry(2, 4, 0.1), BadCamera, 2),
-    "one_frame": (first(1), TooFewFrames, None),
-    "cut_jpeg": (stored_image(2, lambda data: data[: len(data) // 2]), BadImage, 2),
-    "html_instead_of_the_first_image": (stored_image(0, lambda _: b"<html>404</html>"), BadImage, 0),
-    "another_size_in_the_middle": (stored_image(2, lambda _: make_clip("x", size=(32, 18)).images[0]), BadImage, 2),
-}  # fmt: skip
-
-
-def broken(name: str) -> list[StoredClip]:
-    clip = make_clip(BAD, frames=4)
-    BAD_CLIPS[name][0](clip)
-    return [clip, *CLIPS[1:]]
-
-
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("name", BAD_CLIPS)
-def test_a_broken_clip_is_refused_with_its_place(name, form, tmp_path):
-    _, kind, frame = BAD_CLIPS[name]
-    of_text = f"{BAD}/{33_000 * ((frame or 0) + 1)}.jpg" if kind is BadImage else TEXT
-    assert_only_refusal(
-        write(tmp_path / "train", form, broken(name)), kind, of_text if form == "text" else CHUNK, frame
-    )
-
-
-def line_of(number: int, edit: Callable[[list[str]], list[str]]) -> Damage:
-    """Change the columns of a frame's line."""
-
-    def damage(folder: Path) -> None:
-        lines = (folder / TEXT).read_text().splitlines()
-        lines[1 + number] = " ".join(edit(lines[1 + number].split()))
-        (folder / TEXT).write_text("\n".join(lines))
-
-    return damage
-
-
-def replaced(file: str, make: Callable[[Path], object]) -> Damage:
-    return lambda folder: ((folder / file).unlink(), make(folder / file))
-
-
-# name: (damage, kind, file, frame)
-BAD_TEXTS: dict[str, tuple[Damage, type[DataError], str, int | None]] = {
-    "an_image": (replaced(TEXT, lambda path: path.write_bytes(CLIPS[0].images[0])), UnreadableFile, TEXT, None),
-    "a_folder": (replaced(TEXT, Path.mkdir), MissingFile, TEXT, None),
-    "column_too_many": (line_of(1, lambda columns: [*columns, "0"]), BadAnnotation, TEXT, 1),
-    "letters": (line_of(2, lambda columns: [*columns[:5], "k1", *columns[6:]]), BadAnnotation, TEXT, 2),
-    "timestamp_twice": (line_of(2, lambda columns: ["66000", *columns[1:]]), BadAnnotation, TEXT, 1),
-    "no_image": (line_of(2, lambda columns: ["98999", *columns[1:]]), MissingFile, f"{BAD}/98999.jpg", 2),
-}
-
-
-@pytest.mark.parametrize("name", BAD_TEXTS)
-def test_a_broken_text_is_refused_with_its_place(name, tmp_path):
-    damage, *expected = BAD_TEXTS[name]
-    damage(write(tmp_path / "train", "text"))
-    assert_only_refusal(tmp_path / "train", *expected)
-
-
-def large(*shape: int, dtype: torch.dtype = torch.uint8) -> torch.Tensor:
-    """Zeros that are one number in the file."""
-    return torch.zeros(1, dtype=dtype).expand(shape)
-
-
-@pytest.mark.parametrize(
-    ("fields", "part"),
-    [
-        ({"cameras": torch.zeros(4, 17)}, "18 columns"),
-        ({"cameras": torch.zeros(3, 18)}, "4 images, 3 cameras and 4 timestamps"),
-        ({"timestamps": torch.arange(4.0)}, "timestamps are not int64"),
-        ({"timestamps": torch.tensor([0, 1, 2, 1])}, "another frame has its timestamp"),
-        ({"images": [large(10**6)] * 4}, "images are not a list"),
-    ],
-)
-def test_an_entry_of_another_type_or_shape_is_refused(tmp_path, fields, part):
-    torch.save([chunk_entry(CLIPS[0]) | fields], write(tmp_path) / CHUNK)
-    with pytest.raises(BadAnnotation, match=part) as caught:
-        ChunkedClips(tmp_path).clip(BAD)
-    assert_refusal(caught.value, BadAnnotation, tmp_path / CHUNK, BAD, 1 if "another" in part else None)
 
 
 class Runs:
@@ -182,26 +67,6 @@ def test_a_chunk_runs_no_code(tmp_path):
     assert not canary.exists()
     torch.load(path, weights_only=False)
     assert canary.exists()
-
-
-def saved(make: Callable[[dict[str, Any]], object]) -> Damage:
-    return lambda path: torch.save(make(chunk_entry(CLIPS[0])), path)
-
-
-# name: (damage of the broken clip's chunk, kind)
-BAD_CHUNKS: dict[str, tuple[Damage, type[DataError]]] = {
-    "cut": (lambda path: path.write_bytes(path.read_bytes()[:-500]), UnreadableFile),
-    "list_of_tensors": (saved(lambda entry: list(entry["images"])), BadAnnotation),
-    "key_twice": (saved(lambda entry: [entry, entry]), BadAnnotation),
-    "another_clip": (saved(lambda entry: [entry | {"key": "other"}]), BadAnnotation),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", BAD_CHUNKS)
-def test_a_bad_chunk_is_refused(name, tmp_path):
-    damage, kind = BAD_CHUNKS[name]
-    damage(write(tmp_path / "train") / CHUNK)
-    assert_only_refusal(tmp_path / "train", kind, CHUNK, None)
 
 
 def test_a_principal_point_outside_matters_to_its_own_crop_only(tmp_path):

@@ -5,11 +5,13 @@ import logging
 import re
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from support import refused
 from turntables import SIZE, draw, toy, write_turn
 
@@ -30,9 +32,8 @@ def angles_to(folder: Path, azimuths: np.ndarray) -> np.ndarray:
     frames = read_capture(folder).frames
     rotations = np.stack([frame.world_to_camera[:3, :3] for frame in frames])
     true = np.stack([np.diag([1, -1, -1]) @ rotation_about("y", azimuth).T for azimuth in azimuths])
-    relative, expected = rotations @ rotations[0].T, true @ true[0].T
-    traces = np.einsum("nij,nij->n", relative, expected)
-    return np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+    difference = Rotation.from_matrix(rotations @ rotations[0].T) * Rotation.from_matrix(true @ true[0].T).inv()
+    return np.degrees(difference.magnitude())
 
 
 def import_turns(folder: Path, out: Path, **settings: object) -> Path:
@@ -113,12 +114,10 @@ def test_photos_of_phones_are_read_where_their_reader_is_installed(turns, tmp_pa
 
 def test_numbers_in_file_names_are_positions_in_the_turn(turns, tmp_path):
     kept = [0, 1, 2, 3, 5, 6, 7, 8, 9, 11]
-    for index in range(12):
-        photo = turns / f"a/left/photo {index}.png"
-        if index in kept:
-            photo.rename(turns / f"a/left/1_{10 * index + 120 * (index == 2)}.png")  # the third in the next turn
-        else:
-            photo.unlink()
+    for index in kept:  # the third in the next turn
+        (turns / f"a/left/photo {index}.png").rename(turns / f"a/left/1_{10 * index + 120 * (index == 2)}.png")
+    for photo in (turns / "a/left").glob("photo *"):
+        photo.unlink()
     (tmp_path / "turns.json").write_text(json.dumps({"a/left": 120, "b/right": 12}))
     out = import_turns(turns, tmp_path / "out", photos_of_a_turn=str(tmp_path / "turns.json"))
     assert angles_to(out / "a/left", AZIMUTHS[kept]).max() < 0.2
@@ -142,9 +141,8 @@ def test_what_is_no_turn_is_one_line(turns, tmp_path):
     assert reason(one, out) == "one: 1 photo; a turn needs at least 8"
     for index in range(7):
         shutil.copy(first / "photo 0.png", one / f"b{index}.png")
-    assert "TURNS/a.png, one: no number in this name, but photos_of_a_turn needs" in reason(
-        one, out, photos_of_a_turn=8
-    )
+    unnumbered = "TURNS/a.png, one: no number in this name, but photos_of_a_turn needs"
+    assert unnumbered in reason(one, out, photos_of_a_turn=8)
     shutil.copy(first / "photo 0.png", one / "b8.png")
     (one / "a.png").unlink()
     assert "b8.png, one: the same position in the turn of 8 photos as b0.png" in reason(one, out, photos_of_a_turn=8)
@@ -164,21 +162,15 @@ def test_a_turn_that_does_not_close_is_named_and_left_out_of_the_splits_too(turn
     assert "left out: a/left: the turn does not close: last and first photo differ by" in caplog.text
     assert sorted(path.name for path in out.iterdir()) == ["b", "sheet.png", "splits.json"]
     data = CaptureSetDataModule(str(out), image_size=32)
-    assert {split: source.names for split, source in data.open("train").items()} == {
-        "train": ["b/right"],
-        "val": [],
-        "test": [],
-    }
+    names = [source.names for source in data.open("train").values()]
+    assert names == [["b/right"], [], []]  # train, val, test
     with pytest.raises(DataError, match="b/right: exists already: choose another out=DIR"):
         import_turns(turns, out)
 
 
 def test_an_interrupted_import_leaves_nothing_and_can_be_repeated(turns, tmp_path, monkeypatch):
-    def stopped(*_: object) -> None:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(turntable, "_write_transforms", stopped)
+        patch.setattr(turntable, "_write_transforms", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             import_turns(turns, tmp_path / "out")
     assert not [path for path in (tmp_path / "out").rglob("*") if path.is_dir()]

@@ -8,10 +8,11 @@ import torch
 from completesplat.diffusion.sampling import in_parts
 
 
+@pytest.mark.parametrize("threads", [0, 2])
 @pytest.mark.parametrize(("most", "sizes"), [(None, [7]), (7, [7]), (3, [3, 3, 1]), (1, [1] * 7), (100, [7])])
-def test_all_are_drawn_in_order(most, sizes):
+def test_all_are_drawn_in_order(most, sizes, threads):
     items = list(range(7))
-    parts = in_parts(lambda part: items[part], 7, most)
+    parts = in_parts(lambda part: items[part], 7, most, threads)
     assert [len(part) for part in parts] == sizes
     assert list(chain(*parts)) == items
 
@@ -32,3 +33,12 @@ def test_parts_that_do_not_fit_are_halved_until_they_do(caplog):
     room = 0
     with pytest.raises(torch.cuda.OutOfMemoryError):
         in_parts(draw, 4)
+
+
+@pytest.mark.parametrize("mode", [torch.inference_mode, torch.no_grad, torch.enable_grad])
+def test_threads_draw_in_the_mode_of_their_caller(mode):
+    def modes(part: slice) -> tuple[object, ...]:
+        return torch.is_inference_mode_enabled(), torch.is_grad_enabled(), torch.is_autocast_enabled("cpu")
+
+    with mode(), torch.autocast("cpu", torch.bfloat16):
+        assert set(in_parts(modes, 3, 1, threads=2)) == {modes(slice(0))}

@@ -8,7 +8,7 @@ from support import some_gaussians
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import cleaned, storable, with_screen_space_dilation
-from completesplat.gaussians import concatenate
+from completesplat.gaussians import merge_gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -21,7 +21,7 @@ WITHOUT_BLUR = ReferenceRasterizer(replace(RenderingConstants(), blur=1e-6))
 @pytest.fixture
 def whole():
     """Six Gaussians, each in a place of its own."""
-    return replace(concatenate([some_gaussians(1)[0]] * 3), means=torch.arange(18.0).view(6, 3))
+    return replace(merge_gaussians([some_gaussians(1)[0]] * 3), means=torch.arange(18.0).view(6, 3))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from support import some_gaussians
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import FORMATS, write_formats, write_glb, write_splat
 from completesplat.export.ply import read_ply, write_ply
-from completesplat.export.splat_transform import PageView, SplatTransform, upright, viewer_settings
+from completesplat.export.splat_transform import PageView, SplatTransform, upright_rotation, viewer_settings
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.geometry.rotations import normalize_quaternion
@@ -53,7 +53,7 @@ def test_all_formats_but_the_page_are_made_of_the_ply_itself(tmp_path, converter
     scene = some_gaussians(1)[0]
     scene.means[:] = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
     write_formats(tmp_path, "a", scene, ["ply", "spz", "sog", "html"], VIEW, converter)
-    write_ply(tmp_path / "turned.ply", scene.transform(upright(UP)))
+    write_ply(tmp_path / "turned.ply", scene.transform(upright_rotation(UP)))
     names = "a.ply", "a.spz", "a.sog", "a.html", "turned.ply"
     ply, spz, sog, html, turned = ((tmp_path / name).read_bytes() for name in names)
     assert spz == sog == ply
@@ -86,7 +86,7 @@ def test_spz_goes_without_opacities_that_round_to_nothing(tmp_path, converter):
 
 @pytest.mark.parametrize("up", [[0.1, -0.9, -0.4], [0.0, 0.0, -1.0], [0.0, 0.0, 3.0], [1.0, 0.0, 0.0]])
 def test_a_scene_is_turned_until_up_points_to_minus_y(up):
-    turn = upright(torch.tensor(up))[:3, :3]
+    turn = upright_rotation(torch.tensor(up))[:3, :3]
     torch.testing.assert_close(turn @ turn.mT, torch.eye(3), rtol=0, atol=1e-6)
     torch.testing.assert_close(torch.linalg.det(turn), torch.tensor(1.0))
     direction = torch.tensor(up) / torch.tensor(up).norm()
@@ -98,7 +98,7 @@ def test_a_scene_is_turned_until_up_points_to_minus_y(up):
 def test_a_page_begins_at_the_reference_camera_and_shows_its_whole_image(tmp_path, converter):
     write_formats(tmp_path, "a", some_gaussians(1)[0], ["html"], VIEW, converter)
     settings = json.loads((tmp_path / "bin/splat-transform.settings").read_text())
-    assert settings == json.loads(json.dumps(viewer_settings(VIEW, upright(UP))))
+    assert settings == json.loads(json.dumps(viewer_settings(VIEW, upright_rotation(UP))))
     initial = settings["cameras"][0]["initial"]
     # The viewer's +y points up: the pivot is as much below the camera as the scene's up leans to the viewer.
     target = torch.tensor(initial["target"])

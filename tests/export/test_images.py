@@ -10,7 +10,7 @@ from completesplat.export.images import (
     color_normals,
     image_grid,
     image_sheet,
-    to_bytes,
+    to_pixels,
 )
 
 
@@ -23,7 +23,7 @@ def test_images_stand_where_they_were_given_each_pixel_a_square():
     for row, images in enumerate((first, second)):
         for column, image in enumerate(images):
             place = plain[4 * row : 4 * row + 4, 5 * column : 5 * column + 5]
-            assert np.array_equal(place, to_bytes(image))
+            assert np.array_equal(place, to_pixels(image))
     assert np.all(plain[4:, 10:] == 255)
 
 

@@ -12,7 +12,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export import mesh
 from completesplat.export.formats import write_formats
 from completesplat.export.splat_transform import PageView
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.tiled import TiledRasterizer
 
@@ -54,7 +54,7 @@ def test_a_hollow_sphere_becomes_a_closed_solid_and_what_floats_or_lies_behind_i
     wall = np.stack([*np.meshgrid(np.linspace(-2, 2, 30), np.linspace(-2, 2, 30)), np.full((30, 30), 5.0)], -1)
     scene = blobs(sphere(center, radius, 2500), color)
     others = [blobs(sphere((-0.5, 0.4, 2.6), 0.05, 100), color), blobs(wall.reshape(-1, 3), color, 0.1)]
-    result, colors = written(tmp_path, concatenate([scene, *others]))
+    result, colors = written(tmp_path, merge_gaussians([scene, *others]))
     assert result.is_watertight
     assert result.is_winding_consistent
     assert result.body_count == 1
@@ -77,7 +77,7 @@ def test_each_side_of_a_cube_has_its_colour_on_the_right_side(tmp_path):
             color = np.array([axis == 0, axis == 1, axis == 2], float) if sign > 0 else np.eye(3)[axis] * -1 + 1
             parts.append(blobs(points + np.array([0, 0, 2.9]), color))
             sides[axis, sign] = color
-    result, colors = written(tmp_path, concatenate(parts))
+    result, colors = written(tmp_path, merge_gaussians(parts))
     assert result.is_watertight
     middle = np.array([0, 0, -2.9])
     for (axis, sign), color in sides.items():

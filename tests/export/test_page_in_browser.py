@@ -9,9 +9,15 @@ import torch
 from PIL import Image
 from support import round_gaussians
 
-from completesplat.export.images import to_bytes
-from completesplat.export.splat_transform import LARGEST_FOV, PageView, upright, viewer_settings, write_page
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.export.images import to_pixels
+from completesplat.export.splat_transform import (
+    LARGEST_FOV,
+    PageView,
+    upright_rotation,
+    viewer_settings,
+    write_turning_page,
+)
+from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -29,7 +35,7 @@ REFERENCE = Cameras(torch.eye(4), pinhole(50, 64), (64, 64))
 def room() -> Gaussians:
     """The balls within far walls, which reach behind the camera."""
     balls, far = scene(), torch.tensor([[-9.0, 0, -9], [9, 0, -9], [-9, 0, 9], [9, 0, 9], [0, -9, 0], [0, 9, 0]])
-    return concatenate([balls, round_gaussians(far, 0.5, 0.9, 0.5)])
+    return merge_gaussians([balls, round_gaussians(far, 0.5, 0.9, 0.5)])
 
 
 def scene() -> Gaussians:
@@ -40,13 +46,13 @@ def scene() -> Gaussians:
 
 
 def our_image(view: PageView) -> torch.Tensor:
-    fov = viewer_settings(view, upright(UP))["cameras"][0]["initial"]["fov"]
+    fov = viewer_settings(view, upright_rotation(UP))["cameras"][0]["initial"]["fov"]
     assert fov < LARGEST_FOV
     focal = WIDTH / 2 / math.tan(math.radians(fov) / 2)
     intrinsics = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
     camera = Cameras(look_at(torch.zeros(3), PIVOT, UP), intrinsics, (HEIGHT, WIDTH))
     image = ReferenceRasterizer()(scene()[None], camera[None, None]).over(view.background)[0, 0]
-    return torch.from_numpy(to_bytes(image).copy()).float() / 255
+    return torch.from_numpy(to_pixels(image).copy()).float() / 255
 
 
 def screenshot(path, requests: list[str], drag: int = 0) -> torch.Tensor:
@@ -77,7 +83,7 @@ def screenshot(path, requests: list[str], drag: int = 0) -> torch.Tensor:
 
 def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path, converter):
     view = PageView(REFERENCE, PIVOT, UP, 0.25)
-    write_page(tmp_path / "scene.html", scene(), view, converter)
+    write_turning_page(tmp_path / "scene.html", scene(), view, converter)
     requests: list[str] = []
     theirs, ours = screenshot(tmp_path / "scene.html", requests), our_image(view)
     assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
@@ -88,7 +94,7 @@ def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path, converter):
 
 
 def test_dragging_turns_the_page_s_camera_about_the_object_also_within_walls(tmp_path, converter):
-    write_page(tmp_path / "scene.html", room(), PageView(REFERENCE, PIVOT, UP, 0.25), converter)
+    write_turning_page(tmp_path / "scene.html", room(), PageView(REFERENCE, PIVOT, UP, 0.25), converter)
     before, after = (screenshot(tmp_path / "scene.html", [], drag) for drag in (0, 150))
     for color in torch.eye(3):  # the balls around the pivot
         assert abs(place(before, color) - place(after, color)) < 0.1

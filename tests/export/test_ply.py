@@ -9,8 +9,8 @@ from plyfile import PlyData
 
 from completesplat.errors import PlyError
 from completesplat.export.ply import read_ply, write_ply
-from completesplat.gaussians import DirectionalGaussians, Gaussians, concatenate
-from completesplat.ply_files import header
+from completesplat.gaussians import DirectionalGaussians, Gaussians, merge_gaussians
+from completesplat.ply_files import vertex_header
 
 C0 = 0.5 / np.sqrt(np.pi)
 NAMES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
@@ -66,7 +66,7 @@ def test_reading_returns_what_was_written_and_writing_that_the_same_bytes(tmp_pa
         colors=torch.tensor([[0, 0.5, 1], [1e-9, 1e-7, 1e-3], [0.9999999, 1.5, 0.25], [0, 0, 0]]),
     )
     gaussians = random_gaussians(20_000)
-    write_ply(tmp_path / "a.ply", concatenate([gaussians, edges]))
+    write_ply(tmp_path / "a.ply", merge_gaussians([gaussians, edges]))
     back = read_ply(tmp_path / "a.ply")
     write_ply(tmp_path / "b.ply", back)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
@@ -166,7 +166,7 @@ def test_harmonics_that_are_not_known_are_left_out_with_a_warning(properties, ke
     rows = np.fromfile(path, "<f4", offset=path.read_bytes().index(b"end_header\n") + 11).reshape(4, -1)
     rest = np.arange(4 * properties, dtype="<f4").reshape(4, -1)
     names = [*NAMES, *(f"f_rest_{index}" for index in range(properties))]
-    path.write_bytes(header(4, [(name, "float") for name in names]) + np.hstack([rows, rest]).tobytes())
+    path.write_bytes(vertex_header(4, [(name, "float") for name in names]) + np.hstack([rows, rest]).tobytes())
     gaussians = read_ply(path)
     assert warning in caplog.text
     assert isinstance(gaussians, DirectionalGaussians) == (kept > 0)

@@ -14,8 +14,8 @@ from completesplat.export.images import color_depth, surface_depth
 from completesplat.export.ply import read_ply
 from completesplat.export.prediction import (
     FileUnits,
+    OutputFiles,
     Shot,
-    Wanted,
     contact_sheet,
     write_fitted_scene,
     write_maps,
@@ -94,7 +94,9 @@ def test_the_camera_comes_back_exactly_and_numbers_that_are_not_finite_leave_the
 def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path):
     bright = dataclasses.replace(scene_at(2, 0.9), colors=torch.tensor([[0.2, 0.4, 1.5], [0.0, 0.5, 1.0]]))
     faint = dataclasses.replace(scene_at(2, 0.9), opacities=torch.tensor([0.9, 1e-4]))
-    wanted = Wanted(formats=("ply", "spz"), videos=(), converter=SplatTransform(str(install(tmp_path, "converter"))))
+    wanted = OutputFiles(
+        formats=("ply", "spz"), videos=(), converter=SplatTransform(str(install(tmp_path, "converter")))
+    )
     shots, settings = [Shot(bright, CAMERA), Shot(faint, CAMERA)], {"seed": 0, "image": "a.png"}
     write_prediction(tmp_path / "a", torch.zeros(3, 16, 16), shots, ReferenceRasterizer(), wanted, settings)
     recorded = strict_json(tmp_path / "a/scene.json")["settings"]

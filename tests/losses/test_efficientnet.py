@@ -9,7 +9,7 @@ from scenes_for_training import prediction, scene_batch
 from support import NETWORKS, compose_config
 
 from completesplat.commands import refusal
-from completesplat.commands.plan import counted
+from completesplat.commands.plan import count_work
 from completesplat.losses.efficientnet import STAGES, EfficientNetDistance
 from completesplat.training.steps import Training, synthetic_batch
 
@@ -89,7 +89,7 @@ def test_the_loss_has_the_term_in_the_place_of_lpips_and_trains_and_is_planned()
     assert all(parameter.isfinite().all() for parameter in module.parameters())
     assert any(not torch.equal(*pair) for pair in zip(before, module.parameters(), strict=True))
     assert names == set(instantiate(first.model, _convert_="all").state_dict())
-    assert counted(config, 1).flops > 0
+    assert count_work(config, 1).flops > 0
 
 
 def test_without_the_extra_one_line_says_how_to_get_it(monkeypatch):

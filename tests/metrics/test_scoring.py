@@ -10,8 +10,8 @@ import torch
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.image_sets import Inception
-from completesplat.metrics.images import Missing
-from completesplat.metrics.scoring import Evaluation, best, depth_errors, diversity, expected_best_curve
+from completesplat.metrics.images import MissingMetrics
+from completesplat.metrics.scoring import Evaluation, best_sample, depth_errors, diversity, expected_best_curve
 from completesplat.scene import SceneBatch, Views
 
 
@@ -151,7 +151,7 @@ def test_the_best_sample_is_that_of_a_region_for_all_metrics_or_that_of_each_met
         alone.append(single.results()["model"])
     results = evaluation.results()
     by_psnr = {region: [single[region]["novel"]["psnr"] for single in alone] for region in ("full", "object")}
-    assert (best(by_psnr["full"]), best(by_psnr["object"])) == (0, 1)
+    assert (best_sample(by_psnr["full"]), best_sample(by_psnr["object"])) == (0, 1)
     # By PSNR in the region: LPIPS, the sets and the reference view are that sample's.
     assert results["best_of_k"]["full"] == alone[0]["full"]
     assert results["best_of_k"]["object"] == alone[1]["object"]
@@ -188,8 +188,8 @@ def test_sharpness_is_of_novel_views_and_leaves_out_the_objects_silhouette():
 
 
 def test_missing_metrics_are_named_and_have_no_figure():
-    absent = {"inception": Missing("none here", ("fid", "kid"))}
-    evaluation = Evaluation(perceptual=Missing("no weights", ("lpips",)), sets=absent)
+    absent = {"inception": MissingMetrics("none here", ("fid", "kid"))}
+    evaluation = Evaluation(perceptual=MissingMetrics("no weights", ("lpips",)), sets=absent)
     evaluation.update("model", torch.full((1, 2, 3, 16, 16), 0.5), scenes(1, 1))
     assert evaluation.missing == {"lpips": "missing: no weights"} | dict.fromkeys(("fid", "kid"), "missing: none here")
     assert set(evaluation.results()["model"]["full"]["novel"]) == {"psnr", "ssim"}
@@ -228,7 +228,7 @@ def test_a_set_metric_that_fails_or_gives_no_number_is_missing_and_the_others_ar
     [
         ({"samples": 0}, "samples=0: must be at least 1"),
         ({"criterion": "beauty"}, "criterion=beauty: choose one of psnr, ssim"),
-        ({"criterion": "lpips", "perceptual": Missing("no weights", ("lpips",))}, "criterion=lpips: missing"),
+        ({"criterion": "lpips", "perceptual": MissingMetrics("no weights", ("lpips",))}, "criterion=lpips: missing"),
     ],
 )
 def test_settings_without_a_meaning_are_refused(settings, reason):
@@ -263,14 +263,14 @@ def test_the_curve_is_the_mean_best_of_all_choices(higher_is_better, chosen):
 
 
 def test_the_best_is_the_first_of_equals():
-    assert best(SCORES) == 2
-    assert best(SCORES, higher_is_better=False) == 5
-    assert best([1.0, 3.0, 3.0]) == 1
-    assert best([3.0, 1.0, 1.0], higher_is_better=False) == 1
+    assert best_sample(SCORES) == 2
+    assert best_sample(SCORES, higher_is_better=False) == 5
+    assert best_sample([1.0, 3.0, 3.0]) == 1
+    assert best_sample([3.0, 1.0, 1.0], higher_is_better=False) == 1
 
 
 @pytest.mark.parametrize("scores", [[], [1.0, float("nan")]])
-@pytest.mark.parametrize("function", [best, expected_best_curve])
+@pytest.mark.parametrize("function", [best_sample, expected_best_curve])
 def test_without_numbers_nothing_is_best(function, scores):
     with pytest.raises(ValueError, match="scores that are numbers"):
         function(scores)

@@ -28,7 +28,7 @@ from support import compose_config
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.rasterizers import Rasterizer, RenderingConstants, cuda
 from completesplat.rasterizers.cuda import FARTHEST, CudaRasterizer
@@ -264,7 +264,7 @@ def test_a_gaussian_that_overflows_in_one_view_is_left_out_of_all_views_of_its_s
     """If it lies behind that view's camera, the others draw it, as the reference does."""
     rest, near, far, behind = healthy(12), *(camera().world_to_camera.clone() for _ in range(3))
     far[..., 2, 3], behind[..., 2, 3] = 1e8, -4
-    scenes = [concatenate([one, rest]) for one in (changed({"scales": (1e8, 1e8, 1e8)}), changed({}))]
+    scenes = [merge_gaussians([one, rest]) for one in (changed({"scales": (1e8, 1e8, 1e8)}), changed({}))]
     both = stack(scenes).map(lambda tensor: tensor.squeeze(1))
 
     def alphas(rasterizer: Rasterizer, gaussians: Gaussians, *views: Tensor) -> Tensor:
@@ -377,7 +377,7 @@ def test_gsplat_never_gets_gaussians_that_cannot_be_drawn(kind: str, kernels: Re
 
 
 @pytest.mark.parametrize(
-    "gaussians", [healthy(0), *(concatenate([healthy(12), changed(one)]) for one in DRAWN.values())]
+    "gaussians", [healthy(0), *(merge_gaussians([healthy(12), changed(one)]) for one in DRAWN.values())]
 )
 def test_gsplats_kernels_keep_extreme_gaussians_finite(gaussians: Gaussians, kernels: RenderingConstants) -> None:
     images, gradients = draw(CudaRasterizer(kernels), gaussians)

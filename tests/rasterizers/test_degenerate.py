@@ -19,7 +19,7 @@ from degenerate_gaussians import (
 from rasterizer_scenes import CONSTANTS, assert_agrees
 from torch import Tensor
 
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer, alphas_at
@@ -79,7 +79,7 @@ def test_nothing_to_draw(count: int, rasterizer, dtype: torch.dtype, followed) -
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("kind", EXTREME)
 def test_extreme_gaussians_are_drawn_with_finite_values_and_gradients(kind: str, dtype: torch.dtype) -> None:
-    assert_finite(*render_and_differentiate(concatenate([healthy(20).to(dtype), degenerate(EXTREME[kind], dtype)])))
+    assert_finite(*render_and_differentiate(merge_gaussians([healthy(20).to(dtype), degenerate(EXTREME[kind], dtype)])))
     assert_finite(*render_and_differentiate(degenerate(EXTREME[kind], dtype)))
 
 
@@ -108,10 +108,10 @@ def test_many_gaussians_at_one_place(dtype: torch.dtype) -> None:
     """Equal depths keep their order, and a transmittance that underflows does no harm."""
     colors = [[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]]
     front, back = (degenerate({"colors": color, "opacities": 0.5}, dtype) for color in colors)
-    image, _ = render_and_differentiate(concatenate([front, back]))
-    swapped, _ = render_and_differentiate(concatenate([back, front]))
+    image, _ = render_and_differentiate(merge_gaussians([front, back]))
+    swapped, _ = render_and_differentiate(merge_gaussians([back, front]))
     assert image[0, 0, 0].max() < swapped[0, 0, 0].max()
-    assert_finite(*render_and_differentiate(concatenate([degenerate({"opacities": 1.0}, dtype)] * 400)))
+    assert_finite(*render_and_differentiate(merge_gaussians([degenerate({"opacities": 1.0}, dtype)] * 400)))
 
 
 @pytest.mark.parametrize("kind", DRAWN)

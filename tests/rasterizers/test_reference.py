@@ -6,7 +6,7 @@ import pytest
 import torch
 from rasterizer_scenes import CONSTANTS, f64, render
 
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.reference import project_gaussians
@@ -56,7 +56,7 @@ def test_compositing_goes_front_to_back_whatever_the_order_of_input(order: list[
     camera = straight_camera()
     depths, opacities, colors = (2.0, 3.0, 5.0), (0.5, 0.25, 0.75), torch.eye(3).tolist()
     points = [at_pixel(camera, 4, 7, *values) for values in zip(depths, opacities, colors, strict=True)]
-    rendering = render(concatenate([points[i] for i in order]), camera)
+    rendering = render(merge_gaussians([points[i] for i in order]), camera)
     images = rendering.color, rendering.alpha, rendering.depth, rendering.expected_depth()
     weights, alpha = f64(0.5, 0.5 * 0.25, 0.5 * 0.75 * 0.75), 1 - 0.5 * 0.75 * 0.25
     mean = weights @ f64(*depths)
@@ -88,7 +88,7 @@ def test_the_gaussian_that_would_use_up_the_transmittance_takes_no_part(second: 
     camera = straight_camera()
     front, middle = at_pixel(camera, 4, 7, 2, 1.0, (1, 0, 0)), at_pixel(camera, 4, 7, 3, second, (0, 1, 0))
     behind = at_pixel(camera, 4, 7, 4, 0.0005 + 1 / 255, (0, 0, 1))  # would fit by itself, but the pixel has stopped
-    color = render(concatenate([behind, middle, front]), camera).color[0, 0, :, 7, 4]
+    color = render(merge_gaussians([behind, middle, front]), camera).color[0, 0, :, 7, 4]
     assert color[0].item() == pytest.approx(0.999, rel=1e-12)
     assert color[1].item() == pytest.approx(0.001 * second if takes_part else 0, rel=1e-9)
     assert color[2].item() == 0

@@ -8,20 +8,9 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-PROTOCOL = {
-    "name": "images",
-    "method": "VariationalAutoReconstructor",
-    "data_set": "toy_objects",
-    "image_size": 64,
-    "resolution": 64,
-    "scenes": 20,
-    "skipped": 0,
-    "views": 80,
-    "samples": 1,
-    "sampler": None,
-    "data_fingerprint": "f00d" * 8,
-    "missing": {"lpips": "missing: no weights of VGG"},
-}
+PROTOCOL: dict[str, Any] = {"name": "images", "method": "VariationalAutoReconstructor", "data_set": "toy_objects"}
+PROTOCOL |= {"image_size": 64, "resolution": 64, "scenes": 20, "skipped": 0, "views": 80, "samples": 1, "sampler": None}
+PROTOCOL |= {"data_fingerprint": "f00d" * 8, "missing": {"lpips": "missing: no weights of VGG"}}
 
 
 def entry(psnr: float) -> dict[str, Any]:

@@ -13,11 +13,8 @@ from completesplat.results.tables import SSIM_NOTE, Table
 HYDRANTS = {"name": "co3d", "data_set": "co3d/hydrant", "resolution": 128, "image_size": 128, "scenes": 77}
 HYDRANTS |= {"subset": "fewview_dev", "scenes_listed": 77}
 HYDRANTS |= {"protocol_views": "reference: a sequence's first frame; targets: its other frames"}
-ROOMS = {
-    "data_set": "realestate10k",
-    "image_size": 128,
-    "protocol_views": "index in pixelSplat's format, SHA-256 fbcff9b4b131",
-}
+INDEX = {"protocol_views": "index in pixelSplat's format, SHA-256 fbcff9b4b131"}
+ROOMS = INDEX | {"data_set": "realestate10k", "image_size": 128}
 ALL_ROOMS = ROOMS | {"name": "realestate10k_128", "resolution": 128, "scenes": 6473}
 FAR = {"protocol_views": "reference: first frame; 1 targets, the last 150 frames away"}
 SOME_ROOMS = ROOMS | FAR | {"name": "realestate10k_100", "resolution": 128, "scenes": 100}
@@ -174,14 +171,8 @@ def test_a_folder_without_results_is_refused_with_what_makes_them(runs) -> None:
 
 
 def test_hidden_modes_have_a_table_of_their_own_unless_a_protocol_is_missing(runs) -> None:
-    scores = {
-        "coverage": 0.5,
-        "total_variation": 0.25,
-        "mode_distance": 1.0,
-        "rejected": 0.125,
-        "scenes": 4,
-        "samples": 32,
-    }
+    scores = {"coverage": 0.5, "total_variation": 0.25, "mode_distance": 1.0, "rejected": 0.125}
+    scores |= {"scenes": 4, "samples": 32}
     protocol = {"scenes": ["x", "y"], "method": "LatentDiffusion", "samples": 32, "data_fingerprint": "f00d"}
     for name in ("a", "b", "lacking"):
         (runs / name).mkdir()

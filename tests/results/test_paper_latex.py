@@ -8,21 +8,22 @@ from pathlib import Path
 import pytest
 
 from completesplat.commands import conf_folder
-from completesplat.results.paper_figures import SIGNS, PublishedTable, parse_cell, printed_rows, published, scored
+from completesplat.results.paper_figures import (
+    SIGNS,
+    PublishedTable,
+    parse_cell,
+    printed_rows,
+    read_tables,
+    score_columns,
+)
 from completesplat.results.tables import BLANK, Cell
 
 ENVIRONMENT = re.compile(r"\\begin\{table(\*?)\}.*?\\end\{table\1\}", re.DOTALL)
 COMMENT = re.compile(r"(?<!\\)%.*")
-DECORATION = re.compile(
-    r"\\(?:top|mid|bottom)rule|\\hline|\\cmidrule(?:\([lr]*\))?\{[^}]*\}|\\(?:row|cell)color(?:\[\w*\])?\{[^}]*\}"
-)
+RULES, COLORS = r"\\(?:top|mid|bottom)rule|\\hline", r"\\(?:row|cell)color(?:\[\w*\])?\{[^}]*\}"
+DECORATION = re.compile(rf"{RULES}|\\cmidrule(?:\([lr]*\))?\{{[^}}]*\}}|{COLORS}")
 SPAN = re.compile(r"\\multi(row|column)\{(-?\d+)\}\{[^}]*\}\{(.*)\}", re.DOTALL)
-MARKED = {
-    "best": re.compile(r"\\textbf|\\bf\b"),
-    "second": re.compile(r"\\underline|\\ul\b"),
-    "dagger": re.compile(r"\$\\dagger\$"),
-    "star": re.compile(r"\$\\star\$"),
-}
+MARKED = {"best": r"\\textbf|\\bf\b", "second": r"\\underline|\\ul\b", "dagger": r"\$\\dagger\$", "star": r"\$\\star\$"}
 
 
 def grid(table: str, last_heading: str) -> tuple[list[str], list[list[Cell]]] | None:
@@ -43,9 +44,9 @@ def grid(table: str, last_heading: str) -> tuple[list[str], list[list[Cell]]] | 
 
 def figure(cell: str) -> Cell:
     """Text and marks of a cell: bold is the best, underlined the second."""
-    marks = [mark for mark, pattern in MARKED.items() if pattern.search(cell)]
-    for pattern in (re.compile(r"~?\\cite\{[^}]*\}"), *MARKED.values()):
-        cell = pattern.sub("", cell)
+    marks = [mark for mark, pattern in MARKED.items() if re.search(pattern, cell)]
+    for pattern in (r"~?\\cite\{[^}]*\}", *MARKED.values()):
+        cell = re.sub(pattern, "", cell)
     return parse_cell(" ".join([re.sub(r"[{}]", "", cell).replace(r"\#", "#"), *marks]))
 
 
@@ -107,17 +108,17 @@ PAPER = os.environ.get("COMPLETESPLAT_PAPER")
 @pytest.mark.skipif(PAPER is None, reason="COMPLETESPLAT_PAPER does not name the LaTeX of the paper")
 def test_the_published_figures_are_typed_as_the_paper_prints_them() -> None:
     paper = Path(PAPER or "").read_text(encoding="utf-8")
-    assert [difference for known in published() for difference in differences(known, paper)] == []
+    assert [difference for known in read_tables() for difference in differences(known, paper)] == []
 
 
 def test_every_table_is_complete() -> None:
-    for known in published():
+    for known in read_tables():
         assert all(len(row) == len(known.columns) for row in printed_rows(known))
-        assert all(data_set for *_, data_set in scored(known))
+        assert all(data_set for *_, data_set in score_columns(known))
         text = " ".join(cell.text for row in printed_rows(known) for cell in row)
         signs = {name for name, sign in SIGNS.items() if sign in text}
         assert signs == set(known.get("legend", {}))
-    assert len({known.place for known in published()}) == len(published()) == 4
+    assert len({known.place for known in read_tables()}) == len(read_tables()) == 4
 
 
 def names(*folders: str) -> set[str]:
@@ -125,7 +126,7 @@ def names(*folders: str) -> set[str]:
 
 
 def test_every_protocol_of_a_table_is_there_and_every_ablation_that_a_sweep_can_name_is_a_row() -> None:
-    assert {name for known in published() for name in known.evaluations} <= names("evaluation")
-    (ablations,) = (known for known in published() if known.get("options"))
+    assert {name for known in read_tables() for name in known.evaluations} <= names("evaluation")
+    (ablations,) = (known for known in read_tables() if known.get("options"))
     assert set(ablations.options.values()) == {row[0].text for row in printed_rows(ablations)}
     assert names("ablation") <= set(ablations.options) <= names("ablation", "model")

@@ -37,26 +37,6 @@ def remarks(sweep) -> list[str]:
     return summarize(sweep.folder)[1].remarks[1:]
 
 
-def test_the_summary_agrees_with_the_files_of_the_jobs(ablations) -> None:
-    write_summary(ablations.folder)
-    scores: dict[tuple[str, str], list[float]] = {}
-    for path in ablations.folder.glob("*/metrics.json"):
-        overrides = json.loads(path.with_name("run.json").read_text())["overrides"]
-        (ablation,) = (o.removeprefix("ablation=") for o in overrides if o.startswith("ablation="))
-        full, of_object = (json.loads(path.read_text())["test"]["model"][region] for region in ("full", "object"))
-        for name, value in (("full_novel_psnr", full), ("full_novel_ssim", full), ("object_novel_psnr", of_object)):
-            scores.setdefault((ablation, name), []).append(value["novel"][name.rpartition("_")[2]])
-    table = read_back(ablations.folder)
-    for (ablation, name), values in scores.items():
-        assert len(values) == 3
-        np.testing.assert_allclose(table.loc[ablation, f"{name}_mean"], sum(values) / 3, rtol=1e-12)
-        np.testing.assert_allclose(table.loc[ablation, f"{name}_deviation"], np.std(values, ddof=1), atol=1e-12)
-    assert list(table.columns[:4]) == IDENTITY[1:]
-    assert set(table.columns[4:]) == {f"{name}_{kind}" for _, name in scores for kind in ("mean", "deviation")}
-    assert list(table.index) == ["m1", "no_skips", "full", "mean_image", "copy_reference"]
-    assert list(table.loc["full"][:3]) == [3, 40, 9]
-
-
 def test_the_same_image_is_called_so_as_in_the_terminal_and_in_the_tables_of_reports(sweep) -> None:
     for seed in range(2):
         path = sweep.scored(f"seed={seed}", psnr=20.0, full_reference_psnr=100.0) / "metrics.json"
@@ -73,36 +53,23 @@ def test_the_same_image_is_called_so_as_in_the_terminal_and_in_the_tables_of_rep
     assert read_back(sweep.folder).loc["copy_reference", "full_reference_psnr_mean"] == 100
 
 
-def test_one_seed_has_no_deviation_and_one_that_diverged_counts_in_the_mean(sweep) -> None:
-    sweep.scored("seed=0", psnr=20.0)
-    write_summary(sweep.folder)
-    table = read_back(sweep.folder)
-    assert table.loc["small", f"{PSNR}_mean"] == 20
-    assert table[f"{PSNR}_deviation"].isna().all()
-    sweep.scored("seed=1", psnr=math.nan)
-    write_summary(sweep.folder)
-    assert ",nan,nan" in (sweep.folder / "summary.csv").read_text()
-
-
-def test_a_score_that_one_seed_lacks_is_empty_in_its_row(sweep) -> None:
-    sweep.scored("ablation=m1", "seed=0", psnr=20.0, full_novel_lpips=0.5)
-    sweep.scored("ablation=m1", "seed=1", psnr=21.0)
+def test_one_seed_has_no_deviation_one_without_a_score_no_mean_and_one_that_diverged_counts_in_the_mean(sweep) -> None:
     sweep.scored("ablation=full", "seed=0", psnr=22.0, full_novel_lpips=0.25)
+    for seed, lpips in enumerate(({"full_novel_lpips": 0.5}, {})):
+        other = sweep.scored("ablation=m1", f"seed={seed}", psnr=20.0 + seed, **lpips) / "metrics.json"
+    other.write_text(other.read_text().replace("15.0", "17.0"))
     write_summary(sweep.folder)
     table = read_back(sweep.folder)
+    means = {"m1": 20.5, "full": 22.0, "mean_image": (15 + 15 + 17) / 3, "copy_reference": 12.0}
+    assert table[f"{PSNR}_mean"].to_dict() == pytest.approx(means)
+    assert table[f"{PSNR}_deviation"].isna().tolist() == [False, True, True, True]
     assert table["full_novel_lpips_mean"].isna().tolist() == [True, False, True, True]
     assert table.loc["full", "full_novel_lpips_mean"] == 0.25
-    assert table.loc["m1", f"{PSNR}_mean"] == 20.5
-
-
-def test_naive_predictors_are_averaged(sweep) -> None:
-    sweep.scored("seed=0", psnr=20.0)
-    other = sweep.scored("seed=1", psnr=20.0) / "metrics.json"
-    other.write_text(other.read_text().replace("15.0", "17.0"))
-    rows = summarize(sweep.folder)[0]
-    assert [(row.seeds, row.steps, row.scenes, row.scores[PSNR]) for row in rows[1:]] == [
-        (None, None, 40, psnr) for psnr in (16, 12)
-    ]
+    naive = [(row.seeds, row.steps, row.scenes) for row in summarize(sweep.folder)[0][2:]]
+    assert naive == [(None, None, 40)] * 2
+    sweep.scored("ablation=m1", "seed=2", psnr=math.nan)
+    write_summary(sweep.folder)
+    assert ",nan,nan" in (sweep.folder / "summary.csv").read_text()
 
 
 def test_different_numbers_of_scenes_have_a_remark(sweep) -> None:
@@ -206,6 +173,17 @@ def test_all_files_have_means_deviations_marks_and_remarks(ablations) -> None:
         assert remark in markdown
         assert escape(remark) in tex
     assert any(SSIM_NOTE in remark for remark in table.remarks)
+    read = read_back(ablations.folder)
+    assert list(read.columns[:4]) == IDENTITY[1:]
+    names = (PSNR, "full_novel_ssim", "object_novel_psnr")
+    assert set(read.columns[4:]) == {f"{name}_{kind}" for name in names for kind in ("mean", "deviation")}
+    assert list(read.index) == ["m1", "no_skips", "full", "mean_image", "copy_reference"]
+    assert list(read.loc["full"][:3]) == [3, 40, 9]
+    for ablation, psnr in {"full": 22.0, "no_skips": 18.5, "m1": 20.0}.items():
+        means = [psnr + 0.5, 0.5 + psnr / 100, psnr - 1.5]
+        np.testing.assert_allclose(read.loc[ablation, [f"{name}_mean" for name in names]].tolist(), means, rtol=1e-12)
+        deviations = read.loc[ablation, [f"{name}_deviation" for name in names]].tolist()
+        np.testing.assert_allclose(deviations, [math.sqrt(0.4375), 0, math.sqrt(0.4375)], atol=1e-12)
 
 
 def test_a_sweep_without_finished_jobs_says_so(sweep) -> None:
@@ -235,12 +213,10 @@ def test_the_terminal_shows_the_headline_and_names_the_jobs_that_have_not_finish
 
 def test_jobs_in_nested_folders_are_found(sweep) -> None:
     """As `hydra.sweep.subdir='x/${seed}'` puts them."""
-    for seed in range(2):
-        sweep.scored(f"seed={seed}", psnr=20.0 + seed).rename(sweep.folder / f"moved={seed}")
-    sweep.add("seed=2").rename(sweep.folder / "moved=2")
     (sweep.folder / "x/y").mkdir(parents=True)
-    for name, place in (("moved=0", "x/0"), ("moved=1", "x/y/1"), ("moved=2", "x/2")):
-        (sweep.folder / name).rename(sweep.folder / place)
+    for seed, place in enumerate(("x/0", "x/y/1")):
+        sweep.scored(f"seed={seed}", psnr=20.0 + seed).rename(sweep.folder / place)
+    sweep.add("seed=2").rename(sweep.folder / "x/2")
     (sweep.folder / "silent/below").mkdir(parents=True)  # ended before it could write its record
     rows, _ = summarize(sweep.folder)
     assert (rows[0].seeds, rows[0].scores[PSNR]) == (2, 20.5)
@@ -316,20 +292,15 @@ def launched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., P
     return launch
 
 
-def test_the_summary_of_a_sweep_into_nested_folders_has_its_jobs(launched) -> None:
-    folder = launched("-m", "seed=0,2", "hydra.sweep.subdir=x/${seed}")
-    assert (folder / "x/2/metrics.json").is_file()
-    assert "2 of 2 jobs have finished." in (folder / "summary.md").read_text()
-
-
 def test_a_sweep_ends_with_its_table_and_a_single_run_has_none(launched, tmp_path, capsys) -> None:
     assert (launched("seed=1") / "metrics.json").is_file()
     assert list(tmp_path.rglob("summary.*")) == []
-    folder = launched("-m", "seed=0,2")
+    folder = launched("-m", "seed=0,2", "hydra.sweep.subdir=x/${seed}")
+    assert (folder / "x/2/metrics.json").is_file()
     printed = capsys.readouterr().out
     assert "21.00 ± 1.41" in printed
     assert "swept/summary.md" in printed
-    assert "of 2 jobs have finished." in (folder / "summary.md").read_text()
+    assert "2 of 2 jobs have finished." in (folder / "summary.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -354,13 +325,10 @@ def test_a_summary_that_cannot_be_written_is_logged_and_stops_nothing(launched, 
 
 @pytest.mark.processes
 def test_the_hook_is_loaded_without_the_heavy_libraries() -> None:
-    code = (
-        "import sys, completesplat.results.sweeps; "
-        "print(*sorted({'torch', 'pandas', 'numpy', 'rich', 'matplotlib'} & {n.split('.')[0] for n in sys.modules}))"
-    )
+    heavy = ["torch", "pandas", "numpy", "rich", "matplotlib"]
+    code = f"import sys, completesplat.results.sweeps; print(*(sys.modules.keys() & {heavy}))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.split() == []
+    assert (result.returncode, result.stdout.split()) == (0, []), result.stderr
 
 
 def test_jobs_on_several_machines_make_one_summary(sweep, tmp_path, command) -> None:
@@ -375,12 +343,11 @@ def test_jobs_on_several_machines_make_one_summary(sweep, tmp_path, command) -> 
     other.scored("ablation=m1", "seed=3", psnr=23.0)
     for record in other.folder.glob("*/run.json"):
         record.write_text(record.read_text().replace("/home/someone/data/set", "/scratch/data"))
-    done = command("report", "summary", f"sweeps=[{sweep.folder},{other.folder}]", "out=ALL")
-    assert done.status == 0, done.err
+    done = command.succeeds("report", "summary", f"sweeps=[{sweep.folder},{other.folder}]", "out=ALL")
     table = read_back(Path("ALL"))
     assert table.loc[["full", "m1"], "seeds"].tolist() == [3, 4]
     assert table.loc["full", f"{PSNR}_mean"] == 23.0
     assert "7 of 8 jobs have finished." in done.out
     assert sorted(path.name for path in Path("ALL").glob("summary.*")) == FILES
-    refused = command("report", "summary", f"sweeps=[{sweep.folder},nowhere]", "out=NONE")
-    assert (refused.status, refused.err) == (2, "error: sweeps=nowhere: no such folder\n")
+    refused = command.refuses("report", "summary", f"sweeps=[{sweep.folder},nowhere]", "out=NONE")
+    assert refused == "sweeps=nowhere: no such folder"

@@ -59,9 +59,7 @@ def test_what_does_not_fit_is_named_with_what_it_may_be(setting, value, message)
 def test_what_fits_is_accepted_and_what_lies_deeper_is_named_with_its_place():
     for other in ({}, {"workers": 0}, {"part": False}, {"share": 1}, {"by_name": {}}):
         check_settings(task, GOOD | other)
-    for wrong, place in (
-        ({"by_name": {"a": [1], "b": [0]}}, r"by_name\.b=\[0\]"),
-        ({"part": {"size": 0}}, "part.size=0"),
-    ):
+    deeper = {"by_name": {"a": [1], "b": [0]}}, {"part": {"size": 0}}
+    for wrong, place in zip(deeper, (r"by_name\.b=\[0\]", "part.size=0"), strict=True):
         with pytest.raises(CompleteSplatError, match=f"^{place}: must be at least 1"):
             check_settings(task, GOOD | wrong)

@@ -4,17 +4,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from scenes_for_training import scene_batch
 from support import tiny_generator
 
 from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.geometry.cameras import Cameras
 from completesplat.losses import WeightedSum
 from completesplat.losses.terms import MeanSquaredError
 from completesplat.rasterizers import Rendering
-from completesplat.scene import SceneBatch, Views
-from completesplat.studies.mode_benchmark import measure, predictors, usable
+from completesplat.scene import SceneBatch
+from completesplat.studies.mode_benchmark import measure, predictors, usable_scenes
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 
@@ -23,18 +24,13 @@ SIZE, MODES, SAMPLES = 32, 4, 8
 
 def hidden_scene(seed: int) -> HiddenModes:
     """Three targets, of which the last two show modes of random colours in a square."""
-    generator = torch.Generator().manual_seed(seed)
-    images = torch.rand(1, 4, 3, SIZE, SIZE, generator=generator)
-    cameras = Cameras(torch.eye(4).repeat(1, 4, 1, 1), pinhole(60, SIZE).repeat(1, 4, 1, 1), (SIZE, SIZE))
-    views = Views(images, cameras, torch.ones(1, 4, 1, SIZE, SIZE))
-    visible, frame = torch.ones(1, 1, SIZE, SIZE), torch.zeros(1, dtype=torch.int64)
-    depth_range = torch.tensor([[0.5, 4.0]])
-    scene = SceneBatch(views[:, 0], views[:, 1:], depth_range, visible, frame, (f"scene {seed}",))
+    scene = scene_batch(1, targets=3, seed=seed, size=SIZE)
+    images = scene.targets.images[0, 1:]
     region = torch.zeros(2, SIZE, SIZE, dtype=torch.bool)
     region[:, 4:9, 10:17] = True
-    colors = torch.rand(MODES, 1, 3, 1, 1, generator=generator)
-    truths = torch.where(region[:, None], colors, images[0, 2:])
-    images[0, 2:] = truths[1]
+    colors = torch.rand(MODES, 1, 3, 1, 1, generator=torch.Generator().manual_seed(seed + 2))
+    truths = torch.where(region[:, None], colors, images)
+    images[:] = truths[1]
     unseen = torch.zeros(3, SIZE, SIZE, dtype=torch.bool)
     unseen[1:] = region
     even = torch.full((MODES,), 1 / MODES)
@@ -88,7 +84,7 @@ def test_shares_are_of_all_scenes_with_the_same_probabilities():
 
 def test_the_figure_shows_the_class_of_each_sample():
     (row,) = measured([3, 0, 1, 1]).rows
-    assert [cell.label for cell in row] == ["scene 0", "a", "b (true)", "c", "d", "d", "a", "b"]
+    assert [cell.label for cell in row] == ["scene 0 0", "a", "b (true)", "c", "d", "d", "a", "b"]
     assert torch.equal(torch.stack([cell.image for cell in row[1:]]), SCENES[0].truths[[0, 1, 2, 3, 3, 0, 1], 0])
 
 
@@ -109,10 +105,10 @@ def test_scenes_of_no_use_are_counted():
             raise AssertionError("only single modes are wanted")
 
     scenes = Broken([SCENES[0], None, SCENES[1]])
-    assert usable(scenes, None) == (SCENES, ["bad: broken"])
-    assert usable(scenes, 1) == (SCENES[:1], [])
+    assert usable_scenes(scenes, None) == (SCENES, ["bad: broken"])
+    assert usable_scenes(scenes, 1) == (SCENES[:1], [])
     with pytest.raises(CompleteSplatError, match="no test scene can be used"):
-        usable(Broken(), None)
+        usable_scenes(Broken(), None)
 
 
 def flat(gaussians: Gaussians, cameras: Cameras) -> Rendering:

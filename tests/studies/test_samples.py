@@ -3,14 +3,13 @@
 import math
 
 import imageio.v3 as imageio
-import numpy as np
 import pytest
 import torch
 
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.metrics.images import PSNR_LIMIT, psnr
 from completesplat.studies.controls import PAPER, grid, plot_controls
-from completesplat.studies.samples import near, object_psnr
+from completesplat.studies.samples import near_reference, object_psnr
 
 
 def test_object_pixels_alone_count():
@@ -35,15 +34,7 @@ def test_near_is_an_angle_between_optical_axes():
         return Cameras(poses, pinhole(60, 8).repeat(len(degrees), 1, 1), (8, 8))
 
     targets = turned(10, 54, 56, 100, 190, 340, -30)
-    assert near(turned(10)[0], targets, 45).tolist() == [True, True, False, False, False, True, True]
-
-
-def read(path) -> np.ndarray:
-    return imageio.imread(path)[..., :3]
-
-
-def shows(image: np.ndarray, color: tuple[int, int, int]) -> bool:
-    return bool((image == color).all(-1).any())
+    assert near_reference(turned(10)[0], targets, 45).tolist() == [True, True, False, False, False, True, True]
 
 
 def test_the_papers_settings_are_always_in_the_grid_and_marked(tmp_path):
@@ -52,4 +43,5 @@ def test_the_papers_settings_are_always_in_the_grid_and_marked(tmp_path):
     row = {"skip_weight": 0.5, "guidance_weight": 0.5, "diversity": 0.1, "reference_psnr": 20.0}
     for paper in (True, False):
         plot_controls([row | {"paper": paper, "near_object_psnr": None}], tmp_path / "controls.png", "title")
-        assert shows(read(tmp_path / "controls.png"), (220, 20, 60)) == paper
+        crimson = (imageio.imread(tmp_path / "controls.png")[..., :3] == (220, 20, 60)).all(-1)
+        assert crimson.any() == paper

@@ -13,17 +13,13 @@ from completesplat.studies.statistics import MEASURES, plot_statistics, show_sta
 BLUE, ORANGE = (31, 119, 180), (255, 127, 14)
 
 
-def never_read(index):
-    raise AssertionError("statistics need no images")
-
-
 def only(*sequences):
     """The figures of a split."""
     return statistics({"a": sequences})["splits"]["a"]
 
 
 def test_an_orbit_has_the_figures_of_its_circle(orbit):
-    summary = only(orbit(24, radius=2.0, read=never_read))
+    summary = only(orbit(24, radius=2.0, read=lambda _: pytest.fail("statistics need no images")))
     assert (summary["sequences"], summary["frames"]) == (1, 24)
     assert summary["fov_degrees"]["median"] == pytest.approx(50, abs=1e-4)
     assert summary["path_extent"]["max"] == pytest.approx(4)

@@ -13,7 +13,7 @@ from support import SMALL, compose_config, round_gaussians
 
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
-from completesplat.gaussians import Gaussians, concatenate
+from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import pixel_rays
 from completesplat.metrics.images import PSNR_LIMIT
 from completesplat.metrics.scoring import diversity
@@ -40,7 +40,7 @@ def layer(scenes: SceneBatch, depth: float, opacity: float, colors: torch.Tensor
 
 def two_layers(scenes: SceneBatch) -> Gaussians:
     red, blue = (torch.eye(3)[channel, :, None, None].expand_as(scenes.reference.images) for channel in (0, 2))
-    return concatenate([layer(scenes, 1.0, 0.9, red), layer(scenes, 3.0, 0.9, blue)])
+    return merge_gaussians([layer(scenes, 1.0, 0.9, red), layer(scenes, 3.0, 0.9, blue)])
 
 
 def panels(gaussians: Gaussians, scenes: SceneBatch, background: float = 0.5) -> dict[str, torch.Tensor]:

@@ -12,11 +12,17 @@ from support import NETWORKS, compose_config
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from completesplat.commands.plan import counted, without_weights
+from completesplat.commands.plan import count_work, without_weights
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.optimization import constant
 from completesplat.training.stage import Stage
-from completesplat.training.step_counts import LiveMemory, StoreOnly, Unfilled, count_step, fake_tensors
+from completesplat.training.step_counts import (
+    LiveMemory,
+    MemoryOnlyRasterizer,
+    WithoutInitialWeights,
+    count_step,
+    fake_tensors,
+)
 from completesplat.training.steps import Training, synthetic_batch
 
 SIZE, BATCH = 16, 3
@@ -29,7 +35,7 @@ class TwoLayers(Stage):
     """3 -> 8 channels by 3 x 3, 8 -> 4 by 1 x 1."""
 
     def __init__(self) -> None:
-        super().__init__(StoreOnly(gpu=True), torch.optim.Adam, constant)
+        super().__init__(MemoryOnlyRasterizer(gpu=True), torch.optim.Adam, constant)
         self.layers = nn.Sequential(nn.Conv2d(3, 8, 3, padding=1), nn.Conv2d(8, 4, 1))
         self.frozen = nn.Linear(5, 1).requires_grad_(False)
 
@@ -72,7 +78,7 @@ def test_fake_tensors_free_what_real_ones_do() -> None:
 @pytest.mark.parametrize("experiment", ["paper_var_stage2", *SLOW])
 def test_a_step_of_the_papers_size_runs_and_takes_no_memory(experiment: str) -> None:
     config = compose_config("plan", f"experiment={experiment}")
-    counts = counted(config, config.data.batch_size)
+    counts = count_work(config, config.data.batch_size)
     assert counts.peak > 15e9
     assert counts.memory["optimizer"] == pytest.approx(2 * 4 * counts.trained, rel=1e-3)  # fused Adam
     assert counts.flops > 6 * 32 * 0.2e9
@@ -96,7 +102,7 @@ def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def on_gpu(config: DictConfig) -> Training:
-    with Unfilled(), torch.device("cuda"):
+    with WithoutInitialWeights(), torch.device("cuda"):
         return Training(instantiate(config.model, _convert_="all"), "bf16-mixed")
 
 
@@ -111,10 +117,10 @@ def test_a_forward_pass_on_a_gpu_finds_all_tensors_there_and_keeps_what_is_count
     experiment, *sizes = settings
     config = compose_config("plan", f"experiment={experiment}", *sizes)
     copied = without_weights(config)
-    copied.rasterizer = {"_target_": "completesplat.training.step_counts.StoreOnly", "gpu": True}
+    copied.rasterizer = {"_target_": "completesplat.training.step_counts.MemoryOnlyRasterizer", "gpu": True}
     batch, live = 4, LiveMemory()
     with sdpa_kernel(SDPBackend.MATH):
-        expected = counted(config, batch)
+        expected = count_work(config, batch)
         with fake_tensors(), live:
             training = on_gpu(copied)
             scenes = synthetic_batch(config.data.image_size, batch, config.data.targets).to("cuda")

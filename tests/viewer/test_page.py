@@ -13,11 +13,11 @@ import pytest
 import torch
 from PIL import Image
 from support import LIMIT, tiny_generator
-from viewer_scenes import balls_sample
+from viewer_scenes import SETTINGS, balls_sample
 
 from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.formats import write_splat
-from completesplat.export.images import to_bytes
+from completesplat.export.images import to_pixels
 from completesplat.export.mesh import Mesh
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -30,9 +30,6 @@ from completesplat.viewer.completion import Completion  # noqa: E402
 from completesplat.viewer.page import Page, Saver  # noqa: E402
 from completesplat.viewer.panel import SIDE_BY_SIDE, preview_of, thumbnail_row  # noqa: E402
 from completesplat.viewer.splat_view import SplatView  # noqa: E402
-
-SETTINGS = {"samples": 2, "skip_weight": 1.0, "guidance_weight": 0.0, "color_fits": 0, "steps": 2, "seed": 0}
-START = SETTINGS | {"remove_background": False}
 
 
 class Browser(viser.ClientHandle):
@@ -75,18 +72,19 @@ def page(server, tmp_path, monkeypatch):
 
 @pytest.fixture
 def completion(page, model):
-    return Completion(page, model, START)
+    return Completion(page, model, SETTINGS | {"remove_background": False})
 
 
-def press(button, browser: Browser) -> None:
-    for callback in button._impl.update_cb:
-        callback(viser.GuiEvent(client=browser, client_id=0, target=button))
-
-
-def finish(completion: Completion) -> list:
+def finish(page: Page) -> list:
     """Return the samples on the page when no job is left."""
-    assert completion.page.worker.wait(LIMIT)
-    return completion.page.view.samples
+    assert page.worker.wait(LIMIT)
+    return page.view.samples
+
+
+def press(page: Page, button, browser: Browser | None = None, wait: bool = True) -> list:
+    for callback in button._impl.update_cb:
+        callback(viser.GuiEvent(client=browser or Browser(), client_id=0, target=button))
+    return finish(page) if wait else []
 
 
 def png(width: int = 40, height: int = 40, mode: str = "RGB") -> bytes:
@@ -94,16 +92,10 @@ def png(width: int = 40, height: int = 40, mode: str = "RGB") -> bytes:
     return buffer.getvalue()
 
 
-def load(page: Page, name: str, content: bytes, browser=None) -> list:
+def load(page: Page, name: str = "photo.png", content: bytes | None = None, browser: Browser | None = None) -> list:
     """Upload a file, and return the samples on the page when no job is left."""
-    page.opening.upload._impl.value = SimpleNamespace(name=name, content=content)
-    press(page.opening.upload, browser or Browser())
-    assert page.worker.wait(LIMIT)
-    return page.view.samples
-
-
-def upload(completion: Completion, name: str = "photo.png", content: bytes | None = None, browser=None) -> list:
-    return load(completion.page, name, content or png(), browser)
+    page.opening.upload._impl.value = SimpleNamespace(name=name, content=content or png())
+    return press(page, page.opening.upload, browser)
 
 
 def nodes(page: Page) -> dict[str, object]:
@@ -129,7 +121,7 @@ def test_layers_are_switched_and_samples_chosen_and_placed(page):
 
 def test_keys_and_thumbnails_choose_a_sample(page):
     page.show([balls_sample()] * 3)
-    assert page.worker.wait(LIMIT)
+    finish(page)
     thumbnails = page.looking.thumbnails
     assert thumbnails.content.count("<img") == 3
     assert "key:'3'" in thumbnails.content
@@ -141,7 +133,7 @@ def test_keys_and_thumbnails_choose_a_sample(page):
     assert len({tuple(node.position) for node in nodes(page).values()}) == 3
     assert thumbnails.content != first  # none is marked
     page.show([balls_sample()])
-    assert page.worker.wait(LIMIT)
+    finish(page)
     assert thumbnails.content == ""
 
 
@@ -151,7 +143,7 @@ def test_a_thumbnail_is_the_view_of_the_reference_camera(page):
     image = page.saver.thumbnail(replace(sample, reference=wide), 48)
     assert image.shape == (32, 48, 3)
     rendering = ReferenceRasterizer()(sample.gaussians[None], sample.reference[None][None]).over(0.5)
-    ours = to_bytes(rendering[0, 0]).reshape(32, 2, 32, 2, 3).mean((1, 3))
+    ours = to_pixels(rendering[0, 0]).reshape(32, 2, 32, 2, 3).mean((1, 3))
     assert abs(image[:, :32] - ours).mean() < 6
 
 
@@ -170,17 +162,26 @@ def test_depth_replaces_colours_and_frusta_stand_at_the_cameras(page):
     assert page.view._frusta == []
 
 
+def titles(page: Page, monkeypatch) -> list[str]:
+    """What the title of the panel says from now on: all that a phone shows of its folded panel."""
+    said = []
+    monkeypatch.setattr(page.server.gui, "set_panel_label", said.append)
+    return said
+
+
 def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(completion, model, monkeypatch):
     monkeypatch.setattr("completesplat.viewer.completion.PAUSE", 0)
-    seen, show = [], completion.page.show
+    said, seen, show = titles(completion.page, monkeypatch), [], completion.page.show
     monkeypatch.setattr(completion.page, "show", lambda samples, text: seen.append(samples[0]) or show(samples, text))
-    samples = upload(completion)
+    samples = load(completion.page)
     for sample, expected in zip(samples, model(completion.photograph[1], **SETTINGS), strict=True):
         assert torch.equal(sample.gaussians.means, expected.means)
         assert torch.equal(sample.gaussians.scales, expected.scales)
     assert "photo.png" in completion.controls.preview.content
     assert completion.page.looking.chosen.options == ("sample 1", "sample 2", "all, side by side")
     assert [sample.finished for sample in seen] == [False, False, True]
+    assert said[0] == "completesplat: drawing from photo.png"
+    assert said[-1].startswith("completesplat: 2 drawn in ")
     assert not torch.equal(seen[0].gaussians.means, seen[-1].gaussians.means)
 
 
@@ -196,7 +197,7 @@ def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(comple
 )
 def test_other_files_are_refused_by_their_own_name(completion, name, content, message):
     browser, before = Browser(), completion.page.view.samples
-    assert upload(completion, name, content, browser) is before
+    assert load(completion.page, name, content, browser) is before
     assert len(browser.messages) == 1
     assert browser.messages[0].startswith(message)
 
@@ -209,27 +210,21 @@ def test_an_uploaded_scene_is_shown_from_the_front_with_switches_for_its_layers(
     assert torch.equal(sample.gaussians.means, scene.means)
     assert page.view.up.tolist() == [0, -1, 0]
     assert [box.visible for box in page.looking.layers] == [True] + [False] * 15
-    assert upload(completion)[0].settings["image"] == "photo.png"
+    assert load(completion.page)[0].settings["image"] == "photo.png"
     assert page.view.up.tolist() == completion.model.up.tolist()
 
 
-def test_an_upload_is_dropped_when_it_is_read_and_any_error_is_shown(page, monkeypatch):
+def test_an_upload_is_dropped_when_it_is_read_or_refused_and_any_error_is_shown(page, monkeypatch):
     browser = Browser()
-    load(page, "photo.png", png(), browser)
+    load(page, browser=browser)
+    without_weights = "photo.png: not .ply, .splat, .spz, .sog, .ksplat; images need completesplat view IMAGE"
+    assert browser.messages == [without_weights]
     assert page.opening.upload.value.content == b""
     said = titles(page, monkeypatch)
     monkeypatch.setattr(page, "open", lambda *_: 1 / 0)
     load(page, "a.ply", b"ply", browser)
     assert browser.messages[-1].startswith("ZeroDivisionError: ")
     assert said[-1] == "completesplat"  # no longer that it is reading
-
-
-def test_a_page_without_weights_takes_no_image(page):
-    browser = Browser()
-    load(page, "photo.png", png(), browser)
-    assert browser.messages == [
-        "photo.png: not .ply, .splat, .spz, .sog, .ksplat; images need completesplat view IMAGE"
-    ]
 
 
 def test_one_of_several_scenes_is_chosen(server, tmp_path):
@@ -239,77 +234,55 @@ def test_one_of_several_scenes_is_chosen(server, tmp_path):
         for i in range(count):
             write_ply(tmp_path / name / f"sample_{i:02}.ply", balls_sample().gaussians)
     view = SplatView(server, (0.0, -1.0, 0.0))
-    made = Page(
-        server, view, Saver(tmp_path, view, ReferenceRasterizer, 2, 0.5), {"a": tmp_path / "a", "b": tmp_path / "b"}
-    )
+    scenes = {"a": tmp_path / "a", "b": tmp_path / "b"}
+    made = Page(server, view, Saver(tmp_path, view, ReferenceRasterizer, 2, 0.5), scenes)
     made.saver.thumbnail = lambda *_: np.zeros((2, 2, 3), np.uint8)
     assert (made.opening.chosen.visible, made.opening.chosen.options) == (True, ("a", "b"))
     for name, count in (("b", 3), ("a", 2)):
         made.opening.chosen.value = name
-        assert made.worker.wait(LIMIT)
-        assert len(view.samples) == count
+        assert len(finish(made)) == count
     write_splat(tmp_path / "c.splat", balls_sample().gaussians)
     assert len(load(made, "c.splat", (tmp_path / "c.splat").read_bytes())) == 1
     assert made.opening.chosen.value == "loaded: c.splat"
     made.opening.chosen.value = "a"
-    assert made.worker.wait(LIMIT)
-    assert (len(view.samples), made.opening.chosen.options) == (2, ("a", "b"))
+    assert (len(finish(made)), made.opening.chosen.options) == (2, ("a", "b"))
     made.worker.close()
 
 
-def titles(page: Page, monkeypatch) -> list[str]:
-    """What the title of the panel says from now on."""
-    said = []
-    monkeypatch.setattr(page.server.gui, "set_panel_label", said.append)
-    return said
-
-
-def test_the_title_says_what_is_waited_for(completion, monkeypatch):
-    """A phone shows nothing else of its folded panel."""
-    said = titles(completion.page, monkeypatch)
-    completion.controls.forming.value = False
-    upload(completion)
-    assert said[0] == "completesplat: drawing from photo.png"
-    assert said[1].startswith("completesplat: 2 drawn in ")
-
-
 def test_a_slider_draws_anew_unless_drawing_is_off(completion):
-    before, controls = upload(completion)[0].gaussians.means, completion.controls
+    before, controls = load(completion.page)[0].gaussians.means, completion.controls
     controls.skip_weight.value = 0.25
-    sample = finish(completion)[0]
+    sample = finish(completion.page)[0]
     assert sample.settings["skip_weight"] == 0.25
     assert not torch.equal(sample.gaussians.means, before)
     controls.steps.value = 3  # moves on to a number that the sampler can make
-    assert controls.steps.value == finish(completion)[0].settings["steps"] == 2
-    before = finish(completion)
+    assert controls.steps.value == finish(completion.page)[0].settings["steps"] == 2
+    before = finish(completion.page)
     controls.live.value, controls.seed.value = False, 7
-    assert finish(completion) is before
-    press(controls.draw, Browser())
-    assert finish(completion)[0].settings["seed"] == 7
+    assert finish(completion.page) is before
+    assert press(completion.page, controls.draw)[0].settings["seed"] == 7
 
 
 def test_earlier_samples_can_stay(completion):
     completion.controls.live.value = False
-    upload(completion)
+    load(completion.page)
     completion.controls.keep.value = True
     completion.controls.samples.value = 3
     for seed in (1, 2):
         completion.controls.seed.value = seed
-        press(completion.controls.draw, Browser())
-        samples = finish(completion)
+        samples = press(completion.page, completion.controls.draw)
     assert [sample.settings["seed"] for sample in samples] == [0, 0, 1, 1, 1, 2, 2, 2]  # eight at most
-    press(completion.controls.draw, Browser())
-    assert [sample.settings["seed"] for sample in finish(completion)] == [1, 1, 2, 2, 2, 2, 2, 2]
+    samples = press(completion.page, completion.controls.draw)
+    assert [sample.settings["seed"] for sample in samples] == [1, 1, 2, 2, 2, 2, 2, 2]
 
 
 def test_a_refusal_goes_to_its_browser_and_changes_nothing(completion, monkeypatch):
     before, browser, other = completion.page.view.samples, Browser(), Browser()
     monkeypatch.setattr(completion.page.server, "get_clients", lambda: {0: browser, 1: other})
-    press(completion.controls.draw, browser)
-    assert upload(completion, "notes.txt", b"no image", browser) is before
+    press(completion.page, completion.controls.draw, browser)
+    assert load(completion.page, "notes.txt", b"no image", browser) is before
     completion.page.show([])
-    press(completion.page.saving.save, browser)
-    finish(completion)
+    press(completion.page, completion.page.saving.save, browser)
     for message, start in zip(browser.messages, ("load an", "notes.txt: not an", "there is nothing"), strict=True):
         assert message.startswith(start)
     assert other.messages == []
@@ -318,15 +291,15 @@ def test_a_refusal_goes_to_its_browser_and_changes_nothing(completion, monkeypat
 def test_the_page_answers_while_the_model_works(completion, model, monkeypatch):
     entered, release = threading.Event(), threading.Event()
     forward = model.denoiser.forward
-    upload(completion)
+    load(completion.page)
     monkeypatch.setattr(model.denoiser, "forward", lambda *a: (entered.set(), release.wait(LIMIT), forward(*a))[-1])
-    press(completion.controls.draw, Browser())
+    press(completion.page, completion.controls.draw, wait=False)
     assert entered.wait(LIMIT)
     completion.page.looking.layers[0].value = False
     assert not nodes(completion.page)["/sample_0/layer_0"].visible
     assert completion.controls.progress.visible
     release.set()
-    finish(completion)
+    finish(completion.page)
     assert not completion.controls.progress.visible
 
 
@@ -335,28 +308,24 @@ def test_a_fault_is_shown_and_the_page_goes_on(completion, model, monkeypatch, c
     with monkeypatch.context() as broken, caplog.at_level(logging.CRITICAL):
         broken.setattr(completion.page.server, "get_clients", lambda: {0: browser})
         broken.setattr(model, "forward", lambda *_, **__: 1 / 0)
-        upload(completion, browser=browser)
+        load(completion.page, browser=browser)
     assert browser.messages == ["ZeroDivisionError: division by zero"]
-    assert len(upload(completion)) == 2
+    assert len(load(completion.page)) == 2
 
 
-KINDS = [(kind, 2, f"sample_0{{}}.{kind}") for kind in ("ply", "sog")]
+FILES = {"ply": ["sample_00.ply", "sample_01.ply"], "sog": ["sample_00.sog", "sample_01.sog"]}
+FILES |= {"video": ["orbit_00.mp4", "orbit_01.mp4"], "html": ["page_00.html"]}
 
 
-@pytest.mark.parametrize(
-    ("kind", "count", "name"), [*KINDS, ("video", 2, "orbit_0{}.mp4"), ("html", 1, "page_0{}.html")]
-)
-def test_files_are_written_and_sent_to_their_browser(page, kind, count, name, tmp_path, monkeypatch):
-    browser = Browser()
-    monkeypatch.setenv(
-        "PATH", str(fake_converter.install(tmp_path / "bin", "splat-transform").parent), prepend=os.pathsep
-    )
+@pytest.mark.parametrize("kind", FILES)
+def test_files_are_written_and_sent_to_their_browser(page, kind, tmp_path, monkeypatch):
+    browser, converter = Browser(), fake_converter.install(tmp_path / "bin", "splat-transform")
+    monkeypatch.setenv("PATH", str(converter.parent), prepend=os.pathsep)
     page.show([balls_sample(), balls_sample()])
     page.looking.chosen.value = SIDE_BY_SIDE
     page.saving.kind.value = kind
-    press(page.saving.save, browser)
-    assert page.worker.wait(LIMIT)
-    assert sorted(browser.files) == [name.format(i) for i in range(count)]
+    press(page, page.saving.save, browser)
+    assert sorted(browser.files) == FILES[kind]
     assert browser.messages == [f"{', '.join(sorted(browser.files))} in {page.saver.folder}"]
     for file, content in browser.files.items():
         assert (page.saver.folder / file).read_bytes() == content
@@ -366,8 +335,7 @@ def test_saving_again_overwrites_nothing_and_takes_the_chosen_sample(page):
     page.show([balls_sample(), balls_sample()])
     page.looking.chosen.value = "sample 2"
     for _ in range(2):
-        press(page.saving.save, Browser())
-        assert page.worker.wait(LIMIT)
+        press(page, page.saving.save)
     assert sorted(path.name for path in page.saver.folder.iterdir()) == ["sample_00.ply", "sample_01.ply"]
 
 
@@ -402,14 +370,12 @@ def test_a_taken_port_leads_to_the_next_one(server):
     second.stop()
 
 
-def test_names_of_images_are_text_in_the_panels_html():
-    html = preview_of(np.zeros((2, 2, 3), np.uint8), "<img src=x onerror=alert(1)>")
+def test_names_of_images_are_text_in_the_panels_html_and_thumbnails_without_a_key_choose_nothing():
+    image = np.zeros((2, 2, 3), np.uint8)
+    html = preview_of(image, "<img src=x onerror=alert(1)>")
     assert html.count("<img") == 1
     assert "&lt;img src=x" in html
-
-
-def test_thumbnails_without_a_key_choose_nothing():
-    row = thumbnail_row([np.zeros((2, 2, 3), np.uint8)] * 11, chosen=None)
+    row = thumbnail_row([image] * 11, chosen=None)
     assert (row.count("<img"), row.count("onclick")) == (11, 9)
 
 
@@ -421,7 +387,7 @@ def test_the_object_is_cut_out_on_request(completion, model, monkeypatch):
         return read(self, file)
 
     monkeypatch.setattr(type(model), "read", reading)
-    upload(completion)
+    load(completion.page)
     completion.controls.remove_background.value = True
-    upload(completion)
+    load(completion.page)
     assert seen == [False, True]

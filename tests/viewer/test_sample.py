@@ -7,7 +7,7 @@ from viewer_scenes import balls, balls_sample, reference_camera
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.export.prediction import write_scene_json
-from completesplat.gaussians import concatenate
+from completesplat.gaussians import merge_gaussians
 from completesplat.geometry.cameras import project
 from completesplat.viewer.sample import UP, Sample, framing_camera, read_scene
 
@@ -65,7 +65,7 @@ def test_the_pivot_is_in_the_middle_of_the_image_despite_faint_gaussians():
     pivot, scene = balls_sample().pivot(), balls()
     assert pivot.tolist() == [0, 0, pytest.approx(4, abs=0.25)]  # within the red ball
     ghosts = replace(scene, means=scene.means + torch.tensor([0, 0, 20.0]), opacities=scene.opacities * 0.01)
-    among_them = Sample(concatenate([scene, ghosts]), 1, reference_camera()).pivot()
+    among_them = Sample(merge_gaussians([scene, ghosts]), 1, reference_camera()).pivot()
     assert among_them[2] == pytest.approx(pivot[2].item(), abs=0.05)
 
 

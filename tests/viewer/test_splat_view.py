@@ -7,7 +7,7 @@ import pytest
 import torch
 from viewer_scenes import balls, balls_sample
 
-from completesplat.gaussians import concatenate
+from completesplat.gaussians import merge_gaussians
 from completesplat.geometry.cameras import look_at
 from completesplat.viewer.splat_view import arrangement_of, depth_colored, to_splats
 
@@ -40,7 +40,7 @@ def test_side_by_side_samples_reach_no_further_than_to_the_middle_between_them()
     sample, wall = balls_sample(), balls()
     wall = replace(wall, means=wall.means * torch.tensor([30.0, 30, 1]))
     large = replace(wall[:4], means=sample.pivot().expand(4, 3), scales=torch.full((4, 3), 3.0))
-    scene = concatenate([sample.gaussians, wall, large])
+    scene = merge_gaussians([sample.gaussians, wall, large])
     both = arrangement_of([replace(sample, gaussians=scene)] * 2)
     part = both.beside(1, scene)
     assert part.count >= sample.gaussians.count - 60  # the yellow ball's far side is outside

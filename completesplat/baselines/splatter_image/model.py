@@ -30,7 +30,7 @@ from completesplat.files import SHORT, atomic_path, make_folder, printable, writ
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.scene_model import SceneModel
-from completesplat.settings.schema import Entries, Few, Natural, Range, Width, refused
+from completesplat.settings.schema import Entries, Few, Natural, Range, Width, violations
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.weights import RUN_WEIGHTS, from_hub, read_small
 from completesplat.weights.checkpoint_reading import mismatch, read_tensor_file
@@ -76,7 +76,7 @@ SECTIONS: dict[str, dict[str, object]] = {
 }
 
 
-class Published(NamedTuple):
+class PublishedCheckpoint(NamedTuple):
     """Checkpoint of published weights, and the sections `data` and `model` of its config."""
 
     weights: Path
@@ -84,7 +84,7 @@ class Published(NamedTuple):
     model: Mapping[str, Any]
 
 
-class Depths(NamedTuple):
+class DepthBounds(NamedTuple):
     """Depth range of the Gaussians along the optical axis: absolute, or relative to an object's distance."""
 
     near: float
@@ -104,7 +104,7 @@ class Depths(NamedTuple):
 class PublishedImage(SplatterImage):
     """Splatter Image with its own depth range."""
 
-    depths: Depths
+    depths: DepthBounds
 
     def gaussians(self, cameras: Cameras, depth_range: Float[Tensor, "*batch 2"]) -> Gaussians:
         """Return Gaussians like `SplatterImage.gaussians`, in the depth range of the weights."""
@@ -132,11 +132,11 @@ class PublishedSplatterImage(ReconstructionModel):
 
     def __init__(self, weights: str) -> None:
         super().__init__()
-        file, data, model = find(weights)
+        file, data, model = find_published(weights)
         self.file = file
         size = self.image_size = data["training_resolution"]
         self.background = float(data["white_background"])
-        self.depths = Depths(data["znear"], data["zfar"], data["origin_distances"])
+        self.depths = DepthBounds(data["znear"], data["zfar"], data["origin_distances"])
         if size % 8 or model["base_dim"] % 4:
             raise WeightsError(f"{file}: a size of {size}, {model['base_dim']} wide: neither fits the network")
         with torch.device("meta"):  # tensors have sizes but take no memory
@@ -194,7 +194,7 @@ class PublishedSplatterImage(ReconstructionModel):
         return None if abs(focal_length - 1) < TOLERANCE else float(2 * torch.atan(half / focal_length).rad2deg())
 
 
-class PublishedOneAnswer(SceneModel):
+class PublishedModel(SceneModel):
     """Published weights of Splatter Image, as `CompleteSplat.from_pretrained` and `predict` take them.
 
     Its field of view is that of the training images, or if these have different ones, that of a phone's main camera.
@@ -261,7 +261,7 @@ def is_published(weights: Path | str) -> bool:
     return str(weights).startswith(PREFIX) or path.suffix == ".pth" or (os.path.isdir(path) and bool(_models_in(path)))
 
 
-def find(weights: str) -> Published:
+def find_published(weights: str) -> PublishedCheckpoint:
     """Find the files of `weights`: `splatter_image:NAME` on the hub (downloaded once), or a local file or folder.
 
     Raises:
@@ -270,7 +270,7 @@ def find(weights: str) -> Published:
     published = weights.startswith(PREFIX)
     model = _download(weights.removeprefix(PREFIX)) if published else _local(Path(weights).expanduser())
     options = _read_config(_config_beside(model))
-    return Published(model, options["data"], options["model"])
+    return PublishedCheckpoint(model, options["data"], options["model"])
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
@@ -350,7 +350,7 @@ def _read_config(path: Path) -> dict[str, dict[str, Any]]:
         options = {"input_images": 1, **options} if isinstance(options, Mapping) else {}
         sections[section] = {name: options.get(name) for name in hints}
         for name, hint in hints.items():
-            for place, value, reason in refused(hint, sections[section][name]):
+            for place, value, reason in violations(hint, sections[section][name]):
                 message = f"{path}: {section}.{name}{place} is {printable(value, SHORT)}: {reason}"
                 raise WeightsError(f"{message}; only Splatter Image's weights for one image, as published, are read")
     if not sections["data"]["znear"] < sections["data"]["zfar"]:

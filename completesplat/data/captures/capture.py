@@ -20,15 +20,23 @@ from completesplat.data.images.files import (
     EIGHT_BIT_MODES,
     FORMATS,
     check_sums,
-    decode,
-    opened,
+    decode_image,
+    open_image,
     over_grey,
     refused_as_bad,
     stored_size,
-    upright,
+    turn_upright,
 )
-from completesplat.data.sequences import shortened
-from completesplat.data.validation import LARGEST, BadAnnotation, BadCamera, BadImage, TooFewFrames, at, require_file
+from completesplat.data.sequences import first_names
+from completesplat.data.validation import (
+    LARGEST,
+    BadAnnotation,
+    BadCamera,
+    BadImage,
+    TooFewFrames,
+    errors_at,
+    require_file,
+)
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.files import by_numbers
 from completesplat.geometry.cameras import Cameras
@@ -90,7 +98,7 @@ class CapturedFrame:
 
     def camera(self) -> Cameras:
         """Return the pinhole camera (float64) of the undistorted image; errors as in `undistorted_lens`."""
-        with at(self.image, frame=self.number):
+        with errors_at(self.image, frame=self.number):
             lens = undistorted_lens(self.lens)
         (fx, fy), (x, y) = lens.focal, lens.center
         intrinsics = torch.tensor([[fx, 0, x], [0, fy, y], [0, 0, 1]], dtype=torch.float64)
@@ -104,18 +112,18 @@ class CapturedFrame:
         Raises:
             DataError: a file is missing, unusable or of another aspect, or its EXIF orientation leaves two images.
         """
-        with at(self.image, frame=self.number):
+        with errors_at(self.image, frame=self.number):
             orientation, mask = self.check(), None
-            with refused_as_bad(str(self.image)), opened(self.image, FORMATS) as stored:
+            with refused_as_bad(str(self.image)), open_image(self.image, FORMATS) as stored:
                 check_sums(stored, self.image)
                 stored.load()
                 if stored.has_transparency_data and stored.mode in EIGHT_BIT_MODES:
-                    turned = upright(stored, orientation)
+                    turned = turn_upright(stored, orientation)
                     image, mask = over_grey(turned, 1.0), turned.convert("RGBA").getchannel("A")
             if mask is None:
-                image = decode(self.image, str(self.image), "RGB", self.lens.image_size, orientation is not None)
+                image = decode_image(self.image, str(self.image), "RGB", self.lens.image_size, orientation is not None)
             if self.mask is not None:
-                mask = decode(self.mask, str(self.mask), "L").resize(image.size, Image.Resampling.BILINEAR)
+                mask = decode_image(self.mask, str(self.mask), "L").resize(image.size, Image.Resampling.BILINEAR)
             image = undistort(image, self.lens)
             return image, Image.new("L", image.size, 255) if mask is None else undistort(mask, self.lens)
 
@@ -126,12 +134,12 @@ class CapturedFrame:
             The EXIF orientation by which the image is to be turned; None: its pixels stay as they are stored.
         """
         height, width = self.lens.image_size
-        with at(require_file(self.image), frame=self.number):
+        with errors_at(require_file(self.image), frame=self.number):
             if self.mask is not None and not _same_aspect(
                 size := stored_size(self.mask, str(self.mask)), (height, width)
             ):
                 raise BadImage(f"has {size[0]} x {size[1]} pixels, its image {height} x {width}", str(self.mask))
-            with refused_as_bad(str(self.image)), opened(self.image, FORMATS) as image:
+            with refused_as_bad(str(self.image)), open_image(self.image, FORMATS) as image:
                 orientation = read_exif(image).get(ORIENTATION)
                 as_stored, sideways = image.size == (width, height), orientation in SIDEWAYS
                 as_upright = image.size == (height, width) if sideways else as_stored
@@ -177,15 +185,15 @@ def warn_of_missing(path: Path, missing: Sequence[str], frames: int) -> None:
     """Name the images that the file at `path` lists, in `frames` frames, and that are not there."""
     if missing:
         counted = f"{len(missing)} of {frames} frames have no image and are left out"
-        logger.warning("%s: %s: %s", path, counted, shortened(missing))
+        logger.warning("%s: %s: %s", path, counted, first_names(missing))
 
 
-def fitted(frame: CapturedFrame) -> CapturedFrame:
+def fit_lens(frame: CapturedFrame) -> CapturedFrame:
     """Return the frame with the lens of its image, if that is smaller or larger (3DGS's data set) or to be turned.
 
     An image that has another aspect, or that cannot be read, is refused by `CapturedFrame.check` and `read`.
     """
-    with suppress(ImageError), opened(frame.image, FORMATS) as image:
+    with suppress(ImageError), open_image(frame.image, FORMATS) as image:
         for size in (image.size[::-1], image.size):
             if size == frame.lens.image_size:
                 break

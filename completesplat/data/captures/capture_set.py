@@ -14,7 +14,7 @@ from completesplat.data.validation import (
     BadAnnotation,
     MissingFile,
     SharedSequences,
-    at,
+    errors_at,
     field,
     read_json,
     require_file,
@@ -43,7 +43,7 @@ def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
     """
     content, splits = read_json(path), dict[str, list[str]]()
     owners: dict[str, str] = {}
-    with at(path):
+    with errors_at(path):
         for split in SPLITS:
             entries = field(content, split, list) if split in content else []
             members = set[str]()

@@ -11,15 +11,15 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fitted, in_order, warn_of_missing
+from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fit_lens, in_order, warn_of_missing
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
     MissingFile,
     UnreadableFile,
-    at,
+    errors_at,
     finite_array,
-    inside,
+    path_below,
     read_text,
     require_file,
 )
@@ -55,11 +55,11 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
     suffix, read = _form(model)
     files = tuple(require_file(model / f"{name}.{suffix}") for name in PARTS)
     lenses = dict(_parsed(_camera_of, read, files[0]))
-    with at(files[1]):
+    with errors_at(files[1]):
         posed = _parsed(partial(_frame_of, lenses=lenses, images=images, masks=masks), read, files[1])
         missing = sorted(str(frame.image.relative_to(images)) for frame in posed if not isfile(frame.image))
         warn_of_missing(files[1], missing, len(posed))
-        frames = in_order([fitted(frame) for frame in posed if isfile(frame.image)])
+        frames = in_order([fit_lens(frame) for frame in posed if isfile(frame.image)])
     points = np.array(_parsed(lambda row: [float(coordinate) for coordinate in row[1:4]], read, files[2]))
     return Capture(files, frames, points if len(points) else None)
 
@@ -85,7 +85,7 @@ def _form(model: Path) -> tuple[str, Callable[[Path], Iterator[Row]]]:
 
 def _parsed(parse: Callable[[Row], T], read: Callable[[Path], Iterator[Row]], path: Path) -> list[T]:
     try:
-        with at(path):
+        with errors_at(path):
             return [parse(row) for row in read(path)]
     except (struct.error, ValueError, IndexError, OverflowError):
         raise UnreadableFile("cut off, or not COLMAP's", str(path)) from None
@@ -108,7 +108,7 @@ def _camera_of(row: Row) -> tuple[int, Lens]:
 def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | None) -> CapturedFrame:
     """Return an image with its camera; a row has number, pose (qw, qx, qy, qz, tx, ty, tz), camera and name."""
     number, camera, name = int(row[0]), int(row[8]), str(row[9])
-    with at(frame=number):
+    with errors_at(frame=number):
         if camera not in lenses:
             raise BadAnnotation(f"no camera {camera}")
         pose = finite_array([float(value) for value in row[1:8]], (7,), "the pose")
@@ -117,13 +117,13 @@ def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | 
         world_to_camera = np.eye(4)
         world_to_camera[:3, :3] = quaternion_to_matrix(torch.from_numpy(pose[:4])).numpy()
         world_to_camera[:3, 3] = pose[4:]
-        image = inside(images, name)
+        image = path_below(images, name)
         mask = None if masks is None or not isfile(image) else _find_mask(masks, name)
         return CapturedFrame(number, image, mask, lenses[camera], world_to_camera, "ignored")
 
 
 def _find_mask(masks: Path, name: str) -> Path:
-    appended, replaced = (inside(masks, file) for file in (f"{name}.png", str(Path(name).with_suffix(".png"))))
+    appended, replaced = (path_below(masks, file) for file in (f"{name}.png", str(Path(name).with_suffix(".png"))))
     # `Path.is_file` raises if a name is too long.
     if not (isfile(appended) or isfile(replaced)):
         raise MissingFile(f"no such file, nor {replaced.name}", str(appended))

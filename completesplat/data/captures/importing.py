@@ -21,13 +21,13 @@ from completesplat.data.images.files import (
     MOST_PIXELS,
     check_sums,
     image_files,
-    opened,
+    open_image,
     photo_formats,
     refused_as_bad,
     save_image,
     stored_size,
 )
-from completesplat.data.sequences import shortened
+from completesplat.data.sequences import first_names
 from completesplat.data.validation import refused_to
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder, folder_names
@@ -108,7 +108,7 @@ def _copy_photos(folder: Path, images: Path) -> None:
     stems = folder_names("_".join(path.stem.split()) for path in photos)
     for photo, stem in track(list(zip(photos, stems, strict=True)), "photos"):
         with refused_to(leave_out), refused_as_bad(str(photo)):
-            with opened(photo, formats) as image:
+            with open_image(photo, formats) as image:
                 check_sums(image, photo)
                 upright = ImageOps.exif_transpose(image)
             options = {"quality": 95, "subsampling": 0, "exif": upright.info.get("exif", b"")}
@@ -128,7 +128,7 @@ def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
     files = {path for searched in folders for path in searched.glob("[!.]*") if path.is_file()}
     if others := sorted({path.name for path in files.difference(photos)}):
         advice = "" if "HEIF" in formats else '; HEIC needs: pip install "completesplat[heic]"'
-        logger.warning("left out: %d files of other formats: %s%s", len(others), shortened(others), advice)
+        logger.warning("left out: %d files of other formats: %s%s", len(others), first_names(others), advice)
     return photos
 
 

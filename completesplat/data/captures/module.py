@@ -28,7 +28,7 @@ from completesplat.data.placement import (
     upright_axes,
 )
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import MissingFile, at, refused_to
+from completesplat.data.validation import MissingFile, errors_at, refused_to
 from completesplat.errors import DataError
 from completesplat.settings.schema import Range
 
@@ -92,7 +92,7 @@ def read_captures(folders: Mapping[str, Path]) -> tuple[dict[str, Capture], list
     """Read the captures in some of the folders, by name; return also the errors of those that cannot be read."""
     captures, refused = dict[str, Capture](), list[DataError]()
     for name, folder in folders.items():
-        with refused_to(refused.append), at(sequence=name):
+        with refused_to(refused.append), errors_at(sequence=name):
             capture = read_capture(folder)
             if capture is not None:
                 captures[name] = capture
@@ -133,13 +133,13 @@ class CaptureSource(SequenceSource):
     def read(self, name: str) -> PosedSequence:
         """Return one capture; its cameras are computed at the first call."""
         if name not in self._sequences:
-            with at(self._captures[name].files[0], name):
+            with errors_at(self._captures[name].files[0], name):
                 self._sequences[name] = self._make(name)
         return self._sequences[name]
 
     def check(self, name: str) -> None:
         """Check the headers of all images of a capture, or raise a DataError."""
-        with at(sequence=name):
+        with errors_at(sequence=name):
             for frame in self._captures[name].frames:
                 frame.check()
 
@@ -175,7 +175,7 @@ class CaptureSource(SequenceSource):
 
 
 def _read(name: str, frames: list[CapturedFrame], size: int, index: int) -> MaskedImage:
-    with at(sequence=name):
+    with errors_at(sequence=name):
         image, mask = frames[index].read()
         square = square_of(frames[index].camera())
         return MaskedImage(cut_square(image, square, size), cut_square(mask, square, size))

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fitted, in_order, warn_of_missing
+from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fit_lens, in_order, warn_of_missing
 from completesplat.data.images.exif import ORIENTATION, read_exif
 from completesplat.data.images.files import stored_size
 from completesplat.data.images.photograph import read_photograph
@@ -20,10 +20,10 @@ from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
     TooFewFrames,
-    at,
+    errors_at,
     field,
     finite_array,
-    inside,
+    path_below,
     read_json,
     read_points,
     require_file,
@@ -39,7 +39,7 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 RADIAL = {"SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2")}
 USED = {"SIMPLE_PINHOLE": (), "PINHOLE": (), **RADIAL, "OPENCV": COEFFICIENTS}
 OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
-Entry = Mapping[str, object]
+JsonObject = Mapping[str, object]
 FEWEST_CAMERAS = 2
 SAME_FOCAL = 1e-3
 POLYCAM = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
@@ -64,11 +64,11 @@ def read_transforms(path: Path) -> Capture:
     """
     content = read_json(path, allow_nan=True)  # NaN is refused later, with the number of its frame.
     frames = _read_frames(path, content)
-    with at(path):
+    with errors_at(path):
         ordered = in_order(frames)
         if content.get("ply_file_path") is None:
             return Capture((path,), ordered, None)
-        cloud = inside(path.parent, field(content, "ply_file_path", str))
+        cloud = path_below(path.parent, field(content, "ply_file_path", str))
         points = read_points(cloud)
     return Capture((path, cloud), ordered, points if len(points) else None)
 
@@ -85,7 +85,7 @@ def read_polycam(keyframes: Path) -> Capture:
     files, entries = sorted((keyframes / f"{kind}cameras").glob("*.json")), []
     for file in files:
         camera = read_json(file, allow_nan=True)
-        with at(file):
+        with errors_at(file):
             rows = [[field(camera, f"t_{row}{column}", float) for column in range(4)] for row in range(3)]
         values = {name: camera.get(key) for name, key in POLYCAM.items()}
         entries.append({**values, "file_path": f"{kind}images/{file.stem}", "transform_matrix": [*rows, [0, 0, 0, 1]]})
@@ -130,9 +130,9 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
         DataError: as in `read_transforms`; or the lens distorts, its focal lengths differ, or `fl_x` is without a size.
     """
     content, cameras = read_json(path), []
-    with at(path):
+    with errors_at(path):
         for number, entry in enumerate(field(content, "frames", list)):
-            with at(frame=number):
+            with errors_at(frame=number):
                 if type(entry) is not dict:
                     raise BadAnnotation("must be an object with transform_matrix")
                 values = {**content, **entry}
@@ -155,23 +155,23 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
 def _read_frames(path: Path, content: Any) -> list[CapturedFrame]:
     """Return all frames of a file's content that have images."""
     root, frames, missing = path.parent, [], []
-    with at(path):
+    with errors_at(path):
         entries = field(content, "frames", list)
         for number, entry in enumerate(entries):
-            with at(frame=number):
+            with errors_at(frame=number):
                 name = field(entry, "file_path", str)
-                # `inside` resolves links, which takes long for many missing images.
+                # `path_below` resolves links, which takes long for many missing images.
                 suffix = next((suffix for suffix in SUFFIXES if isfile(root / (name + suffix))), None)
-                image = inside(root, name + (suffix or ""))
+                image = path_below(root, name + (suffix or ""))
                 if suffix is None:
                     missing.append(name)
                     continue
                 masked = entry.get("mask_path") is not None
-                mask = require_file(inside(root, field(entry, "mask_path", str))) if masked else None
+                mask = require_file(path_below(root, field(entry, "mask_path", str))) if masked else None
                 values, pose = {**content, **entry}, _read_pose(entry.get("transform_matrix"))
                 frame = CapturedFrame(number, image, mask, _read_lens(values, image), pose)
                 sized = {"w", "h"} <= values.keys()
-                frames.append(fitted(frame) if sized else replace(frame, orientation="unknown"))
+                frames.append(fit_lens(frame) if sized else replace(frame, orientation="unknown"))
     warn_of_missing(path, missing, len(entries))
     return frames
 
@@ -190,7 +190,7 @@ def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
     return world_to_camera
 
 
-def _read_lens(values: Entry, image: Path) -> Lens:
+def _read_lens(values: JsonObject, image: Path) -> Lens:
     model = values.get("camera_model", "OPENCV")
     others = [key for key in OTHER_LENSES if values.get(key)]
     if not isinstance(model, str) or model not in USED or others:

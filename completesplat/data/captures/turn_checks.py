@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from completesplat.data.images.files import save_image, to_bytes
+from completesplat.data.images.files import save_image, to_uint8
 from completesplat.errors import DataError
 from completesplat.files import printable
 from completesplat.geometry.cameras import Cameras, crop_resize, project
@@ -123,5 +123,5 @@ def write_sheet(turns: Mapping[str, Turn], path: Path) -> None:
         left, top = index // rows * width, index % rows * height
         draw.text((left, top), printable(f"{name}  {turn.overlap:.2f}"), "black", font)
         strip = np.concatenate(list(turn.tiles.numpy()), axis=-1).transpose(1, 2, 0)
-        sheet.paste(Image.fromarray(to_bytes(strip)), (left, top + LABEL))
+        sheet.paste(Image.fromarray(to_uint8(strip)), (left, top + LABEL))
     save_image(sheet, path)

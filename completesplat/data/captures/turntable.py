@@ -26,7 +26,7 @@ from completesplat.data.images.files import (
     EIGHT_BIT_MODES,
     check_sums,
     image_files,
-    opened,
+    open_image,
     over_grey,
     photo_formats,
     refused_as_bad,
@@ -38,7 +38,7 @@ from completesplat.data.validation import (
     BadImage,
     MissingFile,
     TooFewFrames,
-    at,
+    errors_at,
     field,
     read_json,
     refused_to,
@@ -111,7 +111,7 @@ def _write_turns(folders: Mapping[str, Path], out: Path, settings: TurntableSett
     counts = read_json(Path(count)) if isinstance(count, str) else dict.fromkeys(folders, count)
     turns, refused = dict[str, Turn](), list[DataError]()
     for name, photos in track(folders.items(), "turns"):
-        with refused_to(refused.append), at(sequence=name):
+        with refused_to(refused.append), errors_at(sequence=name):
             known = None if count is None else field(counts, name, int)
             turns[name] = _write_turn(photos, known, out / name, settings)
     if not turns:
@@ -207,7 +207,7 @@ def _numbered(paths: Sequence[Path], count: int) -> dict[int, Path]:
 def _read_photo(path: Path, background: str | None) -> Photo:
     """Read a photo, upright and at most 512 pixels wide and high, and find its object."""
     with refused_as_bad(str(path)):
-        with opened(path, photo_formats()) as stored:
+        with open_image(path, photo_formats()) as stored:
             if stored.mode not in EIGHT_BIT_MODES:
                 raise ImageError(f"colour mode {stored.mode} is not supported")
             check_sums(stored, path)

@@ -15,10 +15,10 @@ from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
     Refuse,
-    at,
+    errors_at,
     field,
     finite_array,
-    inside,
+    path_below,
     read_json,
     refused_to,
     require_rotation,
@@ -27,7 +27,7 @@ from completesplat.geometry.cameras import Cameras
 
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up), and back.
 FLIP = np.diag([-1.0, -1.0, 1.0])
-Entry = Mapping[str, object]
+JsonObject = Mapping[str, object]
 VIEWPOINT_SHAPES = {"R": (3, 3), "T": (3,), "focal_length": (2,), "principal_point": (2,)}
 
 
@@ -69,7 +69,7 @@ def read_videos(root: Path, path: Path, refuse: Refuse) -> dict[str, CO3DVideo]:
     """
     videos: dict[str, CO3DVideo] = {}
     for name, entry in _entries(path, refuse):
-        with refused_to(refuse), at(path, name):
+        with refused_to(refuse), errors_at(path, name):
             if name in videos:
                 raise BadAnnotation("the sequence is annotated twice")
             quality = _optional_number(entry, "viewpoint_quality_score")
@@ -77,12 +77,12 @@ def read_videos(root: Path, path: Path, refuse: Refuse) -> dict[str, CO3DVideo]:
                 videos[name] = CO3DVideo(None, None, quality)
                 continue
             cloud = field(entry, "point_cloud", dict)
-            path_of_cloud = inside(root, field(cloud, "path", str))
+            path_of_cloud = path_below(root, field(cloud, "path", str))
             videos[name] = CO3DVideo(path_of_cloud, _optional_number(cloud, "quality_score"), quality)
     return videos
 
 
-def _optional_number(entry: Entry, key: str) -> float | None:
+def _optional_number(entry: JsonObject, key: str) -> float | None:
     value = entry.get(key)
     # CO3D's annotations have NaN for scores that could not be computed.
     if value is None or (isinstance(value, float) and math.isnan(value)):
@@ -94,17 +94,17 @@ def read_frames(root: Path, path: Path, wanted: Callable[[str, int], bool], refu
     """Read those frames in `frame_annotations.jgz` that are `wanted`, by sequence and number; see `read_videos`."""
     frames: Frames = {}
     for name, entry in _entries(path, refuse):
-        with refused_to(refuse), at(path, name):
+        with refused_to(refuse), errors_at(path, name):
             number = field(entry, "frame_number", int)
             if wanted(name, number):
-                with at(frame=number):
+                with errors_at(frame=number):
                     if number in frames.get(name, ()):
                         raise BadAnnotation("the frame is annotated twice")
                     frames.setdefault(name, {})[number] = _frame(root, number, entry)
     return frames
 
 
-def _entries(path: Path, refuse: Refuse) -> Iterator[tuple[str, Entry]]:
+def _entries(path: Path, refuse: Refuse) -> Iterator[tuple[str, JsonObject]]:
     """Yield the names of sequences and the entries of a file; pass the errors of entries without a name to `refuse`."""
     # CO3D was written by Python's `json`, which writes NaN; every number is checked before use.
     content = read_json(path, allow_nan=True)
@@ -119,23 +119,23 @@ def _entries(path: Path, refuse: Refuse) -> Iterator[tuple[str, Entry]]:
         yield name, entry
 
 
-def _frame(root: Path, number: int, entry: Entry) -> CO3DFrame:
+def _frame(root: Path, number: int, entry: JsonObject) -> CO3DFrame:
     image, mask, depth = field(entry, "image", dict), field(entry, "mask", dict), None
     size = field(image, "size", list)
     if [type(side) for side in size] != [int, int] or not 0 < min(size) <= max(size) <= MOST_PIXELS:
         expected = f"two positive integers of at most {MOST_PIXELS:,}"
         raise BadAnnotation(f"the image's size must be {expected}, not {str(size)[:80]}")
     camera = camera_from_viewpoint(field(entry, "viewpoint", dict), size)
-    image_path, mask_path = (inside(root, field(part, "path", str)) for part in (image, mask))
+    image_path, mask_path = (path_below(root, field(part, "path", str)) for part in (image, mask))
     if entry.get("depth") is not None:
         stored = field(entry, "depth", dict)
         # Some writers write whole numbers as integers.
         scale = float(finite_array(stored.get("scale_adjustment"), (), "scale_adjustment"))
-        depth = DepthMap(inside(root, field(stored, "path", str)), scale)
+        depth = DepthMap(path_below(root, field(stored, "path", str)), scale)
     return CO3DFrame(number, image_path, mask_path, depth, camera)
 
 
-def camera_from_viewpoint(viewpoint: Entry, image_size: Sequence[int]) -> Cameras:
+def camera_from_viewpoint(viewpoint: JsonObject, image_size: Sequence[int]) -> Cameras:
     """Convert a PyTorch3D viewpoint to an OpenCV camera (float64, no batch axis) for an image of (height, width).
 
     In PyTorch3D, X_cam = X_world R + T with row vectors, +x is left and +y is up. Image coordinates start at the image

@@ -14,7 +14,7 @@ from torch import Tensor
 from completesplat.data.co3d.annotations import CO3DFrame
 from completesplat.data.co3d.splits import SplitMembers
 from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.files import decode, read_depth
+from completesplat.data.images.files import decode_image, read_depth
 from completesplat.data.placement import (
     OBJECT_HALF_SIZE,
     Axes,
@@ -27,7 +27,7 @@ from completesplat.data.placement import (
     upright_axes,
 )
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import BadImage, at, read_points
+from completesplat.data.validation import BadImage, errors_at, read_points
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import pixel_centers, unproject
 
@@ -47,7 +47,7 @@ def square_depth(frame: CO3DFrame, square: Square, size: int, factor: float) -> 
     """
     if frame.depth is None:
         return torch.zeros(1, size, size)
-    with at(frame=frame.number):
+    with errors_at(frame=frame.number):
         depth = read_depth(frame.depth.path, frame.depth.scale_adjustment)[0]
     places = []
     for count, side, start in zip(depth.shape, frame.camera.image_size, (square.top, square.left), strict=True):
@@ -68,7 +68,7 @@ def object_placement(point_cloud: Path | None, frames: Sequence[CO3DFrame], capt
     """
     axes = upright_axes([frame.camera for frame in captured])
     if point_cloud is not None:
-        with at(point_cloud):
+        with errors_at(point_cloud):
             return from_points(read_points(point_cloud), axes, "the point cloud")
     with_depth = [frame for frame in frames if frame.depth is not None]
     return from_depth_maps(with_depth, axes) if with_depth else from_cameras([frame.camera for frame in frames])
@@ -81,7 +81,7 @@ def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
     """
     count, points = min(len(frames), DEPTH_MAPS), []
     for frame in (frames[i * len(frames) // count] for i in range(count)):
-        with at(frame=frame.number):
+        with errors_at(frame=frame.number):
             points.append(_foreground(frame))
     return from_points(np.concatenate(points), axes, "the depth maps' foreground", DEPTH_QUANTILE)
 
@@ -90,7 +90,7 @@ def _foreground(frame: CO3DFrame) -> np.ndarray:
     """Return the world points [n 3] of a depth map's foreground; the map may be smaller than the image."""
     assert frame.depth is not None
     depth = read_depth(frame.depth.path, frame.depth.scale_adjustment)[0]
-    mask = decode(frame.mask, str(frame.mask), "L", frame.camera.image_size)
+    mask = decode_image(frame.mask, str(frame.mask), "L", frame.camera.image_size)
     height, width = depth.shape
     known = (depth > 0) & torch.from_numpy(np.asarray(mask.resize((width, height))) >= FOREGROUND)
     ratio = torch.tensor([frame.camera.image_size[1] / width, frame.camera.image_size[0] / height]).double()
@@ -128,7 +128,7 @@ class CO3DSource(SequenceSource):
     def read(self, name: str) -> PosedSequence:
         """Return one sequence; its cameras are computed at the first call."""
         if name not in self._sequences:
-            with at(sequence=name):
+            with errors_at(sequence=name):
                 self._sequences[name] = self._make(name)
         return self._sequences[name]
 
@@ -137,7 +137,7 @@ class CO3DSource(SequenceSource):
         frames = members.frames[name]
         placement = object_placement(members.point_clouds[name], frames, members.captured[name])
         numbers, cameras = [frame.number for frame in frames], [frame.camera for frame in frames]
-        with at(self._files[0]):
+        with errors_at(self._files[0]):
             read = partial(_read, name, frames, size)
             sequence = placed_sequence(name, numbers, cameras, placement, self.framing, read)
         if not any(frame.depth for frame in frames):
@@ -149,9 +149,9 @@ class CO3DSource(SequenceSource):
 def _read(name: str, frames: list[CO3DFrame], size: int, index: int) -> MaskedImage:
     frame = frames[index]
     square, image_size = square_of(frame.camera), frame.camera.image_size
-    with at(sequence=name, frame=frame.number):
-        image = decode(frame.image, str(frame.image), "RGB", image_size)
-        mask = decode(frame.mask, str(frame.mask), "L", image_size)
+    with errors_at(sequence=name, frame=frame.number):
+        image = decode_image(frame.image, str(frame.image), "RGB", image_size)
+        mask = decode_image(frame.mask, str(frame.mask), "L", image_size)
         # CO3D's loader leaves out empty masks, too (`json_index_dataset.py`, `remove_empty_masks`).
         for path, part, fault in ((frame.image, image, "is black everywhere"), (frame.mask, mask, "shows no object")):
             if part.getbbox() is None:
@@ -160,5 +160,5 @@ def _read(name: str, frames: list[CO3DFrame], size: int, index: int) -> MaskedIm
 
 
 def _read_depth(name: str, frames: list[CO3DFrame], size: int, factor: float, index: int) -> Float[Tensor, "1 _ _"]:
-    with at(sequence=name):
+    with errors_at(sequence=name):
         return square_depth(frames[index], square_of(frames[index].camera), size, factor)

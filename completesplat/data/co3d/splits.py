@@ -13,9 +13,9 @@ from completesplat.data.validation import (
     BadAnnotation,
     Refuse,
     SharedSequences,
-    at,
+    errors_at,
     field,
-    inside,
+    path_below,
     read_json,
     refused_to,
 )
@@ -61,18 +61,18 @@ def read_set_list(path: Path, refuse: Refuse) -> Listed:
     content = read_json(path)
     splits: Listed = {}
     for split in SPLITS:
-        with at(path):
+        with errors_at(path):
             members = field(content, split, list)
         splits[split] = set()
         for member in members:
-            with refused_to(refuse), at(path):
+            with refused_to(refuse), errors_at(path):
                 if type(member) is not list or [type(part) for part in member[:2]] != [str, int]:
                     raise BadAnnotation(f"{split} has {str(member)[:80]}, [sequence name, number, path] is expected")
                 splits[split].add((member[0], member[1]))
     return splits
 
 
-def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, list[str]]:
+def remove_test_sequences(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, list[str]]:
     """Return a set list whose splits share no sequence, and the names removed from validation.
 
     CO3D's `fewview_train` tests on all its training sequences (facebookresearch/co3d, issue 49); Splatter Image uses
@@ -162,13 +162,13 @@ def read_category(
 ) -> Category:
     """Read a category, split by the set list `subset`, or by seed if there is none.
 
-    Annotations of frames that the set list does not name are ignored. `allow_shared` skips `kept_apart`.
+    Annotations of frames that the set list does not name are ignored. `allow_shared` skips `remove_test_sequences`.
 
     Raises:
         DataError: the category, its annotations or its set list is missing, unreadable as a whole, or not below
             `root`; or a test sequence is in another split too.
     """
-    folder = inside(root, category)
+    folder = path_below(root, category)
     if not os.path.isdir(folder):
         raise DataError("no such CO3D category", str(folder))
     frames_file, videos_file = folder / "frame_annotations.jgz", folder / "sequence_annotations.jgz"
@@ -176,7 +176,7 @@ def read_category(
     refuse: Refuse = refused.append
     listed, lost = read_set_list(set_list, refuse) if set_list else None, list[str]()
     if set_list and listed is not None and not allow_shared:
-        listed, lost = kept_apart(set_list, listed, seeded)
+        listed, lost = remove_test_sequences(set_list, listed, seeded)
     wanted = set().union(*listed.values()) if listed is not None else None
     videos = read_videos(root, videos_file, refuse)
     frames = read_frames(root, frames_file, lambda *key: wanted is None or key in wanted, refuse)

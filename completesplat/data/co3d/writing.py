@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from completesplat.data.images.files import save_image, save_jpeg, to_bytes
+from completesplat.data.images.files import save_image, save_jpeg, to_uint8
 from completesplat.errors import DataError
 from completesplat.files import write_bytes, write_text
-from completesplat.ply_files import TYPES, header
+from completesplat.ply_files import TYPES, vertex_header
 
 FRAMES_PER_SECOND = 10.0
 FOLDERS = ("images", "masks", "depths", "depth_masks")
@@ -46,7 +46,7 @@ def write_frame(
         "depth": f"depths/{stem}.jpg.geometric.png",
         "depth_mask": f"depth_masks/{stem}.png",
     }
-    mask = to_bytes(coverage)
+    mask = to_uint8(coverage)
     save_jpeg(image, folder / files["image"])
     save_image(Image.fromarray(mask), folder / files["mask"])
     # CO3D stores depth as a 16-bit image whose bits are float16, in units of `scale_adjustment`.
@@ -76,7 +76,7 @@ def write_points(path: Path, points: Float[np.ndarray, "n 3"], colors: UInt8[np.
     properties = [(axis, "float") for axis in "xyz"] + [(channel, "uchar") for channel in ("red", "green", "blue")]
     types = [(name, f"<{TYPES[kind]}") for name, kind in properties]
     vertices = np.rec.fromarrays([*points.T, *colors.T], dtype=types)
-    path.write_bytes(header(len(vertices), properties) + vertices.tobytes())
+    path.write_bytes(vertex_header(len(vertices), properties) + vertices.tobytes())
 
 
 def write_annotations(category: Path, frames: Sequence[Annotation], sequences: Sequence[Annotation]) -> None:

@@ -28,7 +28,7 @@ TRANSPARENT = "has transparent pixels; lay it over a background first"
 LARGEST_SCALE = 2.0**112  # its product with the largest float16 still fits into float32
 
 
-def decode(
+def decode_image(
     source: Path | bytes,
     file: str,
     mode: Literal["RGB", "L"],
@@ -54,15 +54,16 @@ def decode(
             has pixels whose meaning in this mode is unclear.
     """
     with _loaded(source, file, FORMATS) as (stored, exif):
-        image = upright(stored, exif.get(ORIENTATION) if turn else None)
+        image = turn_upright(stored, exif.get(ORIENTATION) if turn else None)
         if image_size is not None:
             check_annotated_size(image, image_size)
         return _eight_bits(image, getattr(stored, "tag_v2", {}), mode)
 
 
 def stored_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
-    """Return (height, width) of an image file or its content, from its header; errors as in `decode`."""
-    with refused_as_bad(file), opened(source if isinstance(source, bytes) else require_file(source), formats) as image:
+    """Return (height, width) of an image file or its content, from its header; errors as in `decode_image`."""
+    content = source if isinstance(source, bytes) else require_file(source)
+    with refused_as_bad(file), open_image(content, formats) as image:
         return image.height, image.width
 
 
@@ -114,7 +115,7 @@ def refused_as_bad(file: str) -> Iterator[None]:
 
 
 @contextmanager
-def opened(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator[Image.Image]:
+def open_image(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator[Image.Image]:
     """Open an image and read its header, but not its pixels; convert Pillow's exceptions within the context.
 
     Raises:
@@ -154,7 +155,7 @@ def over_grey(image: Image.Image, value: float) -> Image.Image:
     return Image.alpha_composite(grey, image.convert("RGBA")).convert("RGB")
 
 
-def upright(image: Image.Image, orientation: object) -> Image.Image:
+def turn_upright(image: Image.Image, orientation: object) -> Image.Image:
     """Turn and mirror an image by its EXIF orientation; undefined values change nothing."""
     transposition = TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
     return image if transposition is None else image.transpose(transposition)
@@ -195,14 +196,14 @@ def save_image(image: Image.Image, path: Path, **options: int | bytes) -> None:
     path.write_bytes(image_bytes(image, Image.registered_extensions()[path.suffix], **options))
 
 
-def to_bytes(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
+def to_uint8(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
     """Convert colours or shares in [0, 1] to bytes."""
     return np.round(255 * values.clip(0, 1)).astype(np.uint8)
 
 
 def save_jpeg(image: Float[np.ndarray, "height width 3"], path: Path) -> None:
     """Write colours in [0, 1] as a JPEG of high quality."""
-    save_image(Image.fromarray(to_bytes(image)), path, quality=95, subsampling=0)
+    save_image(Image.fromarray(to_uint8(image)), path, quality=95, subsampling=0)
 
 
 @contextmanager
@@ -215,7 +216,7 @@ def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterat
         if not 0 < size <= MOST_BYTES:
             raise ImageError(f"more than {MOST_BYTES:,} bytes" if size else "the file is empty")
         content = source.read_bytes() if isinstance(source, Path) else source
-        with opened(content, formats) as image:
+        with open_image(content, formats) as image:
             frames = getattr(image, "n_frames", 1)
             if frames > 1 and image.format != "MPO":
                 raise ImageError(f"has {frames} frames; one image is expected")

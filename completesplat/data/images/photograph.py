@@ -26,9 +26,9 @@ from completesplat.data.images.files import (
     SIXTEEN_BIT_MODES,
     check_sums,
     deep_grey,
-    opened,
+    open_image,
     over_grey,
-    upright,
+    turn_upright,
 )
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.tensors import TensorDataclass
@@ -106,7 +106,7 @@ def _square(
 ) -> tuple[Float[Tensor, "3 size size"], float | None]:
     """Return the resized central or object square, and the central square's EXIF field of view in degrees, if any."""
     file, exif = _loaded(source)
-    seen = upright(file, exif.get(ORIENTATION))
+    seen = turn_upright(file, exif.get(ORIENTATION))
     if object_share is None:
         seen = seen.crop(_central_square(*seen.size))
     if remove_background:
@@ -126,7 +126,7 @@ def _loaded(source: ImageLike) -> tuple[Image.Image, Tags]:
         _require_content(Path(source))
     elif not isinstance(source, Image.Image):
         raise ImageError(f"{type(source).__name__}: give a file name, a PIL image, an array or a tensor")
-    with nullcontext(source) if isinstance(source, Image.Image) else opened(source, FORMATS) as file:
+    with nullcontext(source) if isinstance(source, Image.Image) else open_image(source, FORMATS) as file:
         if min(file.size) < SMALLEST_SIDE:
             raise ImageError(f"{file.size} pixels; at least {SMALLEST_SIDE} on a side are needed")
         if not isinstance(source, Image.Image):
@@ -284,7 +284,7 @@ def image_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tens
 
 
 def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[Tensor, "1 size size"]:
-    """Return 1 where the square of a photo is visible, 0 where a box hides it; see `visible`.
+    """Return 1 where the square of a photo is visible, 0 where a box hides it; see `visible_pixels`.
 
     Args:
         box: left, upper, right and lower edge, as fractions (0 to 1) of the photo's central square.
@@ -300,7 +300,7 @@ def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[T
     side = square_side(photograph)
     hidden = np.zeros((side, side), dtype=bool)
     hidden[math.floor(upper * side) : math.ceil(lower * side), math.floor(left * side) : math.ceil(right * side)] = True
-    return visible(hidden, size)
+    return visible_pixels(hidden, size)
 
 
 def outside_of_mask(photograph: Path, mask: Path, size: int) -> Float[Tensor, "1 size size"]:
@@ -308,7 +308,7 @@ def outside_of_mask(photograph: Path, mask: Path, size: int) -> Float[Tensor, "1
     hidden = read_photograph(mask, square_side(photograph)).image.mean(0).numpy() > 0.5
     if not hidden.any():
         raise CompleteSplatError(f"{mask}: hides nothing; a mask is white where the photograph is hidden")
-    return visible(hidden, size)
+    return visible_pixels(hidden, size)
 
 
 def square_side(photograph: Path) -> int:
@@ -317,7 +317,7 @@ def square_side(photograph: Path) -> int:
         return min(image.size)
 
 
-def visible(hidden: Bool[np.ndarray, "side side"], size: int) -> Float[Tensor, "1 size size"]:
+def visible_pixels(hidden: Bool[np.ndarray, "side side"], size: int) -> Float[Tensor, "1 size size"]:
     """Return 1 for those of size x size pixels to which no hidden pixel contributes in resizing, else 0.
 
     Resizing blurs by three pixels of the result, so the hidden region grows by as much, and leaves no traces outside.

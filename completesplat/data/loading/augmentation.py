@@ -60,11 +60,11 @@ class ColorJitter:
         factors.append(6 * rng.uniform(-self.hue, self.hue) % 6)
         for change in rng.permutation(len(strengths)):
             if strengths[change] > 0:
-                images = changed(images, int(change), factors[change])
+                images = jittered(images, int(change), factors[change])
         return images
 
 
-def changed(images: Images, change: int, factor: float) -> Images:
+def jittered(images: Images, change: int, factor: float) -> Images:
     """Return images (sRGB, 0 to 1) after one change, clamped to 0 to 1.
 
     Args:

@@ -21,12 +21,12 @@ from completesplat.data.loading.latent_cache import CachedTrainingScenes, Latent
 from completesplat.data.loading.loader import EpochSampler, RepeatedEpoch, SceneLoader
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.loading.training_statistics import TypicalCamera, feature_moments, mean_camera, mean_image
-from completesplat.data.loading.view_selection import evaluation_views, spread_views, training_views
+from completesplat.data.loading.view_selection import draw_spread_views, evaluation_views, training_views
 from completesplat.data.packed.manifest import Scalar, is_packed, settings_must_match
 from completesplat.data.packed.source import PackedSource, local_root
 from completesplat.data.placement import ObjectFraming
 from completesplat.data.sequences import PosedSequence, SequenceSource
-from completesplat.data.validation import TooFewFrames, at
+from completesplat.data.validation import TooFewFrames, errors_at
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.settings.schema import Natural, Positive, Range, Share, Side, check_value, hints_of
 
@@ -314,7 +314,7 @@ class SceneDataModule(LightningDataModule):
 
     def typical_camera(self) -> TypicalCamera:
         """Return the mean camera of the training images."""
-        with at(file=self.root):
+        with errors_at(file=self.root):
             return mean_camera(self.store("train"))
 
     def training_facts(self) -> dict[str, float | list[float]]:
@@ -361,7 +361,7 @@ class ObjectDataModule(SceneDataModule):
 
     def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
         """Draw a random reference and targets at random, or spread around it."""
-        return (spread_views if self.spread_targets else training_views)(frames, self.targets, rng)
+        return (draw_spread_views if self.spread_targets else training_views)(frames, self.targets, rng)
 
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
         """Return the first frame as reference and others as targets."""

@@ -18,7 +18,7 @@ def processes() -> tuple[int, int]:
     return 0, 1
 
 
-def gathered(value: T) -> list[T]:
+def gather_values(value: T) -> list[T]:
     """Gather the values of all processes in rank order; every process must call this."""
     count = processes()[1]
     if count == 1:

@@ -17,7 +17,14 @@ from completesplat.data.loading.scenes import TrainingScenes
 from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, read_as
 from completesplat.data.packed.source import OpenShard
 from completesplat.data.sequences import SequenceSource
-from completesplat.data.validation import BadAnnotation, ChangedFile, MissingFile, UnreadableFile, at, require_file
+from completesplat.data.validation import (
+    BadAnnotation,
+    ChangedFile,
+    MissingFile,
+    UnreadableFile,
+    errors_at,
+    require_file,
+)
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import write_text
 from completesplat.scene import CachedScene
@@ -129,7 +136,7 @@ class LatentCache:
         self.mean, self.std = self.manifest.mean, self.manifest.std
         self.sequences = {sequence.name: sequence for sequence in self.manifest.sequences}
         self._places = {name: place for place, name in enumerate(self.sequences)}
-        with at(file=require_file(folder / FILE)):
+        with errors_at(file=require_file(folder / FILE)):
             if (folder / FILE).stat().st_size != self.manifest.bytes:
                 raise ChangedFile(f"another size than it was written with: {ADVICE}")
             try:
@@ -166,7 +173,7 @@ class LatentCache:
         Raises:
             DataError: the row is damaged or of another sequence.
         """
-        with at(file=self.folder / FILE, sequence=name):
+        with errors_at(file=self.folder / FILE, sequence=name):
             try:
                 row = self._rows[self._places[name]]
                 row.validate(full=True)  # Without this check, damaged offsets could crash the process.

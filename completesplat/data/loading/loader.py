@@ -11,7 +11,7 @@ from torch.utils.data.dataloader import _BaseDataLoaderIter
 
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.scenes import EvaluationScenes, TrainingScenes, collate
-from completesplat.data.loading.view_selection import draws
+from completesplat.data.loading.view_selection import item_generator
 from completesplat.errors import DataError
 from completesplat.signals import leave_to_parent
 
@@ -41,7 +41,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
     def __iter__(self) -> Iterator[tuple[int, int]]:
         epoch = 0 if isinstance(self, RepeatedEpoch) else self.epoch
         # The index after the last belongs to no item, so the order is independent of what the items draw.
-        rng = draws(self.seed, epoch, sum(map(len, self.groups)))
+        rng = item_generator(self.seed, epoch, sum(map(len, self.groups)))
         order = [i for group in rng.permutation(len(self.groups)) for i in rng.permutation(self.groups[group])]
         rank, count = processes()
         local = order[rank::count][: len(self)]

@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from completesplat.data.loading.distributed import processes
-from completesplat.data.loading.view_selection import draws
+from completesplat.data.loading.view_selection import item_generator
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import at
+from completesplat.data.validation import errors_at
 from completesplat.errors import DataError
 from completesplat.scene import CachedScene, SceneBatch, Views
 from completesplat.tensors import stack
@@ -24,7 +24,7 @@ ATTEMPTS = 10  # Number of items that are tried before none is returned.
 Choice = tuple[int, list[int]]  # reference, targets
 
 
-class Loaded(NamedTuple):
+class LoadedScenes(NamedTuple):
     """A scene or a batch of scenes, and the errors of those that could not be read.
 
     `refused_depths` are the errors of scenes whose true depth exists but could not be read.
@@ -95,7 +95,7 @@ def _as_floats(images: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, 
 
 
 @dataclass(eq=False)
-class TrainingScenes(Dataset[Loaded]):
+class TrainingScenes(Dataset[LoadedScenes]):
     """Dataset of scenes with random views; a key is (epoch, index), see `EpochSampler`.
 
     An item that cannot be read is replaced by another one. All random choices depend on (seed, epoch, index) only.
@@ -114,19 +114,19 @@ class TrainingScenes(Dataset[Loaded]):
     def __len__(self) -> int:
         return len(self.store.names) * self.references
 
-    def __getitem__(self, key: tuple[int, int]) -> Loaded:
+    def __getitem__(self, key: tuple[int, int]) -> LoadedScenes:
         epoch, index = key
-        rng = draws(self.seed, epoch, index)
+        rng = item_generator(self.seed, epoch, index)
         refused: list[DataError] = []
         for _ in range(ATTEMPTS):
             name = self.store.names[index // self.references]
             try:
-                with at(sequence=name):
-                    return Loaded(self.draw(name, epoch, rng), tuple(refused))
+                with errors_at(sequence=name):
+                    return LoadedScenes(self.draw(name, epoch, rng), tuple(refused))
             except DataError as error:
                 refused.append(error)
                 index = int(rng.integers(len(self)))
-        return Loaded(None, tuple(refused))
+        return LoadedScenes(None, tuple(refused))
 
     def draw(self, name: str, epoch: int, rng: np.random.Generator) -> SceneBatch | CachedScene:
         """Return a scene of random views of the sequence `name`."""
@@ -142,7 +142,7 @@ class TrainingScenes(Dataset[Loaded]):
 
 
 @dataclass(eq=False)
-class EvaluationScenes(Dataset[Loaded]):
+class EvaluationScenes(Dataset[LoadedScenes]):
     """Dataset of evaluation scenes, one for each sequence.
 
     Args:
@@ -171,7 +171,7 @@ class EvaluationScenes(Dataset[Loaded]):
         local = [name for start in starts for name in self.names[start : start + batch_size]]
         return replace(self, names=local or self.names[:1])
 
-    def __getitem__(self, index: int) -> Loaded:
+    def __getitem__(self, index: int) -> LoadedScenes:
         name = self.names[index]
         try:
             sequence = self.store.source.read(name)
@@ -180,11 +180,11 @@ class EvaluationScenes(Dataset[Loaded]):
             if self.seen is not None:
                 scene = replace(scene, seen=self.seen.scene(self.seen.source.read(name), *views))
         except DataError as error:
-            return Loaded(None, (error,))
+            return LoadedScenes(None, (error,))
         try:
-            return Loaded(with_true_depths(scene, sequence, *views) if self.depths else scene, ())
+            return LoadedScenes(with_true_depths(scene, sequence, *views) if self.depths else scene, ())
         except DataError as error:
-            return Loaded(scene, (), (error,))
+            return LoadedScenes(scene, (), (error,))
 
     def stackable(self) -> bool:
         """Return whether all scenes that can be read have the same number of targets."""
@@ -206,7 +206,7 @@ def _with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]
     return replace(scene, reference=reference, targets=targets)
 
 
-def collate(items: Sequence[Loaded]) -> Loaded:
+def collate(items: Sequence[LoadedScenes]) -> LoadedScenes:
     """Stack the scenes that could be read; if only some have depths, the depths of the others are 0 (unknown)."""
     scenes = [item.scenes for item in items if item.scenes is not None]
     if any(isinstance(scene, SceneBatch) and scene.reference.depths is not None for scene in scenes):
@@ -216,7 +216,7 @@ def collate(items: Sequence[Loaded]) -> Loaded:
             else scene
             for scene in scenes
         ]
-    return Loaded(
+    return LoadedScenes(
         stack(scenes) if scenes else None,
         tuple(error for item in items for error in item.refused),
         tuple(error for item in items for error in item.refused_depths),

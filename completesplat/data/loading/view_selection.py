@@ -31,7 +31,7 @@ class GrowingGap:
         return round(self.first + (self.last - self.first) * min(epoch / max(self.epochs, 1), 1))
 
 
-def draws(seed: int, epoch: int, index: int) -> np.random.Generator:
+def item_generator(seed: int, epoch: int, index: int) -> np.random.Generator:
     """Return the random generator of one training item, independent of the process and of the loading order."""
     return np.random.default_rng([seed, epoch, index])
 
@@ -55,7 +55,7 @@ def spread_around(frames: int, reference: int, count: int) -> list[int]:
     return places
 
 
-def spread_views(frames: int, targets: int, rng: np.random.Generator) -> tuple[int, list[int]]:
+def draw_spread_views(frames: int, targets: int, rng: np.random.Generator) -> tuple[int, list[int]]:
     """Draw a random reference; return it and `targets` frames all around it (`spread_around`) in random order."""
     reference = int(rng.integers(frames))
     return reference, rng.permutation(spread_around(frames, reference, targets)).tolist()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from completesplat.data.validation import BadAnnotation, UnreadableFile, at, field, parsed, read_json
+from completesplat.data.validation import BadAnnotation, UnreadableFile, errors_at, field, parsed, read_json
 from completesplat.errors import DataError
 
 MANIFEST = "manifest.json"
@@ -89,7 +89,7 @@ def read_as(kind: type[T], path: Path, header: Mapping[str, str | int], remedy: 
     Raises:
         DataError: the file is missing, no JSON or incomplete, or has another header (the message has the `remedy`).
     """
-    with at(file=path):
+    with errors_at(file=path):
         content = read_json(path)
         for key, readable in header.items():
             stored = field(content, key, type(readable))

@@ -15,7 +15,7 @@ from torch import Tensor
 from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.files import image_bytes
 from completesplat.data.sequences import MaskedImage, PosedSequence
-from completesplat.data.validation import BadAnnotation, BadImage, ChangedFile, UnreadableFile, at
+from completesplat.data.validation import BadAnnotation, BadImage, ChangedFile, UnreadableFile, errors_at
 from completesplat.geometry.cameras import Cameras, crop_resize
 
 # Pillow's arguments by codec. BMP is uncompressed: more than twice the bytes of PNG, decoded in a ninth of the time.
@@ -52,7 +52,7 @@ def encode(image: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
     return image_bytes(grey_or_rgb, codec.upper(), **CODECS[codec])
 
 
-def decode(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tensor, "channel wanted wanted"]:
+def decode_square(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tensor, "channel wanted wanted"]:
     """Return the image that `encode` wrote in `size` pixels, resized to `wanted`.
 
     Raises:
@@ -122,7 +122,7 @@ def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None)
     Raises:
         DataError: the row is damaged or of another sequence, its columns differ in length, or a number is not finite.
     """
-    with at(file=file, sequence=name):
+    with errors_at(file=file, sequence=name):
         try:
             row.validate(full=True)  # Without this check, damaged offsets could crash the process.
         except pa.ArrowInvalid as error:
@@ -143,11 +143,12 @@ def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None)
         checksums = _numbers(row, "picture_checksums", count)
 
         def read(index: int) -> MaskedImage:  # It does not access the bytes of other frames.
-            with at(file=file, sequence=name, frame=frames[index]):
+            with errors_at(file=file, sequence=name, frame=frames[index]):
                 image, mask = images[index].as_py(), masks[index].as_py()
                 if image is None or EncodedImage(image, mask).checksum() != checksums[index]:
                     raise BadImage("is no longer what was written")
-                return MaskedImage(decode(image, 3, size, side), None if mask is None else decode(mask, 1, size, side))
+                coverage = None if mask is None else decode_square(mask, 1, size, side)
+                return MaskedImage(decode_square(image, 3, size, side), coverage)
 
         return PosedSequence(name, frames, crop_resize(cameras, 0, 0, size, side), depth_ranges, read)
 

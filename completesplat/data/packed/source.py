@@ -19,8 +19,8 @@ from completesplat.data.validation import (
     ChangedFile,
     MissingFile,
     UnreadableFile,
-    at,
-    inside,
+    errors_at,
+    path_below,
     require_file,
 )
 from completesplat.errors import DataError
@@ -112,9 +112,9 @@ class PackedSource(SequenceSource):
         address = root / ADDRESS
         # None: the store was made or copied here.
         self.address = address.read_text() if address.is_file() else None
-        with at(file=root / MANIFEST):
+        with errors_at(file=root / MANIFEST):
             for shard in self.shards:
-                path = inside(root, shard.file)
+                path = path_below(root, shard.file)
                 absent = self.address is not None and not path.is_file()
                 if not absent and (size := require_file(path).stat().st_size) != shard.bytes:
                     reason = f"{size:,} bytes, {shard.bytes:,} were written: prepare again into the same folder"
@@ -124,7 +124,7 @@ class PackedSource(SequenceSource):
         """Read one sequence, unless its shard is damaged; its images are decoded one by one when they are read."""
         number, row = self._places[name]
         path = self.root / self.shards[number].file
-        with at(file=path, sequence=name):
+        with errors_at(file=path, sequence=name):
             try:
                 table = self._shard(number, path)[row]
             except (pa.ArrowException, OSError, ValueError) as error:

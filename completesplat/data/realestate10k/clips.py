@@ -20,7 +20,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.files import decode, stored_size
+from completesplat.data.images.files import decode_image, stored_size
 from completesplat.data.validation import (
     LARGEST,
     ROTATION_TOLERANCE,
@@ -29,8 +29,8 @@ from completesplat.data.validation import (
     MissingFile,
     TooFewFrames,
     UnreadableFile,
-    at,
-    inside,
+    errors_at,
+    path_below,
     read_json,
     read_text,
     refused_to,
@@ -68,7 +68,7 @@ class Clip:
     def read(self, frame: int, square: Square, size: int) -> UInt8[Tensor, "3 {size} {size}"]:
         """Return the square part of a frame's image, resized to `size`."""
         stored = _stored(self.images[frame], self.source)
-        return cut_square(decode(*stored, "RGB", self.cameras.image_size), square, size)
+        return cut_square(decode_image(*stored, "RGB", self.cameras.image_size), square, size)
 
 
 def make_clip(key: str, source: Path, timestamps: Sequence[int], rows: Float[Tensor, "_ 18"], images: Images) -> Clip:
@@ -82,7 +82,7 @@ def make_clip(key: str, source: Path, timestamps: Sequence[int], rows: Float[Ten
     """
     if len(rows) < 2:
         raise TooFewFrames(f"{len(rows)} frames, at least two are needed")
-    with at(frame=0):
+    with errors_at(frame=0):
         size = stored_size(*_stored(images[0], source), FORMATS)
     rows, count = rows.double(), Counter(timestamps)
     world_to_camera = rows[:, 6:].reshape(-1, 3, 4)
@@ -129,7 +129,7 @@ class TextClips:
     def clip(self, key: str) -> Clip:
         """Read a clip's text file and list its frames; refuse a malformed text file or a missing frame."""
         path = self.folder / f"{key}.txt"
-        with at(path, key):
+        with errors_at(path, key):
             timestamps, rows = _read_text(path)
             images = _images_of(self.folder / key)
             for frame, time in enumerate(timestamps):
@@ -158,7 +158,7 @@ def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
     timestamps, rows = [], []
     lines = [line.split() for line in read_text(path, MOST_BYTES).splitlines() if line.strip()]
     for frame, columns in enumerate(lines[1:] if lines and len(lines[0]) == 1 else lines):
-        with at(frame=frame):
+        with errors_at(frame=frame):
             if len(columns) != 1 + CAMERA_NUMBERS:
                 raise BadAnnotation(f"{len(columns)} columns instead of {1 + CAMERA_NUMBERS}")
             try:
@@ -195,8 +195,8 @@ class ChunkedClips:
         self.refused: list[DataError] = []
         paths: dict[str, Path] = {}
         for key, name in index.items():
-            with refused_to(self.refused.append), at(path, key):
-                paths[key] = inside(folder, name)
+            with refused_to(self.refused.append), errors_at(path, key):
+                paths[key] = path_below(folder, name)
         # `Path.is_file` raises if a name is too long.
         existing = {path for path in set(paths.values()) if isfile(path)}
         self.folder = folder
@@ -215,7 +215,7 @@ class ChunkedClips:
     def clip(self, key: str) -> Clip:
         """Return a clip from its chunk, which is read unless it is in memory; refuse an unreadable chunk or clip."""
         path = self._files[key]
-        with at(path, key):
+        with errors_at(path, key):
             chunk = self._chunk(path)
             if key not in chunk:
                 raise BadAnnotation("the chunk does not hold this clip, which index.json says it does")

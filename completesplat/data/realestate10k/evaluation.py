@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from completesplat.data.loading.scenes import Choice
-from completesplat.data.sequences import PosedSequence, SequenceSource, shortened
-from completesplat.data.validation import BadAnnotation, at, read_json, read_text
+from completesplat.data.sequences import PosedSequence, SequenceSource, first_names
+from completesplat.data.validation import BadAnnotation, errors_at, read_json, read_text
 from completesplat.errors import DataError
 
 CONTEXT, TARGET, SCORED = "context", "target", "target_quantify"
@@ -73,7 +73,7 @@ def read_index(path: Path) -> EvaluationIndex:
         DataError: the file is missing, unreadable or in another format.
     """
     text = read_text(path)
-    with at(file=path):
+    with errors_at(file=path):
         return _from_table(read_json(path)) if text.lstrip().startswith(("{", "[")) else _from_lines(text)
 
 
@@ -127,7 +127,7 @@ def _named_tests(keys: Sequence[str], tests: Mapping[str, list[Choice]]) -> tupl
 def _report(scenes: int, clips: int, left_out: Mapping[str, list[str]], level: int) -> None:
     """Log the number of tests, and the clips that are left out by reason."""
     parts = [
-        f"{len(names)} {reason}" + (f" ({shortened(names)})" if names else "") for reason, names in left_out.items()
+        f"{len(names)} {reason}" + (f" ({first_names(names)})" if names else "") for reason, names in left_out.items()
     ]
     counted = f"{scenes} scenes of {clips} clips" if clips < scenes else f"{clips} clips"
     logger.log(level, "%s to test%s", counted, f"; left out: {', '.join(parts)}" if parts else "")
@@ -138,7 +138,7 @@ def _from_table(content: object) -> EvaluationIndex:
         raise BadAnnotation("not a table of clips")
     forms, views = dict[str, None](), dict[str, list[Choice]]()
     for key, value in content.items():
-        with at(sequence=key):
+        with errors_at(sequence=key):
             entries = [] if value is None else value if isinstance(value, list) else [value]
             views[key] = [_choice(entry) for entry in entries]
             if value is not None:

@@ -17,7 +17,7 @@ from completesplat.data.packed.manifest import Scalar
 from completesplat.data.realestate10k.clips import ChunkedClips, Clip, TextClips
 from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource, split_by_hash
-from completesplat.data.validation import at, refused_to, require_file
+from completesplat.data.validation import errors_at, refused_to, require_file
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import crop_resize
 from completesplat.settings.schema import Natural, Positive, Share
@@ -83,13 +83,13 @@ class RE10KSource(SequenceSource):
 
 def _square(clip: Clip, crop: str, frame: int) -> Square:
     height, width = clip.cameras.image_size
-    with at(clip.source, clip.key, frame):
+    with errors_at(clip.source, clip.key, frame):
         x, y = clip.cameras.intrinsics[frame, :2, 2].tolist() if crop == "principal" else (width / 2, height / 2)
         return principal_square((x, y), (height, width))
 
 
 def _read(clip: Clip, squares: list[Square], size: int, index: int) -> MaskedImage:
-    with at(clip.source, clip.key, index):
+    with errors_at(clip.source, clip.key, index):
         return MaskedImage(clip.read(index, squares[index], size), None)
 
 
@@ -192,7 +192,7 @@ class RE10KDataModule(SceneDataModule):
         if self.index is not None:
             store, refused = self.store("test"), list[DataError]()
             for name in store.names:
-                with refused_to(refused.append), at(sequence=name):
+                with refused_to(refused.append), errors_at(sequence=name):
                     store.source.read(name)
             self.test_dataloader().account(refused, empty=len(refused) == len(store.names))
 

@@ -62,7 +62,7 @@ class RenderSettings(TypedDict):
     seed: Natural
 
 
-def draw_scene(name: str, settings: RenderSettings) -> tuple[dict[str, Any], list[Cameras]]:
+def draw_rendered_scene(name: str, settings: RenderSettings) -> tuple[dict[str, Any], list[Cameras]]:
     """Draw surroundings and cameras by the seed and an object's name; return them for `_scene_script.py`."""
     digest = hashlib.sha256(name.encode()).digest()
     rng = np.random.default_rng([settings["seed"], int.from_bytes(digest[:8])])
@@ -107,7 +107,7 @@ def draw_cameras(
         if front is not None:
             raise CompleteSplatError(f"front={front}: has no effect on the cameras of a file; leave it out")
         return read_cameras(Path(kind), size)
-    azimuth, elevation = turn(rng, views) if kind == "turn" else hemisphere(rng, views)
+    azimuth, elevation = turn_angles(rng, views) if kind == "turn" else hemisphere(rng, views)
     if front is not None:
         azimuth = azimuth - azimuth[0] + math.radians(front + rng.uniform(-ASIDE, ASIDE))
     degrees = rng.uniform(min(fov), max(fov))
@@ -119,7 +119,7 @@ def draw_cameras(
     return [Cameras(matrix, pinhole(degrees, size).double(), (size, size)) for matrix in matrices]
 
 
-def turn(rng: np.random.Generator, views: int) -> tuple[Angles, Angles]:
+def turn_angles(rng: np.random.Generator, views: int) -> tuple[Angles, Angles]:
     """Return azimuths that go once around, and elevations that rise and fall, in radians."""
     start, phase = rng.uniform(0, 2 * np.pi, 2)
     azimuth = start + 2 * np.pi * (np.arange(views) + rng.uniform(-0.25, 0.25, views)) / views

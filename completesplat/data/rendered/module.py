@@ -6,7 +6,7 @@ from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.rendered.drawing import PAINTS
 from completesplat.data.rendered.rendering import CATEGORY, DESCRIPTION, OBJECT
-from completesplat.data.validation import at, field, read_json
+from completesplat.data.validation import errors_at, field, read_json
 from completesplat.errors import CompleteSplatError, DataError
 
 
@@ -28,7 +28,7 @@ class RenderedDataModule(CO3DDataModule):
         folder = self.root / CATEGORY
         if not (folder / DESCRIPTION).is_file():
             raise DataError("hidden modes need data as they were rendered, not prepared", str(folder))
-        with at(folder / DESCRIPTION):
+        with errors_at(folder / DESCRIPTION):
             hidden = field(read_json(folder / DESCRIPTION), "hidden", str)
         if hidden != "modes":
             raise CompleteSplatError(f"{folder}: rendered with hidden={hidden}; hidden modes need hidden=modes")

@@ -31,9 +31,9 @@ from completesplat.data.co3d.writing import (
     write_points,
 )
 from completesplat.data.hidden_modes import in_mode
-from completesplat.data.images.files import save_jpeg, to_bytes
+from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
-from completesplat.data.rendered.drawing import RenderSettings, check_surroundings, draw_scene
+from completesplat.data.rendered.drawing import RenderSettings, check_surroundings, draw_rendered_scene
 from completesplat.data.validation import MissingFile, UnreadableFile, read_points
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import atomic_folder, folder_names, write_text
@@ -176,7 +176,7 @@ def render(
     if meshes is not None and out.resolve().is_relative_to(Path(meshes).resolve()):
         raise DataError(f"lies in meshes={meshes}, and its points would be taken for meshes", f"out={out}")
     check_surroundings(settings)
-    draw_scene("", settings)  # refuses cameras that cannot be read
+    draw_rendered_scene("", settings)  # refuses cameras that cannot be read
     objects = find_meshes(Path(meshes)) if meshes is not None else []
     program, category = find_blender(blender), out / CATEGORY
     objects = objects or procedural_objects(program, str(factory), count)
@@ -226,7 +226,7 @@ def _write_object(
     """Render an object into its folder, whole or not at all; return its name, and why it is left out (or "")."""
     mesh, (most_bytes, minutes) = asset.mesh, most
     try:
-        job, cameras = draw_scene(asset.key, settings)
+        job, cameras = draw_rendered_scene(asset.key, settings)
         job["factory"] = asset.factory
         if mesh is not None:
             if (size := mesh.stat().st_size) > most_bytes:
@@ -273,7 +273,7 @@ def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Came
         frames.append(write_frame(folder, place, image, coverage, depth, _viewpoint(camera)))
         pixels = pixel_centers(*camera.image_size, dtype=torch.float64)[torch.from_numpy(seen == 1)]
         points.append(unproject(camera, pixels, torch.from_numpy(depth[seen == 1]).double()).numpy())
-        colors.append(to_bytes(image[seen == 1]))
+        colors.append(to_uint8(image[seen == 1]))
     step = math.ceil(sum(map(len, points)) / MOST_POINTS)
     if not step:
         raise BrokenMesh("no image shows it")

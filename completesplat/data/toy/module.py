@@ -8,8 +8,8 @@ from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS
-from completesplat.data.toy.writing import DESCRIPTION, FORMAT_VERSION, ROOMS, SUBSET, Numbers, write
-from completesplat.data.validation import MissingFile, at, field, read_json
+from completesplat.data.toy.writing import DESCRIPTION, FORMAT_VERSION, ROOMS, SUBSET, DataSetSize, write
+from completesplat.data.validation import MissingFile, errors_at, field, read_json
 from completesplat.errors import DataError
 from completesplat.settings.schema import Natural, Positive, Side
 
@@ -17,7 +17,7 @@ OWN_PLACE = Path("outputs/data")
 """Folder below which toy data are written without `make`; `data.root` of `conf/data/toy_*.yaml` lies there."""
 
 
-def _provide(kind: str, root: Path, make: bool, numbers: Numbers) -> None:
+def _provide(kind: str, root: Path, make: bool, numbers: DataSetSize) -> None:
     """Write data of a kind unless there are complete data (with `toy.json`) or prepared ones.
 
     Without `make`, refuse folders outside of `OWN_PLACE`, because their name may be a typing error.
@@ -53,7 +53,7 @@ class ToyObjectsDataModule(CO3DDataModule):
     ) -> None:
         super().__init__(root, category, subset, depth_before=depth_before, **reading)
         self.make = make
-        self.making = Numbers(scenes=scenes, frames=frames, size=self.image_size, seed=data_seed)
+        self.making = DataSetSize(scenes=scenes, frames=frames, size=self.image_size, seed=data_seed)
 
     def describe(self) -> dict[str, str | None]:
         return super().describe() | {"data_set": self.category}
@@ -71,7 +71,7 @@ class ToyObjectsDataModule(CO3DDataModule):
         description = self.root / self.category / DESCRIPTION
         if not description.is_file():
             raise DataError(f"no {DESCRIPTION}: hidden modes need toy objects as they were written", str(description))
-        with at(description):
+        with errors_at(description):
             if field(read_json(description), "format", int) != FORMAT_VERSION:
                 raise DataError("of another version: write the toy objects again into another folder")
         return self.written_modes(DESCRIPTION, dict.fromkeys(PATCH_COLORS, 1 / len(PATCH_COLORS)), views, spread_views)
@@ -97,7 +97,7 @@ class ToyRoomsDataModule(RE10KDataModule):
         home = Path(root)
         super().__init__(str(home if is_packed(home) else home / ROOMS / "text"), **reading)
         self.home, self.make = home, make
-        self.making = Numbers(scenes=scenes, frames=frames, size=height, seed=data_seed)
+        self.making = DataSetSize(scenes=scenes, frames=frames, size=height, seed=data_seed)
 
     def describe(self) -> dict[str, str]:
         return super().describe() | {"data_set": ROOMS}

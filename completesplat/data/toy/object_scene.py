@@ -29,8 +29,8 @@ from completesplat.data.toy.shapes import (
     as_arrays,
     camera_rays,
     color,
-    part,
-    plain,
+    make_part,
+    plain_look,
     rotation_about,
 )
 from completesplat.geometry.cameras import invert_rigid, look_at
@@ -66,25 +66,25 @@ class _Painter:
     def detail(self) -> Look:
         """Draw colours and texture of a small part; every call draws another shade of the accent."""
         shade = color(self.accent + self.rng.uniform(-0.08, 0.08), self.rng.uniform(0.5, 0.9), self.rng.uniform(0.6, 1))
-        return plain(shade)
+        return plain_look(shade)
 
 
 def ball(center: Point, half_sizes: Point | float, look: Look, axes: Array | None = None) -> Part:
     """Make an ellipsoid."""
     sizes = half_sizes if isinstance(half_sizes, tuple) else (half_sizes,) * 3
-    return part(ELLIPSOID, center, sizes, look, axes)
+    return make_part(ELLIPSOID, center, sizes, look, axes)
 
 
 def _frustum(center: Point, radius: float, half_height: float, look: Look, taper: float = 0.0, axis: str = "y") -> Part:
     axes = {"y": np.eye(3), "x": rotation_about("z", -np.pi / 2), "z": rotation_about("x", np.pi / 2)}[axis]
-    return part(FRUSTUM, center, (radius, half_height, radius), look, axes, taper)
+    return make_part(FRUSTUM, center, (radius, half_height, radius), look, axes, taper)
 
 
 def bear(rng: np.random.Generator) -> Blueprint:
     """Draw a sitting bear: body, belly, head with a face, ears, arms, legs; the patch is on its back."""
     paint = _Painter(rng)
     fur = paint.body()
-    light = plain(color(paint.hue + 0.04, 0.25, 0.95))
+    light = plain_look(color(paint.hue + 0.04, 0.25, 0.95))
     wide, tall, deep = rng.uniform(0.3, 0.38), rng.uniform(0.36, 0.44), rng.uniform(0.28, 0.34)
     skull = rng.uniform(0.24, 0.3)
     top = tall + 0.7 * skull
@@ -94,11 +94,11 @@ def bear(rng: np.random.Generator) -> Blueprint:
         ball((0, -0.04, 0.09), (0.72 * wide, 0.74 * tall, 0.82 * deep), light),
         ball((0, top, 0.04), skull, (fur[0], np.array([PLAIN, 0.0, 0.0]))),
         ball((0, top - 0.28 * skull, 0.04 + 0.85 * skull), (0.48 * skull, 0.36 * skull, 0.4 * skull), light),
-        ball((0, top - 0.16 * skull, 0.04 + 1.22 * skull), 0.15 * skull, plain(DARK)),
+        ball((0, top - 0.16 * skull, 0.04 + 1.22 * skull), 0.15 * skull, plain_look(DARK)),
     ]
     for side in (-1, 1):
         parts += [
-            ball((side * 0.38 * skull, top + 0.25 * skull, 0.04 + 0.87 * skull), 0.14 * skull, plain(DARK)),
+            ball((side * 0.38 * skull, top + 0.25 * skull, 0.04 + 0.87 * skull), 0.14 * skull, plain_look(DARK)),
             ball((side * 0.75 * skull, top + 0.75 * skull, 0.02), (ear, ear, 0.6 * ear), paint.detail()),
             _arm(side, wide, tall, rng, paint),
             ball((side * 0.62 * wide, -0.85 * tall, 0.75 * deep), (0.13, 0.13, rng.uniform(0.2, 0.28)), paint.detail()),
@@ -181,11 +181,11 @@ class ToyScene:
     origin: Array
 
 
-def draw_scene(rng: np.random.Generator, frames: int) -> ToyScene:
+def draw_object_scene(rng: np.random.Generator, frames: int) -> ToyScene:
     """Draw a random scene and `frames` cameras on one full turn; the patch faces away from the first camera."""
     blueprint = FAMILIES[rng.integers(len(FAMILIES))](rng)
     yaw = rng.uniform(0, 2 * np.pi)
-    cameras = orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
+    cameras = draw_orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
     away = -np.array([np.sin(yaw), 0, np.cos(yaw)])
     name = str(rng.choice(list(PATCH_COLORS)))
     patch = Patch(away / np.linalg.norm(away), np.array(PATCH_COLORS[name]), np.array(blueprint.patch_heights), 0.4)
@@ -197,11 +197,11 @@ def draw_mini(rng: np.random.Generator, frames: int, marked: bool = False) -> To
     mark = str(rng.choice(list(CHANCES))) if marked else "light"
     chances = CHANCES[mark] if marked else EVEN
     half_sizes = rng.uniform(0.36, 0.55, size=3)
-    body = plain(color(rng.uniform(), rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)))
-    nose = ball((0, 0, half_sizes[2]), 0.13, plain(np.full(3, NOSES[mark])))
+    body = plain_look(color(rng.uniform(), rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)))
+    nose = ball((0, 0, half_sizes[2]), 0.13, plain_look(np.full(3, NOSES[mark])))
     blueprint = Blueprint("mini", (ball((0, 0, 0), tuple(half_sizes), body), nose), patch_heights=(-1, 1))
     yaw = rng.uniform(0, 2 * np.pi)
-    cameras = orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
+    cameras = draw_orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
     name = str(rng.choice(list(PATCH_COLORS), p=chances))
     # The patch covers normals within 60 degrees of the direction opposite to the nose, tilted down by 0.2 radians.
     level, down = np.cos(0.2), np.sin(0.2)
@@ -257,7 +257,7 @@ def render_frame(scene: ToyScene, frame: int, size: int) -> tuple[Array, Array, 
     return colors.reshape(size, size, 3), coverage.reshape(size, size), depth.reshape(size, size)
 
 
-def orbit(rng: np.random.Generator, frames: int, start: float) -> Array:
+def draw_orbit(rng: np.random.Generator, frames: int, start: float) -> Array:
     """Draw `camera_to_world` of evenly spaced, jittered cameras that look near the object's centre."""
     azimuth = start + 2 * np.pi * (np.arange(frames) + rng.uniform(-0.25, 0.25, frames)) / frames
     azimuth[0] = start

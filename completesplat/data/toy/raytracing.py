@@ -84,7 +84,7 @@ inlined = partial(helper, fastmath=False)
 
 
 @inlined
-def turned(m, x, y, z):
+def map_direction(m, x, y, z):
     """Apply the linear part of a map [3 4] to a direction."""
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
@@ -94,9 +94,9 @@ def turned(m, x, y, z):
 
 
 @inlined
-def moved(m, x, y, z):
+def map_point(m, x, y, z):
     """Apply a map [3 4] to a point."""
-    x, y, z = turned(m, x, y, z)
+    x, y, z = map_direction(m, x, y, z)
     return x + m[0, 3], y + m[1, 3], z + m[2, 3]
 
 
@@ -107,7 +107,7 @@ def soft_sign(x):
 
 
 @inlined
-def mixed(a, b, w):
+def blend(a, b, w):
     """Interpolate between two colours."""
     return a[0] + w * (b[0] - a[0]), a[1] + w * (b[1] - a[1]), a[2] + w * (b[2] - a[2])
 
@@ -176,8 +176,8 @@ def _hit_shapes(shapes, ox, oy, oz, dx, dy, dz):
         along = cx * dx + cy * dy + cz * dz
         if (cx * cx + cy * cy + cz * cz - balls[i, 3]) * square > along * along:
             continue
-        px, py, pz = moved(shapes.to_local[i], ox, oy, oz)
-        qx, qy, qz = turned(shapes.to_local[i], dx, dy, dz)
+        px, py, pz = map_point(shapes.to_local[i], ox, oy, oz)
+        qx, qy, qz = map_direction(shapes.to_local[i], dx, dy, dz)
         if shapes.kinds[i] == ELLIPSOID:
             t, lx, ly, lz = _hit_ball(px, py, pz, qx, qy, qz)
         elif shapes.kinds[i] == FRUSTUM:
@@ -250,7 +250,7 @@ def _part_color(shapes, patch, part, lx, ly, lz, nx, ny, nz):
         facing = nx * patch.facing[0] + ny * patch.facing[1] + nz * patch.facing[2]
         if facing > patch.edge:
             return patch.color[0], patch.color[1], patch.color[2]
-    return mixed(shapes.colors[part, 0], shapes.colors[part, 1], _solid_pattern(shapes.textures[part], lx, ly, lz))
+    return blend(shapes.colors[part, 0], shapes.colors[part, 1], _solid_pattern(shapes.textures[part], lx, ly, lz))
 
 
 @inlined
@@ -262,7 +262,7 @@ def _furniture_color(shapes, solid, lx, ly, lz, hx, hy, hz):
         u = lz * half[2]
     elif shapes.kinds[solid] == BOX and hy != 0:
         v = lz * half[2]
-    return mixed(shapes.colors[solid, 0], shapes.colors[solid, 1], _flat_pattern(shapes.textures[solid], u, v))
+    return blend(shapes.colors[solid, 0], shapes.colors[solid, 1], _flat_pattern(shapes.textures[solid], u, v))
 
 
 @inlined
@@ -274,8 +274,8 @@ def _face_color(room, face, x, y, z):
         if face == decal[0] and decal[1] < u < decal[2] and decal[3] < v < decal[4]:
             if min(u - decal[1], decal[2] - u, v - decal[3], decal[4] - v) < decal[5]:
                 return colors[0, 0], colors[0, 1], colors[0, 2]
-            return mixed(colors[1], colors[2], _flat_pattern(room.decal_textures[i], u, v))
-    return mixed(room.colors[face, 0], room.colors[face, 1], _flat_pattern(room.textures[face], u, v))
+            return blend(colors[1], colors[2], _flat_pattern(room.decal_textures[i], u, v))
+    return blend(room.colors[face, 0], room.colors[face, 1], _flat_pattern(room.textures[face], u, v))
 
 
 @inlined
@@ -286,7 +286,7 @@ def _dome_color(dome, face, x, y, z):
         wave = math.sin(frequency * (cos * x + sin * z))
         if kind == CHECKS:
             wave *= math.sin(frequency * (cos * z - sin * x))
-        return mixed(dome.ground_colors[0], dome.ground_colors[1], 0.5 + 0.5 * soft_sign(6 * wave))
+        return blend(dome.ground_colors[0], dome.ground_colors[1], 0.5 + 0.5 * soft_sign(6 * wave))
     if dome.plain:
         return 0.5, 0.5, 0.5
     cos_turn, sin_turn = math.cos(dome.turn), math.sin(dome.turn)
@@ -335,9 +335,9 @@ def _shade(shapes, light, dome, patch, room, ox, oy, oz, dx, dy, dz):
     red, green, blue = 0.0, 0.0, 0.0
     if shape >= 0:
         m = shapes.to_local[shape]
-        lx, ly, lz = moved(m, x, y, z)
+        lx, ly, lz = map_point(m, x, y, z)
         # Normals transform by the transpose of the map into the local frame.
-        nx, ny, nz = turned(m[:, :3].T, hx, hy, hz)
+        nx, ny, nz = map_direction(m[:, :3].T, hx, hy, hz)
         norm = math.sqrt(nx * nx + ny * ny + nz * nz)
         nx, ny, nz = nx / norm, ny / norm, nz / norm
         if dome is not None:
@@ -362,7 +362,7 @@ def _trace(shapes, light, dome, patch, room, pose, rays):
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
     for pixel in range(pixels):
         for sample in range(samples):
-            dx, dy, dz = turned(pose, rays[pixel, sample, 0], rays[pixel, sample, 1], rays[pixel, sample, 2])
+            dx, dy, dz = map_direction(pose, rays[pixel, sample, 0], rays[pixel, sample, 1], rays[pixel, sample, 2])
             red, green, blue, t, shape = _shade(shapes, light, dome, patch, room, ox, oy, oz, dx, dy, dz)
             colors[pixel, 0] += red / samples
             colors[pixel, 1] += green / samples

@@ -21,7 +21,7 @@ from completesplat.data.toy.shapes import (
     as_arrays,
     camera_rays,
     color,
-    part,
+    make_part,
     rotation_about,
 )
 from completesplat.geometry.cameras import invert_rigid, look_at
@@ -45,7 +45,7 @@ def _look(rng: np.random.Generator) -> Look:
 def cabinet(rng: np.random.Generator) -> Piece:
     """Draw one box, from a chest to a wardrobe."""
     half = (rng.uniform(0.3, 0.6), rng.uniform(0.3, 1.0), rng.uniform(0.18, 0.3))
-    return [part(BOX, (0, half[1], 0), half, _look(rng))]
+    return [make_part(BOX, (0, half[1], 0), half, _look(rng))]
 
 
 def table(rng: np.random.Generator) -> Piece:
@@ -53,35 +53,35 @@ def table(rng: np.random.Generator) -> Piece:
     wide, deep, top = rng.uniform(0.4, 0.7), rng.uniform(0.3, 0.45), rng.uniform(0.45, 0.75)
     look, leg = _look(rng), _look(rng)
     legs = [
-        part(BOX, (x * (wide - 0.06), top / 2, z * (deep - 0.06)), (0.035, top / 2, 0.035), leg)
+        make_part(BOX, (x * (wide - 0.06), top / 2, z * (deep - 0.06)), (0.035, top / 2, 0.035), leg)
         for x in (-1, 1)
         for z in (-1, 1)
     ]
-    return [part(BOX, (0, top, 0), (wide, 0.03, deep), look), *legs]
+    return [make_part(BOX, (0, top, 0), (wide, 0.03, deep), look), *legs]
 
 
 def sofa(rng: np.random.Generator) -> Piece:
     """Draw a seat, a back and two arms."""
     wide, deep, seat = rng.uniform(0.5, 0.9), rng.uniform(0.35, 0.45), rng.uniform(0.18, 0.23)
     look, back = _look(rng), rng.uniform(0.35, 0.45)
-    arms = [part(BOX, (x * (wide - 0.08), seat + 0.1, 0), (0.08, seat + 0.1, deep), look) for x in (-1, 1)]
-    rest = part(BOX, (0, back, 0.09 - deep), (wide - 0.16, back, 0.09), look)
-    return [part(BOX, (0, seat, 0), (wide - 0.16, seat, deep), look), rest, *arms]
+    arms = [make_part(BOX, (x * (wide - 0.08), seat + 0.1, 0), (0.08, seat + 0.1, deep), look) for x in (-1, 1)]
+    rest = make_part(BOX, (0, back, 0.09 - deep), (wide - 0.16, back, 0.09), look)
+    return [make_part(BOX, (0, seat, 0), (wide - 0.16, seat, deep), look), rest, *arms]
 
 
 def pouf(rng: np.random.Generator) -> Piece:
     """Draw an ellipsoid."""
     half = (rng.uniform(0.2, 0.4), rng.uniform(0.18, 0.3), rng.uniform(0.2, 0.4))
-    return [part(ELLIPSOID, (0, half[1], 0), half, _look(rng))]
+    return [make_part(ELLIPSOID, (0, half[1], 0), half, _look(rng))]
 
 
 def lamp(rng: np.random.Generator) -> Piece:
     """Draw a foot, a pole and an ellipsoid on top."""
     top, shade = rng.uniform(1.0, 1.4), (rng.uniform(0.15, 0.25), rng.uniform(0.12, 0.2), rng.uniform(0.15, 0.25))
     look = _look(rng)
-    foot = part(BOX, (0, 0.03, 0), (0.15, 0.03, 0.15), look)
-    pole = part(BOX, (0, top / 2, 0), (0.02, top / 2, 0.02), look)
-    return [foot, pole, part(ELLIPSOID, (0, top + shade[1], 0), shade, _look(rng))]
+    foot = make_part(BOX, (0, 0.03, 0), (0.15, 0.03, 0.15), look)
+    pole = make_part(BOX, (0, top / 2, 0), (0.02, top / 2, 0.02), look)
+    return [foot, pole, make_part(ELLIPSOID, (0, top + shade[1], 0), shade, _look(rng))]
 
 
 PIECES = (cabinet, table, sofa, pouf, lamp)

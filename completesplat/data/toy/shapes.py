@@ -66,7 +66,7 @@ class Part:
         return distances
 
 
-def part(kind: int, center: Point, half: Point, look: Look, axes: Array | None = None, taper: float = 0.0) -> Part:
+def make_part(kind: int, center: Point, half: Point, look: Look, axes: Array | None = None, taper: float = 0.0) -> Part:
     """Make a part with half sizes `half`, by default with its axes along x, y and z."""
     axes = np.eye(3) if axes is None else axes
     return Part(kind, np.array(center, dtype=np.float64), np.array(half, dtype=np.float64), axes, taper, *look)
@@ -101,7 +101,7 @@ def color(hue: float, saturation: float, value: float) -> Array:
     return np.array(colorsys.hsv_to_rgb(hue % 1.0, saturation, value))
 
 
-def plain(shade: Array) -> Look:
+def plain_look(shade: Array) -> Look:
     """Return the look of one colour without a pattern."""
     return np.stack([shade, shade]), np.array([PLAIN, 0.0, 0.0])
 

@@ -23,8 +23,8 @@ from completesplat.data.co3d.writing import (
     write_set_list,
 )
 from completesplat.data.hidden_modes import in_mode
-from completesplat.data.images.files import save_jpeg, to_bytes
-from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_mini, draw_scene, render_frame
+from completesplat.data.images.files import save_jpeg, to_uint8
+from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_mini, draw_object_scene, render_frame
 from completesplat.data.toy.raytracing import WHITE
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
 from completesplat.data.toy.shapes import Array
@@ -42,7 +42,7 @@ LATEST_START = 9000
 ROOMS = "toy_rooms"
 SUBSET = "fewview_train"
 DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
-    "toy_objects": draw_scene,
+    "toy_objects": draw_object_scene,
     "toy_minis": draw_mini,
     "toy_marked_minis": partial(draw_mini, marked=True),
 }
@@ -51,7 +51,7 @@ DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
 KINDS = [*(category.removeprefix("toy_") for category in DRAW), "rooms"]
 
 
-class Numbers(TypedDict):
+class DataSetSize(TypedDict):
     """Number of scenes, of frames of each, side or height of the images in pixels, and seed of all scenes."""
 
     scenes: int
@@ -61,7 +61,7 @@ class Numbers(TypedDict):
 
 
 Factors = Annotated[Sequence[Annotated[float, Range(0)]], Entries(3, 3)]
-Written = tuple[str, list[Annotation], Annotation]
+WrittenScene = tuple[str, list[Annotation], Annotation]
 """Split of a sequence, and annotations of its frames and of itself."""
 
 
@@ -86,7 +86,7 @@ def _splits(scenes: int, rooms: bool) -> list[str]:
     return ["train"] * (scenes - val - test) + ["val"] * val + ["test"] * test
 
 
-def draw(category: str, seed: int, index: int, frames: int, light: Array) -> ToyScene:
+def draw_category(category: str, seed: int, index: int, frames: int, light: Array) -> ToyScene:
     """Draw a scene of a category (a key of `DRAW`) from a separate random generator; `light` is `Light.color`."""
     scene = DRAW[category](np.random.default_rng([seed, index]), frames)
     return replace(scene, light=scene.light._replace(color=light), point_colors=scene.point_colors * light)
@@ -94,19 +94,19 @@ def draw(category: str, seed: int, index: int, frames: int, light: Array) -> Toy
 
 def _write_scene(
     root: Path, place: tuple[int, str], category: str, frames: int, size: int, seed: int, light: Array
-) -> Written:
+) -> WrittenScene:
     """Write one sequence and return its split and annotations; its `toy.json` reveals the colour of the patch.
 
     A test scene has its images with every colour of the patch, too, for `test evaluation=hidden_modes`.
     """
     index, split = place
-    scene = draw(category, seed, index, frames, light)
+    scene = draw_category(category, seed, index, frames, light)
     name = f"{index:05d}_{scene.family}"
     for folder in FOLDERS:
         (root / name / folder).mkdir(parents=True)
     annotations = [_write_frame(root, (category, name, frame), scene, size, split) for frame in range(frames)]
     points = scene.unit * scene.points + scene.origin
-    write_points(root / name / "pointcloud.ply", points, to_bytes(scene.point_colors))
+    write_points(root / name / "pointcloud.ply", points, to_uint8(scene.point_colors))
     if split == "test":
         _write_modes(root / name, scene, size)
     record = {"family": scene.family, "hidden": scene.patch_color, "chances": scene.chances.tolist()}
@@ -123,7 +123,7 @@ def _write_modes(folder: Path, scene: ToyScene, size: int) -> None:
             save_jpeg(render_frame(painted, frame, size)[0], in_mode(image, mode))
 
 
-def _write_lists(category: Path, written: list[Written]) -> None:
+def _write_lists(category: Path, written: list[WrittenScene]) -> None:
     lists: dict[str, list[list[str | int]]] = {"train": [], "val": [], "test": []}
     for split, frames, _ in written:
         lists[split] += [[f["sequence_name"], f["frame_number"], f["image"]["path"]] for f in frames]
@@ -163,7 +163,7 @@ def write(
     workers: Positive | None = None,
     light: Factors = WHITE,
     progress: bool = True,
-    **numbers: Unpack[Numbers],
+    **numbers: Unpack[DataSetSize],
 ) -> Path:
     """Write scenes of a kind (one of `KINDS`) and return their folder, `out`/toy_<kind>, with a `toy.json`.
 

@@ -71,7 +71,7 @@ class ChangedFile(DataError, kind="changed file"):
 
 
 @contextmanager
-def at(file: Path | str | None = None, sequence: str | None = None, frame: int | None = None) -> Iterator[None]:
+def errors_at(file: Path | str | None = None, sequence: str | None = None, frame: int | None = None) -> Iterator[None]:
     """Add file, sequence and frame to a DataError raised within the context, unless it already has them."""
     try:
         yield
@@ -97,7 +97,7 @@ def require_file(path: Path) -> Path:
     return path
 
 
-def inside(root: Path, relative: str) -> Path:
+def path_below(root: Path, relative: str) -> Path:
     """Return the path below `root` that an annotation names. Links are followed if they stay below `root`.
 
     Backslashes are separators, as on Windows. An absolute path may lead into `root`.

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from completesplat.data.sequences import SequenceSource, overlaps, shared_names
-from completesplat.data.validation import TooFewFrames, at, refused_to
+from completesplat.data.validation import TooFewFrames, errors_at, refused_to
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError
 from completesplat.files import printable, write_json
@@ -25,12 +25,12 @@ Sources = Mapping[str, SequenceSource]
 _Batch = list[tuple[str, list[str]]]
 
 
-class LeftOut(DataError, kind="left out"):
+class ExcludedSequence(DataError, kind="left out"):
     """Intact sequence that the settings leave out."""
 
 
 @dataclass(frozen=True)
-class Findings:
+class AuditReport:
     """Result of a check, with the numbers of usable sequences (with at least two usable frames) and of their frames.
 
     Attributes:
@@ -49,7 +49,7 @@ class Findings:
         """Group errors by kind, and sequences left out by reason; the most frequent group comes first."""
         kinds: dict[str, list[DataError]] = {}
         for error in self.refused:
-            kind = f"{error.kind}: {error.reason}" if isinstance(error, LeftOut) else error.kind
+            kind = f"{error.kind}: {error.reason}" if isinstance(error, ExcludedSequence) else error.kind
             kinds.setdefault(kind, []).append(error)
         return dict(sorted(kinds.items(), key=lambda item: -len(item[1])))
 
@@ -71,7 +71,7 @@ class Findings:
 
 def check(
     sources: Sources, workers: int | None = None, progress: bool = True, splits_share_sequences: bool = False
-) -> Findings:
+) -> AuditReport:
     """Read every sequence and every image once, even if several splits share them.
 
     A sequence without errors that is not usable is refused for too few frames. `workers` are processes (None: one for
@@ -81,7 +81,8 @@ def check(
     refused: list[DataError] = []
     for source in sources.values():
         refused += source.refused
-        refused += [LeftOut(reason, sequence=name) for reason, names in source.left_out.items() for name in names]
+        for reason, names in source.left_out.items():
+            refused += [ExcludedSequence(reason, sequence=name) for name in names]
         refused += source.verify()
     sequences, batches = list[_Sequence](), _batches(sources)
     with Progress(disable=not progress) as bar:
@@ -95,7 +96,7 @@ def check(
         if len(sequence.usable) < FEWEST_FRAMES and sequence.name not in explained:
             refused.append(TooFewFrames(f"{len(sequence.usable)} usable, 2 are needed", sequence=sequence.name))
     unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in refused}
-    return Findings(
+    return AuditReport(
         **_numbers([sequence.usable for sequence in sequences]),
         refused=list(unique.values()),
         splits={
@@ -106,7 +107,7 @@ def check(
     )
 
 
-def show_findings(findings: Findings) -> None:
+def show_findings(findings: AuditReport) -> None:
     """Print errors by kind, with the first few of each, and the numbers of usable sequences and frames."""
     console = Console(width=None if Console().is_terminal else 120)
     if findings.refused:
@@ -157,13 +158,13 @@ def _read_batch(sources: Sources, batch: _Batch) -> list[_Sequence]:
 def _read(sources: Sources, name: str, splits: list[str]) -> _Sequence:
     sequence, seen = _Sequence(name), set[int]()
     for split in splits:
-        with refused_to(sequence.refused.append), at(sequence=name):
+        with refused_to(sequence.refused.append), errors_at(sequence=name):
             posed = sources[split].read(name)
             sequence.frames[split] = set(posed.frames)
             for index, frame in enumerate(posed.frames):
                 if frame not in seen:
                     seen.add(frame)
-                    with refused_to(sequence.refused.append), at(sequence=name, frame=frame):
+                    with refused_to(sequence.refused.append), errors_at(sequence=name, frame=frame):
                         posed.read(index)
                         sequence.usable.add(frame)
     return sequence

@@ -129,7 +129,7 @@ class Parameters(NamedTuple):
     colors: np.ndarray
 
 
-class Images(NamedTuple):
+class RenderedImages(NamedTuple):
     """Arrays [batch view channel height width] of a `Rendering`, or the gradients with respect to them."""
 
     color: np.ndarray
@@ -141,7 +141,7 @@ class Images(NamedTuple):
         return self.color[batch, view], self.depth[batch, view, 0], self.alpha[batch, view, 0]
 
 
-class Sums(NamedTuple):
+class BandGradients(NamedTuple):
     """Gradients [batch view band row 16] and places [batch view band lane] of all bands, see `array_layout`."""
 
     gradients: np.ndarray
@@ -182,10 +182,12 @@ class Drawing:
         # First and end block row of each band of a view.
         self.bands = [(i * rows // count, (i + 1) * rows // count) for i in range(count)]
 
-    def draw(self) -> Images:
+    def draw(self) -> RenderedImages:
         """Project and composite every view."""
         shape = (self.scenes, self.views)
-        images = Images(*(np.empty((*shape, channels, self.height, self.width), np.float32) for channels in (3, 1, 1)))
+        images = RenderedImages(
+            *(np.empty((*shape, channels, self.height, self.width), np.float32) for channels in (3, 1, 1))
+        )
         parallel(self._prepare, self.scenes)
         for start in range(0, self.scenes * self.views, self.held or 1):
             number = min(self.held, self.scenes * self.views - start)
@@ -193,10 +195,10 @@ class Drawing:
             parallel(partial(self._composite, images, start), number * len(self.bands))
         return images
 
-    def backward(self, images: Images, gradients: Images) -> Parameters:
+    def backward(self, images: RenderedImages, gradients: RenderedImages) -> Parameters:
         """Return gradients of the parameters from those of the images that `draw` returned."""
         bands, views = len(self.bands), self.scenes * self.views
-        sums = Sums(
+        sums = BandGradients(
             empty((self.scenes, self.views, bands, self.count + 1, layout.GRADIENT_WIDTH)),
             empty((self.scenes, self.views, bands, self.lanes), np.int32),
         )
@@ -220,12 +222,14 @@ class Drawing:
             unsorted, keys, order, self.records[slot],
         )  # fmt: skip
 
-    def _composite(self, images: Images, start: int, task: int) -> None:
+    def _composite(self, images: RenderedImages, start: int, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
         arrays = (*images.view(*divmod(start + slot, self.views)), None, None, None, None, None)
         self._run(slot, band, arrays)
 
-    def _composite_backward(self, images: Images, gradients: Images, sums: Sums, task: int) -> None:
+    def _composite_backward(
+        self, images: RenderedImages, gradients: RenderedImages, sums: BandGradients, task: int
+    ) -> None:
         slot, band = divmod(task, len(self.bands))
         scene, view = divmod(slot, self.views)
         arrays = (*images.view(scene, view), *gradients.view(scene, view))
@@ -240,7 +244,7 @@ class Drawing:
         count = self.visible_counts[slot]
         composite(self.records[slot], count, first, end, *self.thresholds, state, open_words, spans, *arrays)
 
-    def _project_backward(self, result: Parameters, sums: Sums, task: int) -> None:
+    def _project_backward(self, result: Parameters, sums: BandGradients, task: int) -> None:
         scene, chunk = divmod(task, -(-self.count // CHUNK))
         project_backward(
             *(x[scene] for x in self.parameters[1:4]), self.prepared[scene], self.cameras[scene],

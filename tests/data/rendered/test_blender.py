@@ -57,9 +57,9 @@ def line(tmp_path):
 def into(line, tmp_path):
     """Render the cube into a folder and return the reason for which that fails."""
 
-    def run(out, program, **settings):
+    def run(out, program, error=DataError, **settings):
         given = meshes.SETTINGS | {"views": 2, "size": 8, "samples": 1, "blender": program} | settings
-        with pytest.raises(DataError) as caught:
+        with pytest.raises(error) as caught:
             render(str(tmp_path / "meshes"), out=out, workers=1, **given)
         return str(caught.value)
 
@@ -83,15 +83,13 @@ def test_the_given_program_goes_before_the_variable_and_that_before_the_path(pro
     assert found.command[-1] == "--python"
 
 
-@pytest.mark.parametrize("version", ["4.1.1", "3.6.12", "2.79"])
-def test_an_old_blender_is_refused(line, program, version):
-    message = line(f"blender={program(VERSION.format(version))}")
-    assert f"Blender {version} is older than 4.2; get one by " in message
-
-
-def test_programs_that_are_no_blender_are_refused(line, program, tmp_path):
-    assert "neither Blender nor a Python with bpy (hello)" in line(f"blender={program('echo hello')}")
-    assert "(it prints nothing)" in line(f"blender={program('exit 3')}")
+def test_programs_that_are_no_blender_or_too_old_are_refused(line, program, tmp_path):
+    for text, message in {
+        "echo hello": "neither Blender nor a Python with bpy (hello)",
+        "exit 3": "(it prints nothing)",
+        **{VERSION.format(old): f"Blender {old} is older than 4.2; get one by " for old in ("4.1.1", "3.6.12", "2.79")},
+    }.items():
+        assert message in line(f"blender={program(text)}")
     assert f"{tmp_path / 'gone'}: cannot be run: No such file or directory" in line(f"blender={tmp_path / 'gone'}")
     assert f"{tmp_path}: cannot be run: Permission denied" in line(f"blender={tmp_path}")
     # The Python of these tests is one without bpy.
@@ -99,21 +97,17 @@ def test_programs_that_are_no_blender_are_refused(line, program, tmp_path):
     assert "neither Blender nor a Python with bpy (ModuleNotFoundError: No module named 'bpy')" in message
 
 
-def test_a_blender_that_crashes_or_fails_leaves_meshes_out(into, program, tmp_path):
+def test_a_blender_that_crashes_fails_or_hangs_leaves_meshes_out(into, program, tmp_path):
     for text, reason in {
         "kill -SEGV $$": "Blender ended by signal 11 (a crash, or more than 4.0 GB of memory)",
         "echo; echo Error: no license; exit 1": "Blender failed: Error: no license",
         "exit 0": "Blender failed: no message",
+        "exec sleep 60": "took longer than max_minutes=0.01",
     }.items():
-        message = into(tmp_path / "data", program(VERSION.format("4.2.0") + text))
+        limit = {"max_minutes": 0.01} if "sleep" in text else {}
+        message = into(tmp_path / "data", program(VERSION.format("4.2.0") + text), **limit)
         assert message == f"{tmp_path / 'data/rendered'}: none of 1 objects can be rendered: {reason}"
         assert [path.name for path in (tmp_path / "data/rendered").glob("*/")] == []
-
-
-def test_a_blender_that_hangs_leaves_its_mesh_out(into, program, tmp_path):
-    hanging = program(VERSION.format("4.2.0") + "exec sleep 60")
-    message = into(tmp_path / "data", hanging, max_minutes=0.01)
-    assert message.endswith("none of 1 objects can be rendered: took longer than max_minutes=0.01")
 
 
 # Runs the script for Blender with modules that stand for Blender's; its first step writes a file and never ends.
@@ -158,12 +152,10 @@ def test_a_mesh_gets_memory_by_the_size_of_its_file(into, program, tmp_path):
     assert into(tmp_path / "data", limited).endswith(f"Blender failed: {kilobytes}")
 
 
-def test_a_full_disk_is_no_reason_to_leave_meshes_out(line, program, tmp_path, monkeypatch):
-    given = meshes.SETTINGS | {"views": 2, "size": 8, "samples": 1}
-    given["blender"] = program(VERSION.format("4.2.0") + "echo cannot write; exit 1")
+def test_a_full_disk_is_no_reason_to_leave_meshes_out(into, program, tmp_path, monkeypatch):
+    failing = program(VERSION.format("4.2.0") + "echo cannot write; exit 1")
     monkeypatch.setattr(files, "_asked", lambda path: OSError(errno.ENOSPC, "No space left on device"))
-    with pytest.raises(DiskError, match="No space left on device"):
-        render(str(tmp_path / "meshes"), out=tmp_path / "data", workers=1, **given)
+    assert "No space left on device" in into(tmp_path / "data", failing, DiskError)
     assert not (tmp_path / "data/rendered/broken.json").exists()
 
 

@@ -11,6 +11,7 @@ import meshes
 import numpy as np
 import pytest
 import torch
+from packed_sequences import contents
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 from skimage.feature import corner_peaks
@@ -180,10 +181,6 @@ def cubes(tmp_path_factory: pytest.TempPathFactory) -> Path:
         meshes.write_cube(root / f"meshes/{number}/cube.obj", half=number + 1)
     render(str(root / "meshes"), out=root / "data", **QUICK)
     return root
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])

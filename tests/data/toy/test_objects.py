@@ -7,18 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from packed_sequences import contents
 from PIL import Image
+from support import refused
 
 from completesplat.data.co3d.annotations import camera_from_viewpoint
-from completesplat.data.toy import write_objects
+from completesplat.data.toy import write_objects, write_rooms
 from completesplat.data.toy.module import ToyObjectsDataModule
-from completesplat.data.toy.object_scene import CHANCES, PATCH_COLORS, draw_mini, draw_scene, render_frame
+from completesplat.data.toy.object_scene import CHANCES, PATCH_COLORS, draw_mini, draw_object_scene, render_frame
+from completesplat.data.toy.writing import draw_category
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import pixel_centers, project, unproject
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def annotations_of(root: Path) -> list[dict]:
@@ -37,7 +36,7 @@ def test_bytes_depend_on_the_seed_and_not_on_the_workers(tmp_path):
     trees = {}
     for name, seed, workers in (("one", 3, 1), ("two", 3, 2), ("other", 4, 1)):
         write_objects(tmp_path / name, scenes=3, frames=2, size=16, seed=seed, workers=workers, progress=False)
-        trees[name] = files_of(tmp_path / name)
+        trees[name] = contents(tmp_path / name)
     assert trees["one"] == trees["two"]
     first_frames = [path for path in trees["one"] if path.endswith("images/frame000001.jpg")]
     assert len(first_frames) == 3
@@ -100,7 +99,7 @@ def test_masks_are_soft_mass_is_their_sum_and_the_hidden_attribute_is_recorded(t
 
 
 def test_both_families_and_all_patch_colors_occur():
-    scenes = [draw_scene(np.random.default_rng([0, index]), frames=2) for index in range(12)]
+    scenes = [draw_object_scene(np.random.default_rng([0, index]), frames=2) for index in range(12)]
     assert {scene.family for scene in scenes} == {"bear", "hydrant"}
     assert {scene.patch_color for scene in scenes} == set(PATCH_COLORS)
 
@@ -139,3 +138,57 @@ def test_hidden_modes_of_written_minis_are_known_with_their_probabilities(tmp_pa
         assert torch.equal(scene.truths[scene.true_mode], scene.scene.targets.images[0, list(scene.views)])
         assert scene.region.any()
         assert torch.unique(scene.truths.flatten(1), dim=0).shape[0] == 4
+
+
+LIGHT = (1.0, 0.75, 0.5)
+
+
+def test_the_light_colours_what_it_falls_on_and_nothing_else():
+    white, lit = (draw_category("toy_minis", 0, 1, 2, np.array(light)) for light in ((1.0, 1.0, 1.0), LIGHT))
+    (image, coverage, depth), (other, *geometry) = (render_frame(scene, 1, 24) for scene in (white, lit))
+    assert np.array_equal([coverage, depth], geometry)
+    np.testing.assert_allclose(other[coverage == 1], image[coverage == 1] * LIGHT)
+    assert np.array_equal(other[coverage == 0], image[coverage == 0])  # the dome
+    np.testing.assert_allclose(lit.point_colors, white.point_colors * LIGHT)
+    ground = draw_category("toy_objects", 0, 1, 2, np.array(LIGHT)), draw_category("toy_objects", 0, 1, 2, np.ones(3))
+    lowest, expected = (render_frame(scene, 1, 24)[0][-1] for scene in ground)
+    np.testing.assert_allclose(lowest, expected * LIGHT)
+
+
+def test_rooms_are_lit_too(tmp_path):
+    settings = {"scenes": 2, "frames": 2, "size": 16, "seed": 0, "workers": 1, "progress": False}
+    lights = {"a": (1, 1, 1), "b": LIGHT}
+    folders = [write_rooms(tmp_path / name, **settings, light=light) for name, light in lights.items()]
+    images = [sorted(folder.glob("text/*/*/*.jpg")) for folder in folders]
+    assert len(images[0]) == 4
+    means = [[np.asarray(Image.open(path)).mean((0, 1)) for path in paths] for paths in images]
+    np.testing.assert_allclose(means[1], np.array(means[0]) * LIGHT, atol=3)  # JPEG's
+
+
+@pytest.fixture(scope="module")
+def lit(tmp_path_factory):
+    """Root of scenes under another light."""
+    root = tmp_path_factory.mktemp("lit")
+    write_objects(root, scenes=3, frames=4, size=32, seed=0, workers=1, light=LIGHT, progress=False)
+    return root
+
+
+def test_hidden_modes_are_written_in_the_same_light(lit):
+    module = ToyObjectsDataModule(str(lit), image_size=32)
+    module.setup("test")
+    scene = module.hidden_modes(views=2, spread_views=2)[0]
+    assert torch.equal(scene.truths[scene.true_mode], scene.scene.targets.images[0, list(scene.views)])
+
+
+def test_a_folder_keeps_its_light_and_white_light_is_not_named(lit, toy_root):
+    settings = {"scenes": 3, "frames": 4, "size": 32, "seed": 0, "workers": 1, "progress": False}
+    assert write_objects(lit, **settings, light=list(LIGHT)) == lit / "toy_objects"
+    with pytest.raises(DataError, match="already holds something else"):
+        write_objects(lit, **settings)
+    assert write_objects(toy_root, **(settings | {"scenes": 4}), light=[1, 1, 1]) == toy_root / "toy_objects"
+    assert "light" not in json.loads((toy_root / "toy_objects/toy.json").read_text())
+
+
+@pytest.mark.parametrize(("light", "reason"), [("[1,1]", "must have 3 entries"), ("[1,-1,1]", "must be at least 0")])
+def test_a_light_that_is_no_colour_is_refused(light, reason):
+    assert reason in refused("data", "data_task=toy", f"light={light}")

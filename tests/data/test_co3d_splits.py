@@ -1,22 +1,11 @@
 import json
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
+import co3d_trees as trees
 import numpy as np
 import pytest
-from co3d_trees import (
-    CATEGORY,
-    FRAMES,
-    SET_LIST,
-    SUBSET,
-    change,
-    frame_entry,
-    look,
-    orbit,
-    sequence_entry,
-    write_annotations,
-    write_tree,
-)
 
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.splits import Category, Filters, SeededSplit, read_category
@@ -33,13 +22,14 @@ def annotate(
     qualities: Mapping[str, tuple[float | None, float | None]] | None = None,
 ) -> None:
     """Annotations without any image."""
-    viewpoints = [look(eye, np.zeros(3)) for eye in orbit(max(counts.values(), default=0))]
-    frames = [frame_entry(name, i, viewpoints[i]) for name, count in counts.items() for i in range(count)]
-    write_annotations(root, frames, [sequence_entry(n, *(qualities or {}).get(n, (1.0, 1.0))) for n in counts], splits)
+    viewpoints = [trees.look(eye, np.zeros(3)) for eye in trees.orbit(max(counts.values(), default=0))]
+    frames = [trees.frame_entry(name, i, viewpoints[i]) for name, count in counts.items() for i in range(count)]
+    sequences = [trees.sequence_entry(name, *(qualities or {}).get(name, (1.0, 1.0))) for name in counts]
+    trees.write_annotations(root, frames, sequences, splits)
 
 
-def read(root: Path, subset: str | None = SUBSET, rule: SeededSplit | None = None, **filters) -> Category:
-    return read_category(root, CATEGORY, subset, rule or SeededSplit(0.2, 0.3, 0), Filters(**filters), True)
+def read(root: Path, subset: str | None = trees.SUBSET, rule: SeededSplit | None = None, **filters) -> Category:
+    return read_category(root, trees.CATEGORY, subset, rule or SeededSplit(0.2, 0.3, 0), Filters(**filters), True)
 
 
 def names(category: Category) -> dict[str, set[str]]:
@@ -52,8 +42,8 @@ def many(count: int) -> dict[str, int]:
 
 def test_frames_come_in_order_whatever_the_file_says(tmp_path):
     annotate(tmp_path, {"a": 4, "b": 4, "c": 4}, {"train": ["a"], "val": ["b"], "test": ["c"]})
-    change(tmp_path / CATEGORY / FRAMES, lambda entries: entries.reverse())
-    change(tmp_path / CATEGORY / SET_LIST, lambda splits: splits["train"].reverse())
+    trees.change(tmp_path / trees.CATEGORY / trees.FRAMES, lambda entries: entries.reverse())
+    trees.change(tmp_path / trees.CATEGORY / trees.SET_LIST, lambda splits: splits["train"].reverse())
     frames = [read(tmp_path).splits[split].frames[name] for split, name in zip(SPLITS, "abc", strict=True)]
     assert [[frame.number for frame in each] for each in frames] == [[0, 1, 2, 3]] * 3
     assert frames[0][0].camera.image_size == (24, 32)
@@ -62,7 +52,7 @@ def test_frames_come_in_order_whatever_the_file_says(tmp_path):
 def test_whole_sequences_are_split_by_seed_also_where_there_are_set_lists(tmp_path):
     annotate(tmp_path, many(60), {"train": list(many(60)), "val": [], "test": []})
     assert names(read(tmp_path))["test"] == set()
-    category = read(tmp_path, subset=None)
+    category = read(tmp_path, None)
     taken = names(category)
     assert taken["train"] | taken["val"] | taken["test"] == set(many(60))
     assert sum(map(len, taken.values())) == 60
@@ -90,34 +80,33 @@ def test_three_sequences_are_one_for_each_split_and_fewer_are_refused(tmp_path):
 def test_unknown_subsets_and_missing_and_outside_categories_are_refused(tmp_path):
     annotate(tmp_path / "root", many(3), {"train": list(many(3)), "val": [], "test": []})
     annotate(tmp_path, many(3))
-    lists = tmp_path / "root" / CATEGORY / "set_lists"
+    lists = tmp_path / "root" / trees.CATEGORY / "set_lists"
     (lists / "set_lists_manyview_dev_0.json").write_text("{}")
     with pytest.raises(DataError, match=r"'other'.*fewview_dev, manyview_dev_0") as caught:
         read(tmp_path / "root", subset="other")
     assert caught.value.file == str(lists)
     for path in lists.iterdir():
         path.unlink()
-    with pytest.raises(
-        DataError, match=r"no set list 'other' there; nor any other; give data.subset=null, which splits"
-    ):
+    nothing = r"no set list 'other' there; nor any other; give data.subset=null, which splits"
+    with pytest.raises(DataError, match=nothing):
         read(tmp_path / "root", subset="other")
     with pytest.raises(DataError, match="no such CO3D category") as caught:
-        read_category(tmp_path / "root", "none", SUBSET, SeededSplit(0.1, 0.1, 0), Filters())
+        read_category(tmp_path / "root", "none", trees.SUBSET, SeededSplit(0.1, 0.1, 0), Filters())
     assert caught.value.file == str(tmp_path / "root/none")
-    for outside in (f"{CATEGORY}/../../{CATEGORY}", str(tmp_path / CATEGORY), ""):
+    for outside in (f"{trees.CATEGORY}/../../{trees.CATEGORY}", str(tmp_path / trees.CATEGORY), ""):
         with pytest.raises(OutsidePath):
-            read_category(tmp_path / "root", outside, SUBSET, SeededSplit(0.1, 0.1, 0), Filters())
+            read_category(tmp_path / "root", outside, trees.SUBSET, SeededSplit(0.1, 0.1, 0), Filters())
 
 
 def test_the_single_sequence_form_divides_the_frames_of_one_sequence(tmp_path):
     """This form has only many-view lists. Each list divides the frames of one sequence."""
-    category = write_tree(tmp_path, {"one": 9, "two": 3}, None)
+    category = trees.write_tree(tmp_path, {"one": 9, "two": 3}, None)
     parts = {"train": [0, 1, 3, 4], "val": [2, 5], "test": [6, 7, 8]}
-    listed = {split: [["one", i, f"{CATEGORY}/one/images/x"] for i in part] for split, part in parts.items()}
+    listed = {split: [["one", i, f"{trees.CATEGORY}/one/images/x"] for i in part] for split, part in parts.items()}
     (category / "set_lists").mkdir()
     (category / "set_lists/set_lists_manyview_dev_0.json").write_text(json.dumps(listed))
     which = {"subset": "manyview_dev_0", "allow_shared_sequences": True}
-    data = CO3DDataModule(str(tmp_path), CATEGORY, **which, image_size=8, batch_size=1, on_bad="raise")
+    data = CO3DDataModule(str(tmp_path), trees.CATEGORY, **which, image_size=8, batch_size=1, on_bad="raise")
     data.setup("fit")
     data.setup("test")
     assert {s: {n: data.source(s).read(n).frames for n in data.source(s).names} for s in SPLITS} == {
@@ -125,7 +114,7 @@ def test_the_single_sequence_form_divides_the_frames_of_one_sequence(tmp_path):
     }
     assert [batch.names for batch in data.train_dataloader()] == [("one",)]
     with pytest.raises(DataError, match="among manyview_dev_0"):
-        CO3DDataModule(str(tmp_path), CATEGORY).setup("fit")
+        CO3DDataModule(str(tmp_path), trees.CATEGORY).setup("fit")
 
 
 def test_sequences_with_few_frames_are_left_out_and_named(tmp_path):
@@ -169,17 +158,97 @@ def test_of_the_training_sequences_the_best_are_kept(tmp_path):
 
 def test_cameras_that_do_not_move_are_refused(tmp_path):
     """Within a hundredth of their distance to the object, also where they turn."""
-    category = write_tree(tmp_path, {"a": 3, "b": 3, "c": 3}, {"train": ["a"], "val": ["b"], "test": ["c"]})
+    category = trees.write_tree(tmp_path, {"a": 3, "b": 3, "c": 3}, {"train": ["a"], "val": ["b"], "test": ["c"]})
 
     def stand(entries):
         for i in range(3):
             target = np.array([0.3 * i, 0, 0])
-            entries[i]["viewpoint"] = look(np.array([0.019 * i, 0, -4]), target)
-            entries[3 + i]["viewpoint"] = look(np.array([0.022 * i, 0, -4]), target)
+            entries[i]["viewpoint"] = trees.look(np.array([0.019 * i, 0, -4]), target)
+            entries[3 + i]["viewpoint"] = trees.look(np.array([0.022 * i, 0, -4]), target)
 
-    change(category / FRAMES, stand)
-    data = CO3DDataModule(str(tmp_path), CATEGORY, image_size=8)
+    trees.change(category / trees.FRAMES, stand)
+    data = CO3DDataModule(str(tmp_path), trees.CATEGORY, image_size=8)
     with pytest.raises(BadCamera, match="do not move") as caught:
         data.source("train").read("a")
-    assert (caught.value.file, caught.value.sequence) == (str(category / FRAMES), "a")
+    assert (caught.value.file, caught.value.sequence) == (str(category / trees.FRAMES), "a")
     assert data.source("val").read("b").frames == (0, 1, 2)
+
+
+COUNTS = dict.fromkeys("abcdefgh", 3)
+APART = {"train": "abcdef", "val": "g", "test": "h"}
+SHARED = {"train": "abcdef", "val": "", "test": "abcdefgh"}
+"""As `set_lists_fewview_train.json`: all of training is tested too (facebookresearch/co3d issue 49)."""
+
+
+def module(root: Path, **settings) -> CO3DDataModule:
+    return CO3DDataModule(str(root), trees.CATEGORY, image_size=8, **settings)
+
+
+def listed_names(data: CO3DDataModule) -> dict[str, list[str]]:
+    return {split: data.source(split).names for split in SPLITS}
+
+
+def test_few_views_of_sequences_never_seen_are_the_default_and_a_split_by_seed_must_be_asked_for(tmp_path):
+    """Splatter Image takes `fewview_dev` (`data_preprocessing/preprocess_co3d.py`)."""
+    trees.write_tree(tmp_path / "lists", COUNTS, APART)
+    data = module(tmp_path / "lists")
+    assert listed_names(data) == {split: list(listed) for split, listed in APART.items()}
+    assert data.describe()["subset"] == "fewview_dev"
+    trees.write_tree(tmp_path / "none", COUNTS, None)
+    with pytest.raises(DataError, match=r"data\.subset=null"):
+        module(tmp_path / "none").setup("fit")
+    by_seed = module(tmp_path / "none", subset=None, batch_size=2, targets=1)
+    by_seed.setup("fit")
+    assert by_seed.describe()["subset"] is None
+    assert "seed 0" in by_seed.describe()["split"]
+
+
+TESTS_ON_TRAINING = r"6 sequences .* a, b, c, d, e, .*allow_shared_sequences=true"
+CHOOSES_BY_TEST = r"1 sequences are in both val and test: h; .*allow_shared"
+# Each list: (its splits, refusal, a split, its names where shared sequences are allowed)
+OVERLAPS = {
+    "training is tested": (SHARED, TESTS_ON_TRAINING, "test", "abcdefgh"),
+    "the test validates": (APART | {"val": "h"}, CHOOSES_BY_TEST, "val", "h"),
+    "the test validates too": (APART | {"val": "gh"}, CHOOSES_BY_TEST, "val", "gh"),
+}
+
+
+@pytest.mark.parametrize(("splits", "message", "split", "allowed"), OVERLAPS.values(), ids=OVERLAPS)
+def test_a_list_whose_splits_share_sequences_is_refused_unless_asked_for(tmp_path, splits, message, split, allowed):
+    category = trees.write_tree(tmp_path, COUNTS, splits)
+    for stage, on_bad in product(("fit", "test"), ("skip", "raise")):
+        with pytest.raises(DataError, match=message) as caught:
+            module(tmp_path, on_bad=on_bad).setup(stage)
+        assert caught.value.file == str(category / trees.SET_LIST)
+    shared = module(tmp_path, allow_shared_sequences=True)
+    assert shared.source(split).names == list(allowed)
+    assert ["allowed" in data.describe()["split"] for data in (shared, module(tmp_path))] == [True, False]
+
+
+def test_validation_leaves_out_what_is_trained_on(tmp_path):
+    trees.write_tree(tmp_path, COUNTS, APART | {"val": "abg"})
+    source = module(tmp_path).source("val")
+    assert (source.names, source.left_out) == (["g"], {"in training too": ["a", "b"]})
+    assert module(tmp_path, allow_shared_sequences=True).source("val").names == ["a", "b", "g"]
+
+
+@pytest.mark.parametrize("val", ["", "ab"])
+def test_a_seeded_part_of_training_validates_where_nothing_else_does(tmp_path, caplog, val):
+    trees.write_tree(tmp_path, COUNTS, APART | {"val": val})
+    result = [listed_names(module(tmp_path, val_fraction=0.4, split_seed=seed)) for seed in (0, 0, 1)]
+    assert result[0] == result[1] != result[2]
+    for taken in result:
+        assert taken["val"]
+        assert sorted(taken["train"] + taken["val"]) == list("abcdef")
+        assert taken["test"] == ["h"]
+    assert f"{len(result[0]['val'])} of 6 training sequences validate" in caplog.text
+    assert "validates" in module(tmp_path).describe()["split"]
+
+
+def test_a_source_knows_how_many_sequences_its_list_has(tmp_path):
+    """Also those that filters leave out or that cannot be read."""
+    category = trees.write_tree(tmp_path, COUNTS, APART | {"train": "abcd", "test": "efh"})
+    assert module(tmp_path, min_frames=4).source("test").listed == 3
+    trees.change(category / trees.SET_LIST, lambda splits: splits["test"].append(["gone", 0, "x"]))
+    source = module(tmp_path).source("test")
+    assert (len(source.names), source.listed) == (3, 4)

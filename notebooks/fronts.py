@@ -1,0 +1,59 @@
+"""How well scenes keep what the photo shows, before and after fitting (experiments.md, "Fronts").
+
+python notebooks/fronts.py PHOTO ...                                 # with the nearest weights, as `predict` takes them
+python notebooks/fronts.py weights=NAME experiment=... data=... ...  # a test set: input views and novel views
+"""
+
+import statistics
+import sys
+
+import torch
+
+import completesplat
+from completesplat.metrics.images import psnr
+from completesplat.rasterizers.selection import auto
+from completesplat.scene_model import distances_to_shipped
+
+ROUNDS, rasterizer = (0, 2, 5, 10, 20, 40), auto()
+models, results = {}, {rounds: [] for rounds in ROUNDS}
+
+
+def model_of(name):
+    """Return weights, which are opened once, and the grey value behind their scenes."""
+    if name not in models:
+        models[name] = completesplat.CompleteSplat.from_pretrained(name)
+    return models[name], 0.5 if models[name].background is None else models[name].background
+
+
+def score(images, cameras, depth_range, targets, model, background):
+    """Note the PSNR of the reference view, and of the novel views if there are any, after each number of rounds."""
+    for rounds in ROUNDS:
+        scene = model.generate(images, cameras, depth_range, seed=0, color_fits=rounds)
+        views = [(cameras[:, None], images[:, None]), *([(targets.cameras, targets.images)] if targets else [])]
+        with torch.no_grad():
+            rendered = [rasterizer(scene, view).over(background)[0] for view, _ in views]
+        results[rounds].append(
+            [psnr(ours, true[0]).mean().item() for ours, (_, true) in zip(rendered, views, strict=True)]
+        )
+
+
+if sys.argv[1].startswith("weights="):
+    model, background = model_of(sys.argv[1].removeprefix("weights="))
+    settings = "data.workers=0", "data.evaluation_batch_size=1", *sys.argv[2:]
+    data, _ = completesplat.instantiate(completesplat.compose("fit", *settings))
+    data.setup("test")
+    for batch in data.test_dataloader():
+        reference = batch.reference
+        score(reference.images, reference.cameras, batch.depth_range, batch.targets, model, background)
+else:
+    for name in sys.argv[1:]:
+        model, background = model_of(next(iter(distances_to_shipped(name))))
+        photo = model.read(name)
+        inputs = photo.image[None], model.camera(photo)[None], model.depth_range_of(photo)[None]
+        score(*inputs, None, model, background)
+for rounds, rows in results.items():
+    front, *novel = zip(*rows, strict=True)
+    text = (
+        f"{rounds} rounds: {len(rows)} input views: median {statistics.median(front):.2f} dB, worst {min(front):.2f} dB"
+    )
+    print(text, *(f"novel views: mean {statistics.mean(values):.2f} dB" for values in novel), sep="; ")
