@@ -13,10 +13,10 @@ SHAPE = {"channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_groups": 4}
 SAFETENSORS, BIN = "diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.bin"
 
 
-def stable_diffusion_vae(channels=SHAPE["channels"], layers_per_block=1, norm_groups=4) -> AutoencoderKL:
+def stable_diffusion_vae(channels=SHAPE["channels"], layers_per_block=1, norm_groups=4, **more) -> AutoencoderKL:
     blocks = {"down_block_types": ("DownEncoderBlock2D",) * 4, "up_block_types": ("UpDecoderBlock2D",) * 4}
     shape = {"block_out_channels": channels, "layers_per_block": layers_per_block, "norm_num_groups": norm_groups}
-    return AutoencoderKL(**blocks, **shape, latent_channels=4).eval()
+    return AutoencoderKL(**blocks, **shape, latent_channels=4, **more).eval()
 
 
 def random_vae() -> AutoencoderKL:

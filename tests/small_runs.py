@@ -4,8 +4,8 @@ import csv
 from pathlib import Path
 
 import torch
-from lightning import Trainer
 from lightning.pytorch.demos.boring_classes import BoringModel
+from scenes_for_training import quiet_trainer
 
 from completesplat.training.checkpoints import LAST, CheckpointFiles, Checkpoints
 from completesplat.training.loggers import ContinuedCSVLogger
@@ -61,11 +61,9 @@ def fit(
     torch.manual_seed(0)
     module, logger = model(), ContinuedCSVLogger(str(folder))
     checkpoints = Checkpoints(str(folder / "checkpoints"), every_n_train_steps=every, keep_every=keep_every * every)
-    trainer = Trainer(
-        max_steps=steps, accelerator="cpu", logger=logger, plugins=[CheckpointFiles()], callbacks=[checkpoints],
-        log_every_n_steps=2, val_check_interval=3, check_val_every_n_epoch=None, num_sanity_val_steps=0,
-        enable_progress_bar=False, enable_model_summary=False, **settings,
-    )  # fmt: skip
+    settings |= {"logger": logger, "plugins": [CheckpointFiles()], "callbacks": [checkpoints]}
+    settings |= {"enable_checkpointing": True, "num_sanity_val_steps": 0, "log_every_n_steps": 2}
+    trainer = quiet_trainer(max_steps=steps, val_check_interval=3, check_val_every_n_epoch=None, **settings)
     last = folder / "checkpoints" / LAST
     validation = torch.utils.data.DataLoader(torch.ones(1, 32))
     start = start or (last if last.is_file() else None)

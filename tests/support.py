@@ -124,8 +124,14 @@ def tiny_generator() -> CompleteSplat:
     return model.eval()
 
 
+def round_gaussians(means: torch.Tensor, scale: float, opacity: float, colors: object) -> Gaussians:
+    """Gaussians of one size and opacity at these means; a colour for each, or one for all."""
+    shape, turns = means.shape[:-1], torch.tensor([1.0, 0, 0, 0])
+    scales, opacities = torch.full((*shape, 3), scale), torch.full(shape, opacity)
+    colors = torch.as_tensor(colors).float().expand(*shape, 3)
+    return Gaussians(means, turns.expand(*shape, 4), scales, opacities, colors)
+
+
 def some_gaussians(batch: int, scale: float = 0.1, opacity: float = 0.5) -> Gaussians:
     """Two equal Gaussians in each set of a batch."""
-    quaternions = torch.tensor([1.0, 0, 0, 0]).expand(batch, 2, 4)
-    scales, opacities = torch.full((batch, 2, 3), scale), torch.full((batch, 2), opacity)
-    return Gaussians(torch.zeros(batch, 2, 3), quaternions, scales, opacities, torch.zeros(batch, 2, 3))
+    return round_gaussians(torch.zeros(batch, 2, 3), scale, opacity, torch.zeros(batch, 2, 3))

@@ -81,11 +81,7 @@ def test_a_configuration_names_nothing_but_parts_of_a_model(folder, trap, place,
 @pytest.mark.parametrize(
     ("place", "value", "reason"),
     [
-        (
-            "denoiser._target_",
-            "mine.Mine",
-            "denoiser names mine.Mine, which is no part of a model; allowed are Den",
-        ),
+        ("denoiser._target_", "mine.Mine", "denoiser names mine.Mine, which is no part of a model; allowed are Den"),
         ("denoiser._target_", "\x1b[2J", r"denoiser names \x1b[2J, which is no part"),
         ("sampler._partial_", True, "sampler._partial_: there is no such setting, but scheduler, steps"),
         ("sampler.steps", "${oc.env:HOME}", "sampler.steps=${oc.env:HOME}: must be a whole number"),

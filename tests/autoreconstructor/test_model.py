@@ -1,6 +1,6 @@
 import pytest
 import torch
-from diffusers import AutoencoderKL
+from pretrained_vaes import stable_diffusion_vae
 
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
@@ -23,14 +23,7 @@ def images():
 
 def test_encoder_and_reconstructor_without_skips_are_diffusers_autoencoder(images):
     model = build(skip_levels=()).eval()
-    theirs = AutoencoderKL(
-        out_channels=30,
-        down_block_types=("DownEncoderBlock2D",) * 4,
-        up_block_types=("UpDecoderBlock2D",) * 4,
-        block_out_channels=TINY["channels"],
-        layers_per_block=TINY["layers_per_block"],
-        norm_num_groups=TINY["norm_groups"],
-    ).eval()
+    theirs = stable_diffusion_vae(**TINY, out_channels=30)
     theirs.encoder.load_state_dict(model.encoder.network.state_dict())
     theirs.quant_conv.load_state_dict(model.encoder.quant_conv.state_dict())
     theirs.decoder.load_state_dict(model.reconstructor.network.state_dict())

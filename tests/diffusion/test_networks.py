@@ -45,34 +45,23 @@ def test_recomputed_activations_give_the_same_gradients(kind, monkeypatch):
         torch.testing.assert_close(gradients[1][name], expected, msg=name)
 
 
-def test_cross_attention_without_text_adds_a_constant():
-    denoiser = tiny(TextlessStableDiffusion)
+def test_cross_attention_without_text_adds_a_constant_and_asks_nothing_where_nothing_is_trained():
+    denoiser, added, asked = tiny(TextlessStableDiffusion), [], []
     assert not any("context" in name for name in denoiser.state_dict())  # the token of zeros is no weight
     crossing = [module for name, module in denoiser.network.named_modules() if name.endswith("attn2")]
     assert len(crossing) == 4  # One of the way down, two of the way up, one between.
-    added = []
     for module in crossing:
         torch.nn.init.normal_(module.to_out[0].bias)
         module.register_forward_hook(lambda module, _, output: added.append((output, module.to_out[0].bias)))
-    with torch.no_grad():
-        denoiser(*inputs())
-    assert len(added) == 4
-    assert all(torch.equal(output, bias.expand_as(output)) for output, bias in added)
-
-
-def test_cross_attention_asks_nothing_where_nothing_is_trained_and_gives_the_same():
-    denoiser, asked = tiny(TextlessStableDiffusion), []
-    crossing = [module for name, module in denoiser.network.named_modules() if name.endswith("attn2")]
-    for module in crossing:
-        torch.nn.init.normal_(module.to_out[0].bias)
         module.to_q.register_forward_hook(lambda *_: asked.append(1))
     trained = denoiser(*inputs())
-    assert len(asked) == len(crossing)  # DDP waits for a gradient of every weight
+    assert (len(asked), len(added)) == (4, 4)  # DDP waits for a gradient of every weight
     trained.sum().backward()
     assert all(parameter.grad is not None for parameter in denoiser.parameters())
     with torch.no_grad():
         drawn = denoiser(*inputs())
-    assert len(asked) == len(crossing)
+    assert (len(asked), len(added)) == (4, 8)
+    assert all(torch.equal(output, bias.expand_as(output)) for output, bias in added[4:])
     assert torch.equal(drawn, trained)
 
 

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import write_formats
 from completesplat.export.ply import read_ply
-from completesplat.export.splat_transform import PageView, SplatTransform, find_splat_transform
+from completesplat.export.splat_transform import PageView
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 
@@ -29,14 +28,6 @@ PRECISION = {
     "spz": (1 / 4096, 1 / 32 + 1e-4, 1 / 255, 0.005),
     "sog": (1e-3, 0.02, 1 / 255, 0.03),
 }
-
-
-@pytest.fixture(scope="module")
-def converter() -> SplatTransform:
-    try:
-        return find_splat_transform()
-    except CompleteSplatError as error:
-        pytest.skip(str(error))
 
 
 def some(count: int = 400) -> Gaussians:

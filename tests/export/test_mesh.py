@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from support import round_gaussians
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export import mesh
@@ -28,10 +29,7 @@ def coarse(monkeypatch):
 
 
 def blobs(points: np.ndarray, colors: object, size: float = 0.02) -> Gaussians:
-    means = torch.tensor(points, dtype=torch.float32)
-    count, turns = len(means), torch.tensor([1.0, 0, 0, 0])
-    rest = torch.full((count, 3), size), torch.full((count,), 0.95)
-    return Gaussians(means, turns.expand(count, 4), *rest, torch.tensor(colors).float().expand(count, 3))
+    return round_gaussians(torch.tensor(points, dtype=torch.float32), size, 0.95, colors)
 
 
 def sphere(center: tuple[float, ...], radius: float, count: int) -> np.ndarray:

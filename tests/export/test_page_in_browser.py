@@ -7,9 +7,8 @@ import shutil
 import pytest
 import torch
 from PIL import Image
+from support import round_gaussians
 
-from completesplat.errors import CompleteSplatError
-from completesplat.export import splat_transform
 from completesplat.export.images import to_pixels
 from completesplat.export.splat_transform import (
     LARGEST_FOV,
@@ -36,16 +35,14 @@ REFERENCE = Cameras(torch.eye(4), pinhole(50, 64), (64, 64))
 def room() -> Gaussians:
     """The balls within far walls, which reach behind the camera."""
     balls, far = scene(), torch.tensor([[-9.0, 0, -9], [9, 0, -9], [-9, 0, 9], [9, 0, 9], [0, -9, 0], [0, 9, 0]])
-    walls = Gaussians(far, far.new_tensor([[1.0, 0, 0, 0]] * 6), far * 0 + 0.5, far[:, 0] * 0 + 0.9, far * 0 + 0.5)
-    return merge_gaussians([balls, walls])
+    return merge_gaussians([balls, round_gaussians(far, 0.5, 0.9, 0.5)])
 
 
 def scene() -> Gaussians:
     """Balls of different colours to the right, to the left, above, and one half hidden by the one on the right."""
     means = torch.tensor([[0.7, 0.0, 3.0], [-0.7, 0.1, 3.0], [0.0, -0.7, 3.0], [0.9, 0.2, 4.0]])
     colors = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])
-    quaternions = torch.tensor([1.0, 0, 0, 0]).expand(4, 4)
-    return Gaussians(means, quaternions, torch.full((4, 3), 0.15), torch.full((4,), 0.99), colors)
+    return round_gaussians(means, 0.15, 0.99, colors)
 
 
 def our_image(view: PageView) -> torch.Tensor:
@@ -84,11 +81,7 @@ def screenshot(path, requests: list[str], drag: int = 0) -> torch.Tensor:
     return screenshot
 
 
-def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path):
-    try:
-        converter = splat_transform.find_splat_transform()
-    except CompleteSplatError as error:
-        pytest.skip(str(error))
+def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path, converter):
     view = PageView(REFERENCE, PIVOT, UP, 0.25)
     write_turning_page(tmp_path / "scene.html", scene(), view, converter)
     requests: list[str] = []
@@ -100,11 +93,7 @@ def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path):
         assert (other - ours).abs().mean() > 0.01
 
 
-def test_dragging_turns_the_page_s_camera_about_the_object_also_within_walls(tmp_path):
-    try:
-        converter = splat_transform.find_splat_transform()
-    except CompleteSplatError as error:
-        pytest.skip(str(error))
+def test_dragging_turns_the_page_s_camera_about_the_object_also_within_walls(tmp_path, converter):
     write_turning_page(tmp_path / "scene.html", room(), PageView(REFERENCE, PIVOT, UP, 0.25), converter)
     before, after = (screenshot(tmp_path / "scene.html", [], drag) for drag in (0, 150))
     for color in torch.eye(3):  # the balls around the pivot

@@ -4,9 +4,9 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
+from support import round_gaussians
 
 from completesplat.export.video import orbit_views, write_video
-from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -44,26 +44,16 @@ def test_odd_sizes_are_padded_and_small_ones_enlarged(tmp_path, caplog):
 
 def test_no_frames_another_format_and_nan_are_refused(tmp_path):
     black, broken = torch.zeros(1, 3, 64, 64), torch.full((2, 3, 64, 64), torch.nan)
-    for name, frames, message in (
-        ("a.mp4", black[:0], "needs"),
-        ("a.txt", black, "needs"),
-        ("a.mp4", broken, "finite"),
-    ):
+    refused = ("a.mp4", black[:0], "needs"), ("a.txt", black, "needs"), ("a.mp4", broken, "finite")
+    for name, frames, message in refused:
         with pytest.raises(ValueError, match=message):
             write_video(tmp_path / name, frames)
     assert list(tmp_path.iterdir()) == []
 
 
-def ball(center, color):
-    """Return one opaque round Gaussian."""
-    quaternions, scales = torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.2)
-    return Gaussians(torch.tensor([center]), quaternions, scales, torch.tensor([1.0]), torch.tensor([color]))
-
-
 def test_the_pivot_stays_in_the_centre_at_the_same_distance_in_front_of_the_background():
-    images, depth = orbit_views(
-        ReferenceRasterizer(), ball([0.0, 0.0, 3.0], [1.0, 0.5, 0.0]), CAMERA, PIVOT, 10, 0.75, UP
-    )
+    orange = round_gaussians(torch.tensor([[0.0, 0.0, 3.0]]), 0.2, 1.0, [1.0, 0.5, 0.0])
+    images, depth = orbit_views(ReferenceRasterizer(), orange, CAMERA, PIVOT, 10, 0.75, UP)
     assert images.shape == (10, 3, 33, 33)  # more views than are rendered at a time
     torch.testing.assert_close(depth[:, 0, 16, 16], torch.full((10,), 3.0), rtol=0, atol=1e-4)
     torch.testing.assert_close(images[:, :, 16, 16], torch.tensor([1.0, 0.5, 0.0]).expand(10, 3), rtol=0, atol=3e-3)
@@ -72,7 +62,7 @@ def test_the_pivot_stays_in_the_centre_at_the_same_distance_in_front_of_the_back
 
 
 def test_the_first_view_is_the_reference_view_and_the_axis_points_up():
-    gaussians = ball([0.3, -0.5, 3.0], [1.0, 0.0, 0.0])
+    gaussians = round_gaussians(torch.tensor([[0.3, -0.5, 3.0]]), 0.2, 1.0, [1.0, 0.0, 0.0])
     world_to_camera = torch.eye(4)
     world_to_camera[:3, :3] = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
     turned = dataclasses.replace(CAMERA, world_to_camera=world_to_camera)

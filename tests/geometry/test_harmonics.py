@@ -32,15 +32,12 @@ def test_signs_and_order_are_those_of_3d_gaussian_splatting() -> None:
     """The signs along the axes and diagonals, from `eval_sh` of its `utils/sh_utils.py`."""
     x, y, z = torch.eye(3, dtype=torch.float64)
     first = math.sqrt(3 / (4 * math.pi))
-    assert harmonics(x, 1).tolist() == pytest.approx([0, 0, -first])
-    assert harmonics(y, 1).tolist() == pytest.approx([-first, 0, 0])
-    assert harmonics(z, 1).tolist() == pytest.approx([0, first, 0])
-    mixed = math.sqrt(15 / (4 * math.pi)) / 2
-    assert harmonics((x + y) / math.sqrt(2), 2)[3].item() == pytest.approx(mixed)
-    assert harmonics((y + z) / math.sqrt(2), 2)[4].item() == pytest.approx(-mixed)
-    assert harmonics((x + z) / math.sqrt(2), 2)[6].item() == pytest.approx(-mixed)
-    assert harmonics(z, 2)[5].item() == pytest.approx(math.sqrt(5 / (4 * math.pi)))
-    assert harmonics(x, 2)[7].item() == pytest.approx(mixed)
+    for axis, expected in ((x, [0, 0, -first]), (y, [-first, 0, 0]), (z, [0, first, 0])):
+        assert harmonics(axis, 1).tolist() == pytest.approx(expected)
+    mixed, along = math.sqrt(15 / (4 * math.pi)) / 2, math.sqrt(5 / (4 * math.pi))
+    second = {3: (x + y, mixed), 4: (y + z, -mixed), 5: (z, along), 6: (x + z, -mixed), 7: (x, mixed)}
+    for index, (toward, expected) in second.items():
+        assert harmonics(toward / toward.norm(), 2)[index].item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("degree", [1, 2])

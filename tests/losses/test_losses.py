@@ -1,13 +1,10 @@
-from dataclasses import replace
-
 import pytest
 import torch
 from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
 from hydra.utils import instantiate
 from kornia.metrics import ssim as kornia_ssim
-from lightning import Trainer
-from scenes_for_training import scene_batch
-from support import NETWORKS, compose_config, some_gaussians
+from scenes_for_training import prediction, quiet_trainer, scene_batch, views
+from support import NETWORKS, compose_config
 from torch.utils.data import DataLoader
 from torchmetrics.functional.image import structural_similarity_index_measure
 
@@ -15,23 +12,10 @@ from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.losses.ssim import structural_similarity
-from completesplat.losses.terms import (
-    KullbackLeibler,
-    MeanSquaredError,
-    StructuralDissimilarity,
-)
+from completesplat.losses.terms import KullbackLeibler, MeanSquaredError, StructuralDissimilarity
 from completesplat.scene import Views
 
 SHAPE = (2, 3, 3, 24, 24)
-
-
-def views(images: torch.Tensor) -> Views:
-    batch, count, _, size, _ = images.shape
-    return replace(scene_batch(batch, count - 1, size=size).all_views(), images=images)
-
-
-def prediction(images: torch.Tensor, posterior: Posterior | None = None, **gaussians: float) -> Prediction:
-    return Prediction(images, some_gaussians(len(images), **gaussians), posterior)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +103,6 @@ def test_training_counts_the_steps_of_the_optimizer():
     config = compose_config("fit", "model=var", "rasterizer=reference", *NETWORKS)
     module = instantiate(config.model, _convert_="all")
     module.loss = WeightedSum(terms)
-    quiet = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}
-    trainer = Trainer(max_steps=3, accumulate_grad_batches=2, logger=False, enable_checkpointing=False, **quiet)
+    trainer = quiet_trainer(max_steps=3, accumulate_grad_batches=2)
     trainer.fit(module, DataLoader([scene_batch()] * 8, batch_size=None, collate_fn=lambda batch: batch))
     assert (trainer.global_step, late.calls) == (3, 2)  # the batches of the third step

@@ -1,20 +1,17 @@
 import copy
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from hydra.utils import instantiate
-from scenes_for_training import scene_batch
-from support import compose_config, some_gaussians
+from scenes_for_training import prediction, views
+from support import compose_config
 from torch import nn
 from torchmetrics.functional.image import lpips as torchmetrics_lpips
 from vgg_weights import CONVOLUTIONS, digest
 
-from completesplat.losses import Prediction
 from completesplat.losses.lpips import URL, LearnedPerceptualSimilarity
-from completesplat.scene import Views
 
 SHAPE = (2, 3, 3, 32, 32)
 
@@ -31,15 +28,6 @@ def term(vgg_file):
 def pair():
     generator = torch.Generator().manual_seed(1)
     return torch.rand(SHAPE, generator=generator), torch.rand(SHAPE, generator=generator)
-
-
-def prediction(images: torch.Tensor) -> Prediction:
-    return Prediction(images, some_gaussians(len(images)), None)
-
-
-def views(images: torch.Tensor) -> Views:
-    batch, count, _, size, _ = images.shape
-    return replace(scene_batch(batch, count - 1, size=size).all_views(), images=images)
 
 
 def flat(pair: tuple[torch.Tensor, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:

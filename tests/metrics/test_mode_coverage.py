@@ -3,13 +3,7 @@
 import pytest
 import torch
 
-from completesplat.metrics.mode_coverage import (
-    REJECTED,
-    classify,
-    draw_modes,
-    mean_of,
-    scores,
-)
+from completesplat.metrics.mode_coverage import REJECTED, classify, draw_modes, mean_of, scores
 
 MODES = torch.rand(4, 50, 3, generator=torch.Generator().manual_seed(0))
 EVEN = torch.full((4,), 0.25)

@@ -11,29 +11,22 @@ FORMS = torch.eye(K, dtype=torch.float64) * D * math.sqrt(K / 2)
 DRAWS = 4000
 
 
-def mean_energy(samples_of):
-    return sum(energy_score(samples_of(i), FORMS[i]) for i in range(K)) / K
+def mean_energy(samples):
+    return sum(energy_score(samples, form) for form in FORMS) / K
 
 
 def test_draws_of_the_truth_have_the_exact_energy_score():
     generator = torch.Generator().manual_seed(0)
-    result = [
-        energy_score(FORMS[torch.randint(K, (8,), generator=generator)], FORMS[i % K]) for i in range(DRAWS)
-    ]  # unbiased: also with 8 samples
+    draws = (FORMS[torch.randint(K, (8,), generator=generator)] for _ in range(DRAWS))  # unbiased: also with 8 samples
+    result = [energy_score(drawn, FORMS[i % K]) for i, drawn in enumerate(draws)]
     assert sum(result) / DRAWS == pytest.approx(0.375 * D, abs=0.004)
 
 
-def test_the_mean_of_the_forms_has_the_exact_energy_score():
-    assert mean_energy(lambda i: FORMS.mean(0).expand(5, -1)) == pytest.approx(math.sqrt(3 / 8) * D)
-
-
-def test_one_form_always_has_the_exact_energy_score():
-    assert mean_energy(lambda i: FORMS[:1].expand(5, -1)) == pytest.approx(0.75 * D)
-
-
-def test_noise_around_the_mean_does_not_improve_the_energy_score():
+def test_one_form_always_and_their_mean_have_exact_energy_scores_and_noise_around_the_mean_gains_nothing():
+    assert mean_energy(FORMS[:1].expand(5, -1)) == pytest.approx(0.75 * D)
+    assert mean_energy(FORMS.mean(0).expand(5, -1)) == pytest.approx(math.sqrt(3 / 8) * D)
     noise = 0.1 * torch.randn(200, K, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    assert mean_energy(lambda i: FORMS.mean(0) + noise) > 0.375 * D * 1.4
+    assert mean_energy(FORMS.mean(0) + noise) > 0.375 * D * 1.4
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from rasterizer_scenes import CONSTANTS, scenes
+from support import round_gaussians
 
 from completesplat.gaussians import DirectionalGaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
@@ -25,14 +26,7 @@ def test_opposite_sides_of_a_gaussian_have_opposite_slopes(rasterizer: Rasterize
     slope, first = torch.tensor([0.1, -0.2, 0.3]), (3 / (4 * torch.pi)) ** 0.5
     harmonics = torch.zeros(1, 1, 3, 3)
     harmonics[0, 0, 1] = slope / first  # times z
-    gaussian = DirectionalGaussians(
-        torch.zeros(1, 1, 3),
-        torch.tensor([[[1.0, 0, 0, 0]]]),
-        torch.full((1, 1, 3), 0.3),
-        torch.full((1, 1), 0.99),
-        torch.full((1, 1, 3), 0.5),
-        harmonics,
-    )
+    gaussian = DirectionalGaussians(**vars(round_gaussians(torch.zeros(1, 1, 3), 0.3, 0.99, 0.5)), harmonics=harmonics)
     eyes = torch.tensor([[0.0, 0, -3], [0, 0, 3], [3, 0, 0]])
     poses = look_at(eyes, torch.zeros(3), torch.tensor([0.0, -1, 0]))
     rendering = rasterizer(gaussian, Cameras(poses[None], pinhole(30, 9).expand(1, 3, 3, 3), (9, 9)))

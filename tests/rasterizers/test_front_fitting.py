@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support import round_gaussians
 
 from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
@@ -21,14 +22,7 @@ def wall(depth: float, grey: float) -> Gaussians:
     reach = depth * torch.tan(torch.deg2rad(torch.tensor(30.0)))
     y, x = torch.meshgrid(place * reach, place * reach, indexing="ij")
     means = torch.stack([x, y, torch.full_like(x, depth)], -1).view(1, -1, 3)
-    shape = means.shape[:2]
-    return Gaussians(
-        means,
-        torch.tensor([1.0, 0, 0, 0]).expand(*shape, 4),
-        torch.full((*shape, 3), float(reach / SIDE)),
-        torch.full(shape, 0.99),
-        torch.full((*shape, 3), grey),
-    )
+    return round_gaussians(means, float(reach / SIDE), 0.99, grey)
 
 
 def joined(*walls: Gaussians) -> Gaussians:

@@ -133,18 +133,16 @@ def test_a_passed_test_is_not_repeated_under_the_same_conditions(tests_run, tmp_
         selection.auto(constants)
         return len(tests_run) == before + 1
 
-    (tmp_path / "kernels_machine/kernel.nbc").write_bytes(b"cope")
-    assert tested_again()
-    (tmp_path / "kernels_machine/other.nbi").write_bytes(b"index")
-    assert tested_again()
-    monkeypatch.setattr(torch, "__version__", "3.0")
-    assert tested_again()
-    monkeypatch.setenv("NUMBA_OPT", "0")
-    assert tested_again()
+    for change in (
+        lambda: (tmp_path / "kernels_machine/kernel.nbc").write_bytes(b"cope"),
+        lambda: (tmp_path / "kernels_machine/other.nbi").write_bytes(b"index"),
+        lambda: monkeypatch.setattr(torch, "__version__", "3.0"),
+        lambda: monkeypatch.setenv("NUMBA_OPT", "0"),
+        lambda: [path.unlink() for path in tmp_path.glob("passed-*")],
+    ):
+        change()
+        assert tested_again()
     constants = RenderingConstants(max_alpha=0.97)
-    assert tested_again()
-    for path in tmp_path.glob("passed-*"):
-        path.unlink()
     assert tested_again()
 
 

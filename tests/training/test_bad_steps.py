@@ -5,8 +5,8 @@ import sys
 
 import pytest
 import torch
-from lightning import Trainer
 from lightning.pytorch.demos.boring_classes import BoringModel
+from scenes_for_training import quiet_trainer
 from small_runs import Batches
 from support import LIMIT, SMALL, strict_json
 
@@ -59,11 +59,9 @@ def train(module, *callbacks, steps=12, accumulated=1, most=3, ckpt_path=None, *
     torch.manual_seed(0)
     module.layer.reset_parameters()
     bad = BadSteps(most)
-    trainer = Trainer(
-        max_steps=steps, accelerator="cpu", logger=False, plugins=[CheckpointFiles()], callbacks=[bad, *callbacks],
-        accumulate_grad_batches=accumulated, enable_progress_bar=False, enable_model_summary=False,
-        enable_checkpointing=any(isinstance(c, Checkpoints) for c in callbacks), gradient_clip_val=1.0, **settings,
-    )  # fmt: skip
+    settings |= {"accumulate_grad_batches": accumulated, "gradient_clip_val": 1.0, "plugins": [CheckpointFiles()]}
+    settings["enable_checkpointing"] = any(isinstance(one, Checkpoints) for one in callbacks)
+    trainer = quiet_trainer(max_steps=steps, callbacks=[bad, *callbacks], **settings)
     trainer.fit(module, Batches(), ckpt_path=ckpt_path, weights_only=True)
     return bad
 

@@ -7,17 +7,14 @@ from unittest.mock import MagicMock
 
 import pytest
 import torch
-from lightning import Callback, Trainer
+from lightning import Callback
 from lightning.pytorch.demos.boring_classes import BoringModel
 from lightning.pytorch.loggers.logger import Logger
-from scenes_for_training import scene_batch
+from scenes_for_training import quiet_trainer, scene_batch
 from torch.utils.data import DataLoader
 
 from completesplat.training import callbacks
 from completesplat.training.callbacks import Progress, StepSeeds, Throughput, memory, step_seed
-
-QUIET = dict.fromkeys(("enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
-QUIET["accelerator"] = "cpu"
 
 
 class Clock:
@@ -65,48 +62,34 @@ class SlowSaver(Callback):
 def speeds(module: Sleeper, nap: float = 0, others: tuple[Callback, ...] = (), **options) -> list[dict[str, float]]:
     """Return the logged rows of one epoch of eight batches of two scenes. Loading a batch takes `nap` seconds."""
     memory = MagicMock(spec=Logger)
-    surroundings = {"logger": memory, "callbacks": [Throughput(), *others], "num_sanity_val_steps": 0}
-    trainer = Trainer(max_epochs=1, **surroundings, **QUIET, **{"log_every_n_steps": 2, **options})
+    settings = {"logger": memory, "callbacks": [Throughput(), *others], "num_sanity_val_steps": 0}
+    trainer = quiet_trainer(max_epochs=1, **settings, **{"log_every_n_steps": 2, **options})
     batches = DataLoader(range(8), collate_fn=lambda _: module.clock.nap(nap) or scene_batch())
     trainer.fit(module, batches, DataLoader(range(8)) if "val_check_interval" in options else None)
     rows = [call.kwargs["metrics"] | {"step": call.kwargs["step"]} for call in memory.log_metrics.call_args_list]
     return [row for row in rows if "speed/scenes_per_second" in row]
 
 
-def test_waiting_for_data_is_measured(clock):
-    """A batch is loaded in one second, and trained on in three."""
-    rows = speeds(Sleeper(clock, training=3), nap=1)
-    assert [row["step"] for row in rows] == [1, 3, 5, 7]
-    for row in rows:
-        assert row["speed/data_wait"] == pytest.approx(1 / 4)
-        assert row["speed/scenes_per_second"] == pytest.approx(2 / 4)
+SAVING = {"others": (SlowSaver(),), "log_every_n_steps": 4}
+# Seconds of a batch's training, validation and loading, settings, steps of the rows, scenes a second, share of waiting.
+SPEEDS = {
+    "waiting for data is measured": ((3, 0, 1), {}, [1, 3, 5, 7], 2 / 4, 1 / 4),
+    "validation between two rows is not counted": ((1, 5, 0), {"val_check_interval": 2}, [1, 3, 5, 7], 2, 0),
+    "validation in the midst of a row is not counted": ((1, 5, 0), {"val_check_interval": 1}, [1, 3, 5, 7], 2, None),
+    "writing checkpoints is not counted": ((1, 0, 0), SAVING, [3, 7], 2, 0),
+    "a row of one batch has no wait": ((2, 0, 1), {"log_every_n_steps": 1}, range(8), 1, None),
+    "accumulated batches are counted once": ((1, 0, 0), {"accumulate_grad_batches": 2}, [1, 3], 2, 0),
+}
 
 
-@pytest.mark.parametrize("interval", [1, 2])
-def test_validation_is_not_counted(clock, interval):
-    """Five times as long as training, and in the midst of an interval as well as between two."""
-    for row in speeds(Sleeper(clock, training=1, validation=5), val_check_interval=interval)[1:]:
-        assert row["speed/scenes_per_second"] == pytest.approx(2)
-
-
-def test_writing_checkpoints_is_not_counted(clock, tmp_path):
-    module = Sleeper(clock, training=1)
-    rows = speeds(module, others=(SlowSaver(),), default_root_dir=tmp_path, log_every_n_steps=4)
-    assert (tmp_path / "last.ckpt").is_file()
-    assert [row["speed/scenes_per_second"] for row in rows] == [pytest.approx(2)] * 2
-
-
-def test_rows_of_one_batch_have_its_speed_and_no_wait(clock):
-    rows = speeds(Sleeper(clock, training=2), nap=1, log_every_n_steps=1)
-    assert [row["speed/scenes_per_second"] for row in rows] == [pytest.approx(1)] * 8
-    assert not any("speed/data_wait" in row for row in rows)
-
-
-def test_accumulated_batches_are_counted_and_logged_once(clock):
-    rows = speeds(Sleeper(clock, training=1), accumulate_grad_batches=2)
-    assert [row["step"] for row in rows] == [1, 3]
-    for row in rows:
-        assert row["speed/scenes_per_second"] == pytest.approx(2)
+@pytest.mark.parametrize("fact", SPEEDS)
+def test_speeds(clock, tmp_path, fact):
+    (training, validation, loading), settings, steps, speed, waiting = SPEEDS[fact]
+    rows = speeds(Sleeper(clock, training, validation), loading, default_root_dir=tmp_path, **settings)
+    assert [row["step"] for row in rows] == list(steps)
+    assert [row["speed/scenes_per_second"] for row in rows] == [pytest.approx(speed)] * len(rows)
+    assert {row.get("speed/data_wait") for row in rows} == {waiting}
+    assert (tmp_path / "last.ckpt").is_file() == ("others" in settings)
 
 
 def test_memory_is_that_of_a_process_with_torch(clock):
@@ -135,7 +118,7 @@ class Drawer(BoringModel):
 def drawn(seed: int, others: int = 0) -> list[float]:
     """Return the numbers of three epochs of four batches; two batches share an optimizer step."""
     module = Drawer(others)
-    trainer = Trainer(max_epochs=3, accumulate_grad_batches=2, logger=False, callbacks=[StepSeeds(seed)], **QUIET)
+    trainer = quiet_trainer(max_epochs=3, accumulate_grad_batches=2, callbacks=[StepSeeds(seed)])
     trainer.fit(module, DataLoader(range(4), generator=torch.Generator()))
     return module.drawn
 
@@ -155,7 +138,7 @@ class Watched(Callback):
     def __init__(self, bar: Progress) -> None:
         self.bar, self.shown = bar, []
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module, *_) -> None:
+    def on_train_batch_end(self, trainer, pl_module, *_) -> None:
         task = self.bar.train_progress_bar
         figures = self.bar.get_metrics(trainer, pl_module)
         self.shown.append((task.description, task.completed, task.total, figures["step"], round(figures["loss"], 4)))
@@ -169,10 +152,10 @@ class Telling(BoringModel):
 
 def test_the_bar_is_the_whole_runs_and_shows_the_first_steps_loss():
     bar = Progress()
-    watched, quiet = Watched(bar), {**QUIET, "enable_progress_bar": True}
+    watched = Watched(bar)
     settings = {"max_steps": 5, "max_epochs": -1, "val_check_interval": 4, "check_val_every_n_epoch": None}
     settings |= {"accumulate_grad_batches": 2, "limit_val_batches": 1, "num_sanity_val_steps": 0}
-    trainer = Trainer(**settings, logger=False, callbacks=[bar, watched], **quiet)
+    trainer = quiet_trainer(**settings, callbacks=[bar, watched], enable_progress_bar=True)
     trainer.fit(Telling(), DataLoader(torch.zeros(4, 32)), DataLoader(torch.zeros(4, 32)))
     steps = [0, 1, 1, 2, 2, 3, 3, 4, 4, 5]  # of two batches each, two in an epoch
     assert watched.shown == [("Training", s, 5, f"{s}/5", 0.5 * (i % 4)) for i, s in enumerate(steps)]

@@ -17,18 +17,10 @@ from completesplat.training.capture import CaptureFit
 FRAMES, STEPS = 9, 8
 FITTING = {"initial": 200, "most": 260, "refine_every": 2}
 QUICK = ["experiment=capture", "data.root=capture", "data.image_size=12", f"trainer.max_steps={STEPS}"]
-QUICK += [
-    "trainer.accelerator=cpu",
-    "trainer.val_check_interval=100",
-    "rasterizer=reference",
-    "callbacks.progress=null",
-]
-QUICK += [
-    *(f"model.fitting.{key}={value}" for key, value in FITTING.items()),
-    "model.formats=[splat,sog]",
-    "model.frames=2",
-]
-QUICK += ["callbacks.checkpoint.every_n_train_steps=4"]
+QUICK += ["trainer.accelerator=cpu", "trainer.val_check_interval=100", "rasterizer=reference"]
+QUICK += ["callbacks.progress=null", "callbacks.checkpoint.every_n_train_steps=4"]
+QUICK += [f"model.fitting.{key}={value}" for key, value in FITTING.items()]
+QUICK += ["model.formats=[splat,sog]", "model.frames=2"]
 
 
 @pytest.fixture
@@ -84,10 +76,8 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
     Image.open(tmp_path / "run/sheet.png").verify()
     # The folder of a run stands for its checkpoint; that of other Gaussians is refused.
     other = command("fit", *QUICK, "model.fitting.most=261", "ckpt_path=run", "out=other")
-    assert (other.status, other.err) == (
-        2,
-        "error: run/checkpoints/last.ckpt: of another model; give the settings of its run\n",
-    )
+    line = "error: run/checkpoints/last.ckpt: of another model; give the settings of its run\n"
+    assert (other.status, other.err) == (2, line)
     # A test of a checkpoint writes no scene into the run.
     (tmp_path / "run/scene.ply").unlink()
     tested = command("test", "ckpt=run", "out=EVAL")
@@ -133,9 +123,8 @@ def test_a_prepared_capture_has_lost_its_units_and_is_refused(command, capture):
 def test_points_of_a_reconstruction_are_in_the_cameras_units(tmp_path):
     write_capture(tmp_path / "capture", FRAMES)
     points = [[0.5, 0.25, -0.125], [0, -0.5, 0], [1, 0, 0], [-1, 0, 0.5]]
-    header = (
-        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
-    )
+    properties = "".join(f"property float {axis}\n" for axis in "xyz")
+    header = f"ply\nformat ascii 1.0\nelement vertex 4\n{properties}end_header\n"
     (tmp_path / "capture/points.ply").write_text(header + "".join("{} {} {}\n".format(*point) for point in points))
     path = tmp_path / "capture/transforms.json"
     path.write_text(path.read_text().replace('{"camera', '{"ply_file_path": "points.ply", "camera'))

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 from hydra.utils import instantiate
-from lightning import Trainer
 from lightning.pytorch.demos.boring_classes import BoringModel
+from scenes_for_training import quiet_trainer
 from support import compose_config
 
 from completesplat.training.checkpoints import CheckpointFiles
@@ -33,10 +33,8 @@ def train(folder, steps, accumulated=1, **settings) -> None:
     """So many optimizer steps, with the configuration's callback."""
     config = compose_config("fit", f"out={folder}").callbacks.checkpoint
     callback = instantiate(config, every_n_train_steps=settings.pop("every_n_train_steps", None), **settings)
-    trainer = Trainer(
-        max_steps=steps, accelerator="cpu", logger=False, plugins=[CheckpointFiles()], callbacks=[callback],
-        accumulate_grad_batches=accumulated, enable_progress_bar=False, enable_model_summary=False,
-    )  # fmt: skip
+    surroundings = {"plugins": [CheckpointFiles()], "callbacks": [callback], "enable_checkpointing": True}
+    trainer = quiet_trainer(max_steps=steps, accumulate_grad_batches=accumulated, **surroundings)
     trainer.fit(BoringModel(), torch.utils.data.DataLoader(torch.ones(100, 32)))
 
 

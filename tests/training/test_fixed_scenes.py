@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from image_sheets import cells
 from PIL import Image
 from scenes_for_training import SIZE, scene_batch
-from support import SMALL, compose_config
+from support import SMALL, compose_config, round_gaussians
 
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
@@ -35,10 +35,7 @@ from completesplat.viewer.sample import read_newest
 def layer(scenes: SceneBatch, depth: float, opacity: float, colors: torch.Tensor) -> Gaussians:
     """A Gaussian on the ray of each pixel, smaller than the pixel, so that the rasterizer's blur alone widens it."""
     rays = pixel_rays(scenes.reference.cameras).flatten(1, 2)
-    batch, count, _ = rays.shape
-    quaternions = torch.tensor([1.0, 0, 0, 0]).expand(batch, count, 4)
-    scales, opacities = torch.full((batch, count, 3), 1e-3), torch.full((batch, count), opacity)
-    return Gaussians(rays * depth, quaternions, scales, opacities, colors.flatten(2).mT.contiguous())
+    return round_gaussians(rays * depth, 1e-3, opacity, colors.flatten(2).mT.contiguous())
 
 
 def two_layers(scenes: SceneBatch) -> Gaussians:

@@ -4,16 +4,14 @@ import os
 from functools import partial
 from itertools import accumulate
 
-import lightning
 import pytest
 import torch
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import BatchSizeFinder
-from scenes_for_training import scene_batch
+from scenes_for_training import opened, quiet_trainer, scene_batch
 from support import SMALL, compose_config, refused, strict_json
 from torch import distributed, nn
 
-import completesplat
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -129,9 +127,8 @@ def test_accumulated_batches_step_as_their_scenes_in_one_batch_also_at_an_epochs
     """In closed form: a step of plain SGD moves the weight by minus the mean of the step's scenes."""
     batch = scene_batch(scenes, size=8)
     numbers, batches = batch.reference.images.mean((1, 2, 3)).tolist(), [batch[i : i + 2] for i in range(0, scenes, 2)]
-    module, quiet = MeanOfScenes(), {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-    quiet |= {"enable_checkpointing": False, "accelerator": "cpu", "default_root_dir": tmp_path}
-    trainer = lightning.Trainer(max_epochs=2, accumulate_grad_batches=4, limit_train_batches=limit, **quiet)
+    module, settings = MeanOfScenes(), {"limit_train_batches": limit, "default_root_dir": tmp_path}
+    trainer = quiet_trainer(max_epochs=2, accumulate_grad_batches=4, **settings)
     trainer.fit(module, torch.utils.data.DataLoader(batches, batch_size=None, collate_fn=lambda batch: batch))
     seen = numbers if limit == 1.0 else numbers[: 2 * limit]
     steps = [-sum(seen[i : i + 8]) / len(seen[i : i + 8]) for i in range(0, len(seen), 8)] * 2
@@ -141,15 +138,13 @@ def test_accumulated_batches_step_as_their_scenes_in_one_batch_also_at_an_epochs
 
 def test_an_epoch_of_accumulated_batches_trains_as_whole_batches(toy_root, tmp_path):
     """Six scenes in batches of four, by plain SGD: one step of four scenes, and one of two."""
-    given = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "data.batch_size=4", "ablation=no_variational"]
-    given += ["data.references_per_sequence=3"]
+    given = ["data.batch_size=4", "ablation=no_variational", "data.references_per_sequence=3"]
     given += ["optimizer=adam", "optimizer._target_=torch.optim.SGD", "optimizer.lr=1"]
     trained = []
     for accumulated in (1, 2):
         torch.manual_seed(0)
-        data, module = completesplat.instantiate(completesplat.compose("fit", *given))
-        quiet = {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False, "accelerator": "cpu"}
-        trainer = lightning.Trainer(max_epochs=1, accumulate_grad_batches=accumulated, limit_val_batches=0, **quiet)
+        data, module = opened(toy_root, *given)
+        trainer = quiet_trainer(max_epochs=1, accumulate_grad_batches=accumulated, limit_val_batches=0)
         trainer.fit(module, data)
         assert trainer.global_step == 2
         trained.append(torch.cat([parameter.detach().flatten() for parameter in module.parameters()]))
@@ -159,13 +154,9 @@ def test_an_epoch_of_accumulated_batches_trains_as_whole_batches(toy_root, tmp_p
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["power", "binsearch"])
 def test_lightnings_search_for_a_batch_size_ends_at_the_scenes_of_an_epoch(toy_root, tmp_path, mode):
-    given = [*SMALL, "experiment=toy_var", f"data.root={toy_root}", "data.references_per_sequence=5"]
-    data, module = completesplat.instantiate(completesplat.compose("fit", *given))
+    data, module = opened(toy_root, "data.references_per_sequence=5")
     finder = BatchSizeFinder(mode, steps_per_trial=1, **({"margin": 0.0} if mode == "binsearch" else {}))
-    quiet = {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False, "accelerator": "cpu"}
-    trainer = lightning.Trainer(
-        max_steps=1, callbacks=[finder], limit_val_batches=0, default_root_dir=tmp_path, **quiet
-    )
+    trainer = quiet_trainer(max_steps=1, callbacks=[finder], limit_val_batches=0, default_root_dir=tmp_path)
     trainer.fit(module, data)
     assert finder.optimal_batch_size == data.batch_size == 10  # five of each of two sequences
     assert list(tmp_path.iterdir()) == []

@@ -59,15 +59,9 @@ def test_one_scene_is_learned_by_heart(command, tmp_path):
     A clip through a room, of which one image shows nearly all that the others do: all around an object, a single
     image's Gaussians would first have to travel to its far side.
     """
-    one_scene = [
-        "data=toy_rooms",
-        "data.make=true",
-        "data.scenes=3",
-        "data.frames=8",
-        "data.max_gap=3",
-        "data.height=32",
-    ]
-    settings = [f"data.root={tmp_path / 'data'}", *one_scene, "data.image_size=32", "data.batch_size=4", *SHORT]
+    one_scene = ["data=toy_rooms", "data.make=true", "data.scenes=3", "data.frames=8", "data.max_gap=3"]
+    one_scene += ["data.height=32", "data.image_size=32", "data.batch_size=4"]
+    settings = [f"data.root={tmp_path / 'data'}", *one_scene, *SHORT]
     steps = ["trainer.max_steps=1000", "test=false", "callbacks.images=null", "data.color_jitter=null"]
     assert command("fit", "experiment=toy_var", *settings, *steps, f"out={tmp_path / 'run'}").status == 0
     values = psnr_of_training_views(tmp_path / "run")

@@ -6,13 +6,11 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
-import lightning
 import pytest
 import torch
 from lightning.pytorch.callbacks import Callback, EarlyStopping, LearningRateFinder, ModelCheckpoint
 from lightning.pytorch.tuner import Tuner
-from scenes_for_training import scene_batch
-from support import SMALL
+from scenes_for_training import opened, quiet_trainer, scene_batch
 from torch.optim.lr_scheduler import LambdaLR
 
 import completesplat
@@ -23,14 +21,7 @@ from completesplat.training.stage import Stage
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
 README = Path(__file__).parents[2] / "README.md"
-QUIET = {"enable_progress_bar": False, "logger": False, "accelerator": "cpu"}
 CLASSES = {"var": completesplat.ReconstructionModule, "diffusion": completesplat.LatentDiffusion}
-
-
-def opened(toy_root: Path, *settings: str):
-    small = [setting for setting in SMALL if not setting.startswith(("trainer", "callbacks"))]
-    config = completesplat.compose("fit", "experiment=toy_var", f"data.root={toy_root}", *small, *settings)
-    return completesplat.instantiate(config)
 
 
 @pytest.mark.parametrize("stage", CLASSES)
@@ -40,7 +31,7 @@ def test_a_checkpoint_of_fit_loads_and_scores_as_fit_scored_it(pipeline, stage):
     weights = read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"]
     assert all(torch.equal(value, weights[name]) for name, value in model.state_dict().items())
     data, _ = opened(pipeline.toy)
-    (scores,) = lightning.Trainer(**QUIET).test(model, data, verbose=False)
+    (scores,) = quiet_trainer().test(model, data, verbose=False)
     of_fit = json.loads((run / "metrics.json").read_text())["test"]
     for predictor, place in {"model": "test", "mean_image": "test/mean_image"}.items():
         for region, view, metric in [("full", "novel", "psnr"), ("object", "reference", "ssim")]:
@@ -50,7 +41,7 @@ def test_a_checkpoint_of_fit_loads_and_scores_as_fit_scored_it(pipeline, stage):
 def test_validation_and_prediction_are_lightnings_own(pipeline):
     model = CLASSES["var"].load_from_checkpoint(pipeline.var / "checkpoints/last.ckpt")
     data, _ = opened(pipeline.toy)
-    trainer = lightning.Trainer(**QUIET)
+    trainer = quiet_trainer()
     (scores,) = trainer.validate(model, data, verbose=False)
     assert scores["val/psnr_novel"] > 0
     scenes = trainer.predict(model, data)
@@ -70,8 +61,7 @@ def test_overfit_batches_trains_and_validates_on_the_same_scenes_in_all_epochs(t
             self.validation += batch.names
 
     seen, (data, model) = Seen(), opened(toy_root, "data.batch_size=1")
-    given = {"overfit_batches": 1, "max_epochs": 3, "enable_checkpointing": False, "enable_model_summary": False}
-    lightning.Trainer(**QUIET, **given, callbacks=[seen]).fit(model, data)
+    quiet_trainer(overfit_batches=1, max_epochs=3, callbacks=[seen]).fit(model, data)
     assert len(seen.training) == 3
     assert len({name for batch in seen.training for name in batch.names}) == 1
     for batch in seen.training[1:]:
@@ -126,24 +116,19 @@ class Quadratic(Stage):
         return (self.weight - 3).square()
 
 
-def quadratic_run(module: Quadratic, folder: Path, *callbacks: lightning.Callback) -> lightning.Trainer:
-    quiet = {key: value for key, value in QUIET.items() if key != "logger"} | {"enable_checkpointing": False}
-    settings = {"max_steps": 4, "logger": False, "enable_model_summary": False, "default_root_dir": folder}
-    return lightning.Trainer(callbacks=list(callbacks), **settings, **quiet)
-
-
 def test_lightnings_search_for_a_learning_rate_sets_that_of_the_optimizer_and_its_schedule(tmp_path):
     batches = torch.utils.data.DataLoader([scene_batch(1, size=8)] * 200, batch_size=None, collate_fn=lambda x: x)
+    run = {"max_steps": 4, "default_root_dir": tmp_path}
     module, finder = Quadratic(), LearningRateFinder(num_training_steps=40)
-    quadratic_run(module, tmp_path, finder).fit(module, batches)
+    quiet_trainer(callbacks=[finder], **run).fit(module, batches)
     found = finder.optimal_lr.suggestion()
     assert found > 1e-5
     assert module.lr == found
     assert module.rates[-4:] == pytest.approx([found, found, found / 2, found / 2])
 
     module = Quadratic()  # searched by itself before a run, in which the optimizer is built anew
-    found = Tuner(quadratic_run(module, tmp_path)).lr_find(module, batches, num_training=40).suggestion()
-    quadratic_run(module, tmp_path).fit(module, batches)
+    found = Tuner(quiet_trainer(**run)).lr_find(module, batches, num_training=40).suggestion()
+    quiet_trainer(**run).fit(module, batches)
     assert module.rates[-4:] == pytest.approx([found, found, found / 2, found / 2])
     assert list(tmp_path.iterdir()) == []
 
@@ -172,8 +157,8 @@ def test_callbacks_and_loggers_of_lightning_see_the_figures(toy_root, tmp_path):
     loggers = [CSVLogger(tmp_path, "csv")]
     if find_spec("tensorboard") or find_spec("tensorboardX"):
         loggers.append(TensorBoardLogger(tmp_path, "board"))
-    settings = {"max_steps": 50, "val_check_interval": 1, "limit_val_batches": 1, "enable_progress_bar": False}
-    trainer = lightning.Trainer(callbacks=[best, stop], logger=loggers, accelerator="cpu", **settings)
+    settings = {"max_steps": 50, "val_check_interval": 1, "limit_val_batches": 1, "enable_checkpointing": True}
+    trainer = quiet_trainer(callbacks=[best, stop], logger=loggers, **settings)
     trainer.fit(model, data)
     assert stop.stopped_epoch >= 0
     assert trainer.global_step < 50

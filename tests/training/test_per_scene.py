@@ -1,8 +1,8 @@
 """Models without training: they see the test's views, and say so; what is left of them in a Splatter Image."""
 
-import lightning
 import pytest
 from hydra.utils import instantiate
+from scenes_for_training import quiet_trainer
 from support import SMALL, compose_config, strict_json
 
 FEW = ["model.fitting.count=300", "model.fitting.steps=60", "data.evaluation_targets=3"]
@@ -12,8 +12,7 @@ def scored(model: str, root, *settings: str):
     config = compose_config("fit", "experiment=toy_var", f"model={model}", f"data.root={root}", *SMALL, *FEW, *settings)
     config.model.scenes_folder = None
     module, data = (instantiate(part, _convert_="all") for part in (config.model, config.data))
-    trainer = lightning.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False)
-    trainer.test(module, datamodule=data, verbose=False)
+    quiet_trainer().test(module, datamodule=data, verbose=False)
     return module
 
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from hydra.utils import instantiate
+from scenes_for_training import opened
 from support import SMALL, compose_config, some_gaussians, strict_json
 
 from completesplat.errors import CompleteSplatError
@@ -56,10 +57,9 @@ def test_ablations_change_the_layers_and_bring_no_skips(ablation, layers):
 
 
 def test_the_decoder_is_all_that_the_test_sees(toy_root):
-    config = compose_config("fit", *SETTINGS, f"data.root={toy_root}")
     torch.manual_seed(0)
-    module = instantiate(config.model, _convert_="all").eval()
-    data = instantiate(config.data, _convert_="all")
+    data, module = opened(toy_root, *MODEL)
+    module.eval()
     data.setup("test")
     scenes = next(iter(data.test_dataloader()))
     with torch.inference_mode():
@@ -71,8 +71,7 @@ def test_the_decoder_is_all_that_the_test_sees(toy_root):
 
 @pytest.fixture
 def store(toy_root):
-    data = instantiate(compose_config("fit", *SETTINGS, f"data.root={toy_root}").data, _convert_="all")
-    return data.store("train")
+    return opened(toy_root, *MODEL)[0].store("train")
 
 
 MEANS = torch.tensor([[0.0, 0.0, 2.0], [0.1, -0.2, 2.5]])

@@ -1,9 +1,8 @@
 import pytest
 import torch
 from hydra.utils import instantiate
-from lightning import Trainer
 from lightning.pytorch.plugins import Precision
-from scenes_for_training import scene_batch
+from scenes_for_training import quiet_trainer, scene_batch
 from support import NETWORKS, compose_config
 from torch.utils.data import DataLoader
 
@@ -51,10 +50,7 @@ def test_gradients_are_clipped_for_fused_optimizers_by_a_norm_that_is_computed_o
         monkeypatch.setattr(Precision, "clip_gradients", lambda *_: pytest.fail("computes the norm again"))
     trained = module("optimizer=adam", "optimizer._target_=torch.optim.SGD", "optimizer.lr=1", "schedule=constant")
     before = [p.detach().clone() for p in trained.parameters()]
-    trainer = Trainer(
-        max_steps=1, precision=precision, gradient_clip_val=1e-3, accelerator="cpu", logger=False,
-        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False, callbacks=guards,
-    )  # fmt: skip
+    trainer = quiet_trainer(max_steps=1, precision=precision, gradient_clip_val=1e-3, callbacks=guards)
     trainer.fit(trained, DataLoader([scene_batch()], batch_size=None))
     moved = torch.cat([(p - b).flatten() for p, b in zip(trained.parameters(), before, strict=True)])
     assert trainer.optimizers[0].defaults["fused"]

@@ -2,11 +2,13 @@
 
 import torch
 from hydra.utils import instantiate
+from scenes_for_training import opened
 from support import SMALL, compose_config, strict_json
 
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
-SETTINGS = ["experiment=toy_var", "model=reconstructor_only", *SMALL, "model.code_steps=4"]
+MODEL = "model=reconstructor_only"
+SETTINGS = ["experiment=toy_var", MODEL, *SMALL, "model.code_steps=4"]
 
 
 def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
@@ -14,18 +16,13 @@ def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
     assert command("fit", *SETTINGS, f"data.root={toy_root}", f"out={run}").status == 0
     first = read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"]
     # Only training images: validation and test have taken none.
-    data = instantiate(compose_config("fit", *SETTINGS, f"data.root={toy_root}").data, _convert_="all")
-    source = data.source("train")
+    source = opened(toy_root, MODEL)[0].source("train")
     assert {name for name, _ in first["model._extra_state"]} <= set(source.names)
     frame_count = sum(len(source.read(name).frames) for name in source.names)
     assert len(first["model.codes"]) == frame_count == 8  # a row for every training image
     assert 2 <= len(first["model._extra_state"]) <= 4  # two steps of two images
-    resume = [
-        f"ckpt_path={run / 'checkpoints/last.ckpt'}",
-        "trainer.max_steps=4",
-        "test=false",
-        f"out={tmp_path / 'more'}",
-    ]
+    resume = [f"ckpt_path={run / 'checkpoints/last.ckpt'}", "trainer.max_steps=4"]
+    resume += ["test=false", f"out={tmp_path / 'more'}"]
     assert command("fit", *SETTINGS, f"data.root={toy_root}", *resume).status == 0
     more = read_checkpoint(tmp_path / "more/checkpoints/last.ckpt")["state_dict"]
     assert more["model._extra_state"][: len(first["model._extra_state"])] == first["model._extra_state"]
@@ -38,18 +35,16 @@ def test_no_ablation_brings_skips():
 
 
 def test_new_codes_lower_the_loss_of_the_reference_and_leave_the_weights(toy_root):
-    config = compose_config("fit", *SETTINGS, f"data.root={toy_root}", "model.code_steps=30", "model.code_rate=0.1")
     torch.manual_seed(0)
-    module = instantiate(config.model, _convert_="all").eval()
-    data = instantiate(config.data, _convert_="all")
+    data, module = opened(toy_root, MODEL, "model.code_steps=30", "model.code_rate=0.1")
+    module.eval()
     data.setup("test")
     scenes = next(iter(data.test_dataloader()))
     before = {name: p.clone() for name, p in module.named_parameters()}
 
     def loss(gaussians) -> float:
-        return torch.nn.functional.mse_loss(
-            module.render(gaussians, scenes.all_views().cameras)[:, 0], scenes.reference.images
-        ).item()
+        images = module.render(gaussians, scenes.all_views().cameras)[:, 0]
+        return torch.nn.functional.mse_loss(images, scenes.reference.images).item()
 
     start = module.gaussians(module.model.new_codes(len(scenes.names), seed=0), scenes)
     with torch.inference_mode():

@@ -69,15 +69,12 @@ def test_the_average_is_sampled_and_written(run):
     exactly(load_file(run.folder / "weights/model.safetensors"), average)
 
 
-def test_the_weights_need_no_vae_any_more(run, pipeline):
+def test_the_weights_need_no_vae_any_more_and_hold_facts_about_the_training_images(run, pipeline):
     (run.folder.parent / "vae").rename(run.folder.parent / "elsewhere")
     model = CompleteSplat.from_pretrained(run.folder / "weights")
     assert model.conditioning.frozen
     assert len(model(pipeline.photograph(), samples=1)) == 1
-
-
-def test_the_weights_hold_facts_about_the_training_images(run):
-    facts = CompleteSplat.from_pretrained(run.folder / "weights").architecture["training"]
+    facts = model.architecture["training"]
     assert facts["box_masks"] == 0
     assert [len(facts[name]) for name in ("picture_mean", "picture_std")] == [8, 8]
 

@@ -17,14 +17,8 @@ pytestmark = pytest.mark.processes
 # Without anything that is drawn in the steps: what processes draw is their own.
 SETTINGS = ["experiment=toy_var", "ablation=no_variational", "autoreconstructor.skip_dropout=0", *SMALL]
 SETTINGS += ["rasterizer=reference", "data.image_size=16", "data.batch_size=4", "data.references_per_sequence=8"]
-SETTINGS += [
-    "optimizer=adam",
-    "optimizer._target_=torch.optim.SGD",
-    "optimizer.fused=false",
-    "optimizer.lr=0.1",
-    "trainer.precision=32-true",
-]
-SETTINGS += ["trainer.log_every_n_steps=1", "trainer.val_check_interval=2"]
+SETTINGS += ["optimizer=adam", "optimizer._target_=torch.optim.SGD", "optimizer.fused=false", "optimizer.lr=0.1"]
+SETTINGS += ["trainer.precision=32-true", "trainer.log_every_n_steps=1", "trainer.val_check_interval=2"]
 
 
 class Trained(NamedTuple):
@@ -51,12 +45,8 @@ def train_here(_: int, root: Path, folder: Path, devices: int, settings: tuple[s
     config = compose_config("fit", f"data.root={root}", *SETTINGS, *settings, f"out={folder}")
     torch.manual_seed(0)
     data, module = (instantiate(part, _convert_="all") for part in (config.data, config.model))
-    several = {
-        "devices": devices,
-        "strategy": "ddp_fork" if devices > 1 else "auto",
-        "enable_checkpointing": False,
-        "plugins": [],
-    }
+    several = {"devices": devices, "strategy": "ddp_fork" if devices > 1 else "auto"}
+    several |= {"enable_checkpointing": False, "plugins": []}
     logger = ContinuedCSVLogger(str(folder))
     trainer: Any = instantiate(config.trainer, **several, enable_progress_bar=False, logger=logger, _convert_="all")
     if dtype == torch.float64:  # Lightning's own precision=64-true cannot convert frozen classes

@@ -1,0 +1,13 @@
+import pytest
+
+from completesplat.errors import CompleteSplatError
+from completesplat.export.splat_transform import SplatTransform, find_splat_transform
+
+
+@pytest.fixture(scope="module")
+def converter() -> SplatTransform:
+    """The real converter, where there is Node.js."""
+    try:
+        return find_splat_transform()
+    except CompleteSplatError as error:
+        pytest.skip(str(error))
