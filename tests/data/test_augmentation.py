@@ -198,6 +198,7 @@ def test_a_single_box_is_a_rectangle_with_sides_in_the_stated_range() -> None:
     assert heights == set(range(4, 9))
     assert widths == set(range(10, 21))
     assert corners == {"first", "last"}
+    assert (BoxMasks(1.0, boxes=(1, 1), sides=(0.01, 0.01))(16, 40, rng()) == 0).sum() == 1  # never none
 
 
 def test_images_are_masked_with_the_stated_probability() -> None:

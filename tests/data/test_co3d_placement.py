@@ -117,10 +117,10 @@ def test_a_plane_is_placed_where_it_is_also_by_smaller_depth_maps(tmp_path, map_
 
 def test_eight_depth_maps_are_read_of_many_in_units_of_their_scale(tmp_path):
     """The others are not even there; half of 16 is every second."""
-    there, larger = plane(tmp_path / "a", (24, 32)), plane(tmp_path / "b", (24, 32), 3)
-    alone, far = from_depth_maps([there], AXES), from_depth_maps([larger], AXES)
-    torch.testing.assert_close(far.center, 3 * alone.center)
-    assert far.half_size == pytest.approx(3 * alone.half_size)
+    there, nearer = plane(tmp_path / "a", (24, 32)), plane(tmp_path / "b", (24, 32), 0.25)
+    alone, near = from_depth_maps([there], AXES), from_depth_maps([nearer], AXES)
+    torch.testing.assert_close(near.center, 0.25 * alone.center)
+    assert near.half_size == pytest.approx(0.25 * alone.half_size)
     gone = frame(look(np.zeros(3), np.array([0, 0, 1.0])), depth=DepthMap(tmp_path / "a/gone.png", 1.0))
     assert from_depth_maps([there, gone] * 8, AXES).half_size == pytest.approx(alone.half_size)
     with pytest.raises(MissingFile) as caught:
@@ -131,7 +131,7 @@ def test_eight_depth_maps_are_read_of_many_in_units_of_their_scale(tmp_path):
         from_depth_maps([there], AXES)
     Image.fromarray(np.zeros((24, 32), dtype=np.uint16)).save(tmp_path / "b/depth.png")
     with pytest.raises(BadPlacement, match="foreground"):
-        from_depth_maps([larger], AXES)
+        from_depth_maps([nearer], AXES)
 
 
 def test_the_cloud_comes_before_depth_maps_and_those_before_cameras(tmp_path):
