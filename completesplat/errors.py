@@ -1,5 +1,9 @@
 """Errors that the user sees as one line, `error: ...`; the exit status is 2 for refused input, 1 for failed work."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
 
 class CompleteSplatError(Exception):
     """An error that the caller can put right: a bad input, a missing file, a wrong setting."""
@@ -58,3 +62,13 @@ class DiskError(CompleteSplatError):
     """A file that cannot be written, because the disk is full or the folder no longer exists."""
 
     exit_status = 1
+
+
+@contextmanager
+def errors_at(file: Path | str | None = None, sequence: str | None = None, frame: int | None = None) -> Iterator[None]:
+    """Add file, sequence and frame to a DataError raised within the context, unless it already has them."""
+    try:
+        yield
+    except DataError as error:
+        place = error.file or (None if file is None else str(file)), error.sequence or sequence
+        raise type(error)(error.reason, *place, frame if error.frame is None else error.frame) from error.__cause__

@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from completesplat import tensors
 from completesplat.geometry.cameras import transform_points
 from completesplat.geometry.harmonics import degree_of, harmonics, rotated
 from completesplat.geometry.rotations import (
@@ -16,7 +15,7 @@ from completesplat.geometry.rotations import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
-from completesplat.tensors import TensorDataclass
+from completesplat.tensors import TensorDataclass, concatenate
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,6 @@ class Gaussians(TensorDataclass):
 
     @property
     def count(self) -> int:
-        """Return the number of Gaussians in each set."""
         return self.means.shape[-2]
 
     def covariances(self) -> Float[Tensor, "*batch gaussian 3 3"]:
@@ -74,7 +72,6 @@ class DirectionalGaussians(Gaussians):
 
     @property
     def degree(self) -> int:
-        """Return the largest degree of the harmonics."""
         return degree_of(self.harmonics.shape[-2])
 
     def seen_from(self, centers: Float[Tensor, "*batch 3"]) -> Gaussians:
@@ -96,10 +93,9 @@ class DirectionalGaussians(Gaussians):
         return DirectionalGaussians(**{**vars(moved), "harmonics": rotated(self.harmonics, matrix[..., :3, :3])})
 
     def finite(self) -> Bool[Tensor, "*batch gaussian"]:
-        """Return a mask of the Gaussians whose values are all finite."""
         return super().finite() & self.harmonics.isfinite().flatten(-2).all(-1)
 
 
 def merge_gaussians(sets: Sequence[Gaussians]) -> Gaussians:
     """Join sets of equal batch shape into one."""
-    return tensors.concatenate(sets, axis=sets[0].opacities.ndim - 1)
+    return concatenate(sets, axis=sets[0].opacities.ndim - 1)

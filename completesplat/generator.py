@@ -76,7 +76,6 @@ class CompleteSplat(SceneModel):
 
     @property
     def reconstruction_model(self) -> VariationalAutoReconstructor:
-        """Return the autoreconstructor."""
         return self.autoreconstructor
 
     def train(self, mode: bool = True) -> "CompleteSplat":
@@ -96,7 +95,6 @@ class CompleteSplat(SceneModel):
         return self.standardised(self.autoreconstructor.posterior(images, views, depth_range)[0].sample())
 
     def set_latent_moments(self, mean: Sequence[float], std: Sequence[float]) -> None:
-        """Set the mean and standard deviation of each latent channel on the training set."""
         self.latent_mean.copy_(torch.tensor(mean)[:, None, None])
         self.latent_std.copy_(torch.tensor(std)[:, None, None])
 

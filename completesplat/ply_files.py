@@ -98,7 +98,6 @@ def _vertices(file: BinaryIO, needed: Sequence[str]) -> np.ndarray:
 
 
 def _elements(lines: Sequence[str]) -> list[Element]:
-    """Parse the header's elements, in the order of the file."""
     declared: list[Element] = []
     for line in lines:
         match line.split():

@@ -116,7 +116,6 @@ class SceneModel(nn.Module):
 
     @property
     def parameterization(self) -> Parameterization:
-        """Return the parameterization of its Splatter Images."""
         return self.reconstruction_model.parameterization
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:

@@ -63,7 +63,6 @@ def keep_signals(kept: bool) -> None:
 
 
 def are_kept() -> bool:
-    """Return whether signals wait."""
     return _kept
 
 

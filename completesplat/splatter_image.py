@@ -113,7 +113,6 @@ class Parameterization:
 
     @property
     def channels(self) -> int:
-        """Return the channels of the network's output."""
         return self.layers * self.layer_channels
 
 

@@ -65,18 +65,27 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
         decoder = {"post_quant_conv": reconstructor.post_quant_conv, "decoder": reconstructor.network}
     # Under these names the state dict's keys are those of diffusers' AutoencoderKL.
     vae = nn.ModuleDict({"encoder": encoder.network, "quant_conv": encoder.quant_conv, **decoder})
-    expected, loaded = ({k: x for k, x in named.items() if k not in HEAD} for named in (vae.state_dict(), weights))
-    reason, groups = mismatch(expected, loaded), config.get("norm_num_groups", 32)
-    assert isinstance(encoder.network.conv_norm_out, nn.GroupNorm)
-    if reason is None and groups != encoder.network.conv_norm_out.num_groups:  # no tensor's shape shows it
-        reason = f"its group normalisation has {groups} groups, not {encoder.network.conv_norm_out.num_groups}"
-    if reason is None and (activation := config.get("act_fn", "silu")) != "silu":  # weights do not show it
-        reason = f"its activation is {activation}, not silu"
+    loaded = _without_head(weights)
+    reason = mismatch(_without_head(vae.state_dict()), loaded) or _other_kind(config, encoder)
     if reason is not None:
         raise WeightsError(f"{place}: {reason}; {_needed_settings(config, part)}")
-    if (unfit := not_finite(loaded)) is not None:
+    unfit = not_finite(loaded)
+    if unfit is not None:
         raise WeightsError(f"{place}: {unfit} is not finite; fetch it again")
     vae.load_state_dict(loaded, strict=False)
+
+
+def _without_head(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value for name, value in weights.items() if name not in HEAD}
+
+
+def _other_kind(config: Mapping[str, object], encoder: Encoder) -> str | None:
+    """Return how a VAE differs from ours in what no tensor's shape shows, if it does."""
+    groups, activation = config.get("norm_num_groups", 32), config.get("act_fn", "silu")
+    assert isinstance(encoder.network.conv_norm_out, nn.GroupNorm)
+    if groups != encoder.network.conv_norm_out.num_groups:
+        return f"its group normalisation has {groups} groups, not {encoder.network.conv_norm_out.num_groups}"
+    return None if activation == "silu" else f"its activation is {activation}, not silu"
 
 
 def _needed_settings(config: Mapping[str, object], part: str) -> str:
@@ -84,11 +93,10 @@ def _needed_settings(config: Mapping[str, object], part: str) -> str:
     conditioning = part == "conditioning"
     names = SETTINGS | ({"latent_channels": "out_channels"} if conditioning else {})
     place = part if conditioning else f"{part}.encoder"
-    overrides = [
-        f"{place}.{ours}={json.dumps(config[theirs], separators=(',', ':'))}"
-        for theirs, ours in names.items()
-        if theirs in config
-    ]
+    values = {
+        ours: json.dumps(config[theirs], separators=(",", ":")) for theirs, ours in names.items() if theirs in config
+    }
+    overrides = [f"{place}.{name}={value}" for name, value in values.items()]
     return f"its config.json asks for {' '.join(overrides)}" if overrides else "no config.json gives its sizes"
 
 
@@ -100,12 +108,12 @@ def _vae_file(source: str, part: str) -> Path:
         f"run `hf download {hub_id} --local-dir DIR` with network access (add `--include 'vae/*'` for the VAE of a "
         f"whole pipeline); then give {part}.pretrained=DIR"
     )
+    if local.is_file() and local.suffix in SUFFIXES:
+        return local
+    if local.is_file():
+        raise WeightsError(f"{source}: not one of the files that are read: {', '.join(SUFFIXES)}")
     if not local.exists() and not is_id:
         raise WeightsError(f"{source}: no such folder; {advice}")
-    if local.is_file():
-        if local.suffix not in SUFFIXES:
-            raise WeightsError(f"{source}: not one of the files that are read: {', '.join(SUFFIXES)}")
-        return local
     for file in WEIGHTS_FILES:
         names = [f"{place}{name}" for place in PLACES for name in (CONFIG_FILE, file)]
         folder = local if local.exists() else from_hub(source, names, advice)
@@ -113,8 +121,9 @@ def _vae_file(source: str, part: str) -> Path:
             if (folder / place / CONFIG_FILE).is_file() and (folder / place / file).is_file():
                 return folder / place / file
     reason = f"no {CONFIG_FILE} and {WEIGHTS_FILES[0]} (or .bin) there, nor in a subfolder vae"
-    if others := sorted(str(path) for path in local.glob("*") if path.suffix in SUFFIXES):
-        raise WeightsError(f"{source}: {reason}; if one of its files is the VAE, give {part}.pretrained={others[0]}")
+    others = sorted(str(path) for path in local.glob("*") if path.suffix in SUFFIXES)
+    if others:
+        advice = f"if one of its files is the VAE, give {part}.pretrained={others[0]}"
     raise WeightsError(f"{source}: {reason}; {advice}")
 
 
@@ -123,7 +132,8 @@ def _read_weights(file: Path) -> dict[str, Tensor]:
     safe = file.suffix == ".safetensors"
     contents: dict[str, Any] = load_file(file) if safe else torch.load(file, map_location="cpu", weights_only=True)
     weights = contents.get("state_dict", contents)
-    if levels := {match[1] for match in map(LDM.match, weights) if match}:
+    levels = {match[1] for match in map(LDM.match, weights) if match}
+    if levels:
         from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint
 
         convert: Callable[..., dict[str, Tensor]] = convert_ldm_vae_checkpoint

@@ -41,7 +41,6 @@ class AutoDecoder(nn.Module):
         self.make_room(rows)
 
     def forward(self, codes: Codes) -> SplatterImage:
-        """Reconstruct from codes."""
         image: SplatterImage = self.reconstructor(codes, ())
         return image
 
@@ -52,7 +51,8 @@ class AutoDecoder(nn.Module):
         self._rows: dict[tuple[str, int], int] = {}
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: object) -> None:
-        if (codes := state_dict.get(f"{prefix}codes")) is not None and len(codes) != len(self.codes):
+        codes = state_dict.get(f"{prefix}codes")
+        if codes is not None and len(codes) != len(self.codes):
             self.make_room(len(codes))
         super()._load_from_state_dict(state_dict, prefix, *others)
 
@@ -75,7 +75,6 @@ class AutoDecoder(nn.Module):
         return [[name, frame] for name, frame in self._rows]
 
     def set_extra_state(self, state: Any) -> None:
-        """Restore the rows of a checkpoint."""
         self._rows = {(name, frame): row for row, (name, frame) in enumerate(state)}
 
 

@@ -51,7 +51,6 @@ class SparseVAE(nn.Module):
         self.register_buffer("std", torch.ones(layers, channels, 1, 1))
 
     def forward(self, image: SplatterImage) -> Reconstruction:
-        """Encode and decode a sparse Splatter Image."""
         mask = occupied(image)[:, :, None]
         seen = torch.cat([torch.where(mask, self.normalize(image.raw), 0.0), mask.float()], dim=2)
         posterior, _ = self.encoder.encode(seen.flatten(1, 2))

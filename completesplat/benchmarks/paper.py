@@ -172,7 +172,6 @@ def busy_processes(count: int) -> Iterator[None]:
 
 
 def compile_networks(networks: list[nn.Module], way: ComputeMode) -> None:
-    """Let these networks compile on their first call, if the way says so."""
     if way.compile is not None:
         torch.compiler.reset()
         for network in networks:

@@ -116,9 +116,9 @@ def check_device() -> Iterator[Finding]:
         reason = f"torch {torch.__version__}, built {built}, finds none (nvidia-smi shows the driver's)"
         yield Finding("GPU", "no", f"{reason}; all works on the CPU, slower")
     for name in FASTER:
-        reason = failure(name, None) or ""
-        message = reason or "a test rendering agrees with the reference"
-        yield Finding(f"rasterizer {name}", "no" if reason else "yes", message)
+        fault = failure(name, None)
+        message = "a test rendering agrees with the reference" if fault is None else fault
+        yield Finding(f"rasterizer {name}", "yes" if fault is None else "no", message)
 
 
 def check_weights(folder: Path = SHIPPED) -> Iterator[Finding]:
@@ -161,7 +161,8 @@ def run(config: DictConfig, out: Path) -> None:
         for finding in findings_of(check):
             rows.append({"part": part, **finding._asdict()})
             table.add_row(part, Text(finding.name), Text(finding.state, STYLES[finding.state]), Text(finding.details))
-            broken += [f"{part}, {finding.name}: {finding.details}"] if finding.state == "broken" else []
+            if finding.state == "broken":
+                broken.append(f"{part}, {finding.name}: {finding.details}")
         table.add_section()
     write_json(out / "doctor.json", {"works": not broken, "findings": rows})
     Console(width=None if Console().is_terminal else 160).print(table)

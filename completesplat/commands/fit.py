@@ -76,10 +76,7 @@ def run(config: DictConfig, out: Path) -> None:
     data, module = instantiate(config)
     # A test that cannot work is refused now, not after the training.
     tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
-    callbacks, loggers = (
-        [part for part in build(config.get(parts, {}), _convert_="all").values() if part is not None]
-        for parts in ("callbacks", "logger")
-    )
+    callbacks, loggers = _parts(config, "callbacks"), _parts(config, "logger")
     trainer = build(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if tested is not None:
@@ -90,11 +87,7 @@ def run(config: DictConfig, out: Path) -> None:
     metrics = {}
     with wandb_runs(loggers, config):
         if isinstance(module, Stage):
-            with _refusing_other_models(checkpoint):
-                trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
-            metrics = _logged(trainer)
-            if trainer.is_global_zero:
-                module.save_weights(out / RUN_WEIGHTS)
+            metrics = _train(trainer, module, data, checkpoint, out)
         if tested is not None:
             metrics |= _test(config, module, tested)
         for run_logger in loggers:  # a run shorter than the logging interval has its figures too
@@ -109,6 +102,23 @@ def run(config: DictConfig, out: Path) -> None:
             described = protocol(config.evaluation, module, tested, scores, out) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
         write_json(out / METRICS, results)  # the last file, because it means that the job is done
+
+
+def _parts(config: DictConfig, group: str) -> list[Any]:
+    parts = build(config.get(group, {}), _convert_="all")
+    return [part for part in parts.values() if part is not None]
+
+
+def _train(
+    trainer: Trainer, module: Stage, data: SceneDataModule, checkpoint: str | None, out: Path
+) -> dict[str, float]:
+    """Train, save the weights, and return all logged figures."""
+    with _refusing_other_models(checkpoint):
+        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    metrics = _logged(trainer)
+    if trainer.is_global_zero:
+        module.save_weights(out / RUN_WEIGHTS)
+    return metrics
 
 
 def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:

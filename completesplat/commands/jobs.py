@@ -228,7 +228,6 @@ def _refuse_earlier_end(out: Path, ends: Mapping[str, Any], earlier: Mapping[str
 
 
 def _differences(first: object, second: object, key: str = "") -> set[str]:
-    """Return the keys of the settings that differ."""
     if not isinstance(first, dict) or not isinstance(second, dict):
         return set() if first == second else {key}
     parts = [(f"{key}.{part}".lstrip("."), part) for part in first.keys() | second.keys()]

@@ -46,7 +46,6 @@ ADDED = ("steps", "days", "gpu_hours", "price")
 
 
 def run(config: DictConfig, out: Path) -> None:
-    """Print the plan of a training and write `plan.json`."""
     plan = plan_of(config)
     write_json(out / "plan.json", plan)
     show(plan_table({"plan": plan}), width=160)

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from glob import glob
 from pathlib import Path
 
@@ -106,7 +107,6 @@ def output_files(config: DictConfig) -> OutputFiles:
 
 
 def _names(value: object) -> tuple[str, ...]:
-    """Return one name, or the names of a list without duplicates."""
     names = value if isinstance(value, Sequence) and not isinstance(value, str) else [value] if value else []
     return tuple(dict.fromkeys(map(str, names)))
 
@@ -123,10 +123,7 @@ def predict_images(
         DiskError: the disk is full; the remaining images are not predicted.
     """
     console, failed = Console(), []
-    hiding = [name for name in ("mask", "box") if config[name] is not None]
-    if hiding and not model.architecture.get("training", {}).get("box_masks"):
-        text = "these weights were not trained with parts of the image hidden (data.box_masks, conf/experiment/"
-        log.warning("%s: %s*_masked.yaml): hidden parts may come out black or grey", hiding[0], text)
+    _warn_of_hidden_parts(config, model)
     rasterizer = instantiate(config.rasterizer, _convert_="all")
     wanted = replace(wanted, background=shown_background(config.background, model))
     folders = folder_names(image.stem for image in images)
@@ -135,29 +132,44 @@ def predict_images(
         for index, (image, folder) in enumerate(zip(images, folders, strict=True)):
             name, start = printable(image.name), time.perf_counter()
             bar.update(task, description=escape(name), completed=index * config.samples)
-            try:
-                _predict(config, model, rasterizer, wanted, image, out / folder, lambda: bar.advance(task))
-            except DiskError:  # the other images would fail, too
-                raise
-            except Exception as error:
-                fault = not isinstance(error, CompleteSplatError | OSError)
-                message = " ".join(str(error).split()) or type(error).__name__
-                message = printable(message if image.name in message else f"{image}: {message}")
-                if len(images) == 1 and fault:
-                    raise
-                if len(images) == 1:
-                    raise CompleteSplatError(message) from error
-                if fault:
-                    log.error("a fault of the program, not of the image", exc_info=error)
-                print(f"error: {message}", file=sys.stderr, flush=True)
+            on_sample = partial(bar.advance, task)
+            predict = partial(_predict, config, model, rasterizer, wanted, image, out / folder, on_sample)
+            if not _succeeds(predict, image, is_only=len(images) == 1):
                 failed.append(name)
-                continue
-            if not console.is_terminal:
+            elif not console.is_terminal:
                 seconds = f"{time.perf_counter() - start:.0f} s"
                 print(f"{index + 1}/{len(images)} {name}: {out / folder} ({seconds})", flush=True)
     if failed:
         share = f"{len(failed)} of {len(images)} images failed ({', '.join(failed)})"
         raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(images) else share)
+
+
+def _warn_of_hidden_parts(config: DictConfig, model: SceneModel) -> None:
+    hiding = [name for name in ("mask", "box") if config[name] is not None]
+    if hiding and not model.architecture.get("training", {}).get("box_masks"):
+        text = "these weights were not trained with parts of the image hidden (data.box_masks, conf/experiment/"
+        log.warning("%s: %s*_masked.yaml): hidden parts may come out black or grey", hiding[0], text)
+
+
+def _succeeds(predict: Callable[[], None], image: Path, is_only: bool) -> bool:
+    """Predict an image; raise the error of the only one, or print that of one of several and return false."""
+    try:
+        predict()
+    except DiskError:  # the other images would fail, too
+        raise
+    except Exception as error:
+        is_fault = not isinstance(error, CompleteSplatError | OSError)
+        if is_only and is_fault:
+            raise
+        message = " ".join(str(error).split()) or type(error).__name__
+        message = printable(message if image.name in message else f"{image}: {message}")
+        if is_only:
+            raise CompleteSplatError(message) from error
+        if is_fault:
+            log.error("a fault of the program, not of the image", exc_info=error)
+        print(f"error: {message}", file=sys.stderr, flush=True)
+        return False
+    return True
 
 
 def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: OutputFiles, out: Path) -> None:

@@ -54,12 +54,10 @@ class TrainedModel:
 
     @cached_property
     def model(self) -> SceneModel:
-        """Return the model of `weights`."""
         return CompleteSplat.from_pretrained(str(self.weights))
 
     @cached_property
     def files(self) -> "SceneFiles":
-        """Return the scorer that reads `scenes`."""
         from completesplat.training.scoring import SceneFiles
 
         rendering = self._rendering((self.data or {}).get("background"))
@@ -115,12 +113,10 @@ class TrainedModel:
         return {"checkpoint": facts, "ema": None}
 
     def _rendering(self, background: object) -> dict[str, Any]:
-        """Return the rasterizer, and the background if it is known."""
         known = {} if background is None else {"background": background}
         return {"rasterizer": instantiate(self.rasterizer, _convert_="all")} | known
 
     def _scorer(self) -> "Scorer":
-        """Return the scorer of `scenes` or of the model of `weights`."""
         if self.scenes is not None:
             return self.files
         from completesplat.training.latent_diffusion import DiffusionScorer

@@ -17,8 +17,8 @@ from completesplat.data.co3d.source import CO3DSource
 from completesplat.data.loading.scenes import SceneStore, with_true_depths
 from completesplat.data.loading.view_selection import evaluation_views
 from completesplat.data.sequences import PosedSequence
-from completesplat.data.validation import BadAnnotation, errors_at, field, finite_array, read_json
-from completesplat.errors import DataError
+from completesplat.data.validation import BadAnnotation, field, finite_array, read_json
+from completesplat.errors import DataError, errors_at
 from completesplat.geometry.surfaces import hidden_from
 from completesplat.scene import SceneBatch
 from completesplat.tensors import TensorDataclass, stack
@@ -147,7 +147,6 @@ class HiddenModeScenes:
         return modes.index(hidden), torch.from_numpy(chances).float()
 
     def _truths(self, name: str, views: Iterable[int]) -> Float[Tensor, "mode view 3 size size"]:
-        """Return the images of some views in every mode."""
         sequences = [(store, store.source.read(name)) for store in self.modes]
         images = [[store.image(sequence, view) for store, sequence in sequences] for view in views]
         return torch.stack([torch.stack(modes) for modes in images], dim=1).float() / 255

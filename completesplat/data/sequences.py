@@ -84,8 +84,12 @@ class SequenceSource(Protocol):
 
 def shared_names(splits: Mapping[str, Collection[str]]) -> dict[str, list[str]]:
     """Return the names that two splits share, by pair ("train and val"), without pairs that share nothing."""
-    pairs = {f"{one} and {other}": sorted({*splits[one]} & {*splits[other]}) for one, other in combinations(splits, 2)}
-    return {pair: names for pair, names in pairs.items() if names}
+    shared = {}
+    for one, other in combinations(splits, 2):
+        names = set(splits[one]) & set(splits[other])
+        if names:
+            shared[f"{one} and {other}"] = sorted(names)
+    return shared
 
 
 def overlaps(shared: Mapping[str, Sequence[str]]) -> list[str]:
@@ -95,7 +99,8 @@ def overlaps(shared: Mapping[str, Sequence[str]]) -> list[str]:
 
 def first_names(names: Sequence[str], most: int = 5) -> str:
     """Return the first few names for a message."""
-    return ", ".join([*names[:most], *(["..."] if len(names) > most else [])])
+    shown = [*names[:most], "..."] if len(names) > most else names
+    return ", ".join(shown)
 
 
 def spread_places(count: int, most: int | None) -> list[int]:

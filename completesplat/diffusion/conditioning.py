@@ -80,7 +80,6 @@ class StableDiffusionConditioning(nn.Module):
         self.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> "StableDiffusionConditioning":
-        """Stay in evaluation mode."""
         return super().train(False)
 
     @torch.no_grad()

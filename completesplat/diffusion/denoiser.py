@@ -50,7 +50,8 @@ class ConditionalUNet(nn.Module):
     ) -> None:
         super().__init__()
         self.latent_channels = latent_channels
-        down = [f"{attention if level in attention_levels else ''}DownBlock2D" for level in range(len(channels))]
+        prefixes = [attention if level in attention_levels else "" for level in range(len(channels))]
+        down = [f"{prefix}DownBlock2D" for prefix in prefixes]
         self.network = kind(
             in_channels=conditioning_channels + latent_channels,
             out_channels=latent_channels,
@@ -71,7 +72,6 @@ class ConditionalUNet(nn.Module):
         return sample.float()
 
     def context_of(self, batch: int) -> dict[str, Tensor]:
-        """Return further inputs of the network."""
         return {}
 
 

@@ -81,28 +81,42 @@ def write_formats(
     clipped = replace(seen, colors=seen.colors.clamp(0, 1))
     files = {kind: name + suffix(kind) for kind in formats}
     for kind, file in files.items():
-        target = folder / file
         if kind == "ply":
-            write_ply(target, gaussians, comments)
-        elif kind == "splat":
-            write_splat(target, clipped)
-        elif kind == "glb":
-            write_glb(target, clipped, comments)
-        elif kind == "mesh" and rasterizer is not None:
-            write_mesh(target, mesh_of(rasterizer, clipped, view.reference, view.pivot), comments)
-        elif converter is None or kind == "mesh":
-            raise CompleteSplatError(f"a {'rasterizer' if kind == 'mesh' else 'converter'} is needed for {kind}")
-        elif kind == "html":
-            write_turning_page(target, clipped, view, converter)
+            write_ply(folder / file, gaussians, comments)
         else:
-            stored = clipped[~transparent(clipped)] if kind == "spz" else clipped
-            if not stored.count:
-                raise CompleteSplatError(f"{target}: all {clipped.count} Gaussians are transparent")
-            with tempfile.TemporaryDirectory() as temporary:
-                source = Path(temporary) / f"{name}.ply"
-                write_ply(source, stored, comments)
-                converter.convert(source, target)
+            _write_format(folder / file, kind, clipped, view, converter, comments, rasterizer)
     return {name if kind == "ply" else f"{name}_{kind}": file for kind, file in files.items()}
+
+
+def _write_format(
+    path: Path,
+    kind: str,
+    gaussians: Gaussians,
+    view: PageView,
+    converter: SplatTransform | None,
+    comments: Sequence[str],
+    rasterizer: Rasterizer | None,
+) -> None:
+    if kind == "splat":
+        write_splat(path, gaussians)
+    elif kind == "glb":
+        write_glb(path, gaussians, comments)
+    elif kind == "mesh":
+        if rasterizer is None:
+            raise CompleteSplatError(f"a rasterizer is needed for {kind}")
+        write_mesh(path, mesh_of(rasterizer, gaussians, view.reference, view.pivot), comments)
+    elif converter is None:
+        raise CompleteSplatError(f"a converter is needed for {kind}")
+    elif kind == "html":
+        write_turning_page(path, gaussians, view, converter)
+    else:
+        stored = gaussians[~transparent(gaussians)] if kind == "spz" else gaussians
+        if not stored.count:
+            raise CompleteSplatError(f"{path}: all {gaussians.count} Gaussians are transparent")
+        with tempfile.TemporaryDirectory() as temporary:
+            source = Path(temporary) / f"{path.stem}.ply"
+            write_ply(source, stored, comments)
+            converter.convert(source, path)
 
 
 def suffix(kind: str) -> str:
@@ -115,13 +129,13 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> int:
     stored = cleaned(gaussians, path).detach()
     records = np.zeros(stored.count, RECORD)
     records["means"], records["scales"] = stored.means.cpu(), stored.scales.cpu()
-    records["colors"] = rounded(torch.cat([stored.colors, stored.opacities[:, None]], dim=-1) * 255)
-    records["quaternions"] = rounded(normalize_quaternion(stored.quaternions) * 128 + 128)
+    records["colors"] = round_to_uint8(torch.cat([stored.colors, stored.opacities[:, None]], dim=-1) * 255)
+    records["quaternions"] = round_to_uint8(normalize_quaternion(stored.quaternions) * 128 + 128)
     write_bytes(path, records.tobytes())
     return stored.count
 
 
-def rounded(values: Tensor) -> UInt8[np.ndarray, "*shape"]:
+def round_to_uint8(values: Tensor) -> UInt8[np.ndarray, "*shape"]:
     """Round values to bytes, those outside of 0 to 255 to the nearer end."""
     return values.round().clamp(0, 255).to(torch.uint8).cpu().numpy()
 

@@ -43,8 +43,8 @@ def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
     """
     table = _table(cleaned(gaussians, path))
     names = [*WRITTEN[:9], *_further_names(table.shape[1] - len(WRITTEN)), *WRITTEN[9:]]
-    first = vertex_header(len(table), [(name, "float") for name in names], (AXES_COMMENT, *comments))
-    write_bytes(path, first + table.numpy().astype("<f4").tobytes())
+    header = vertex_header(len(table), [(name, "float") for name in names], (AXES_COMMENT, *comments))
+    write_bytes(path, header + table.numpy().astype("<f4").tobytes())
     return len(table)
 
 

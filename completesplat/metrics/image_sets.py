@@ -4,6 +4,7 @@ import math
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -67,9 +68,10 @@ class ImageSets:
         for index, metric in enumerate(self.metrics):
             predicted, true = self.described[owner, region, index], self.described[self.TRUE, region, index]
             if predicted:
-                sets = (torch.cat([scenes[name] for name in sorted(predicted)]) for scenes in (true, predicted))
+                names = sorted(predicted)
+                true_set = torch.cat([true[name] for name in names])
                 try:
-                    figures |= metric.distances(*sets)
+                    figures |= metric.distances(true_set, torch.cat([predicted[name] for name in names]))
                 except Exception as error:  # of any metric; the other scores must not be lost
                     missing |= dict.fromkeys(metric.settings(), f"missing: {first_line(error)}")
         missing |= {name: f"missing: not finite ({x})" for name, x in figures.items() if not math.isfinite(x)}
@@ -101,14 +103,13 @@ class Inception:
         return {"fid": frechet_distance(true, predicted), "kid": kernel_distance(true, predicted, self.subset_size)}
 
     def settings(self) -> dict[str, MetricSettings]:
-        """See `SetMetric`."""
         network = {"network": "inception-2015-12-05", "features": "pool, 2048"}
         return {"fid": network, "kid": network | {"subset_size": self.subset_size, "subsets": 100, "factor": 1}}
 
 
 def inception(weights: str | None, sha256: str | None = None, subset_size: int = 1000) -> Inception | MissingMetrics:
     """Return FID and KID, or why they are missing; see `load_inception` for the weights."""
-    load = lambda source: load_inception(source, sha256, subset_size)  # noqa: E731
+    load = partial(load_inception, sha256=sha256, subset_size=subset_size)
     return load_or_missing(weights, load, ADVICE, ("fid", "kid"))
 
 

@@ -74,7 +74,6 @@ class Evaluation:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all scores."""
         self.sets = ImageSets(self.set_metrics)
         self.scores: dict[str, dict[str, Scores]] = defaultdict(dict)
         self.views: dict[str, int] = {}
@@ -101,18 +100,7 @@ class Evaluation:
         self._add(MODEL, name, each[0], dict.fromkeys(REGIONS, images[0]), truth)
         if len(each) == 1:
             return
-        chosen = {
-            (region, metric): best_sample(
-                [scores[region, "novel", metric] for scores in each], HIGHER_IS_BETTER[metric]
-            )
-            for region in REGIONS
-            for metric in self.metrics
-        }
-        by_criterion = {region: chosen[region, self.criterion] for region in REGIONS}
-        scores = {key: each[by_criterion[key[0]]][key] for key in each[0]}
-        self._add(BEST, name, scores, {region: images[i] for region, i in by_criterion.items()}, truth)
-        by_metric = {(r, v, m): each[chosen[r, m]][r, v, m] for r, v, m in each[0] if m in self.metrics}
-        self.scores[BEST_BY_METRIC][name] = by_metric
+        self._add_best(name, each, images, truth)
         self.scores[MEAN][name] = {key: sum(scores[key] for scores in each) / len(each) for key in each[0]}
         proper, ranks = proper_scores(images[:, 1:], truth)
         self.scores[MODEL][name] |= proper
@@ -122,6 +110,19 @@ class Evaluation:
         by, higher = [scores["full", "novel", self.criterion] for scores in each], HIGHER_IS_BETTER[self.criterion]
         curves = {"curve": expected_best_curve(by, higher), "curve_noisy_mean": expected_best_curve(by_noise, higher)}
         self.drawn[name] = {**curves, "diversity": diversity(images[:, 1:]), "ranks": ranks}
+
+    def _add_best(self, name: str, each: Sequence[Scores], images: SampledViews, truth: Views) -> None:
+        """Add the scores of the samples that `BEST_RULES` choose from a scene's, given the scores of each."""
+        chosen: dict[tuple[str, str], int] = {}
+        for region in REGIONS:
+            for metric in self.metrics:
+                values = [scores[region, "novel", metric] for scores in each]
+                chosen[region, metric] = best_sample(values, HIGHER_IS_BETTER[metric])
+        by_criterion = {region: chosen[region, self.criterion] for region in REGIONS}
+        scores = {key: each[by_criterion[key[0]]][key] for key in each[0]}
+        self._add(BEST, name, scores, {region: images[i] for region, i in by_criterion.items()}, truth)
+        by_metric = {(r, v, m): each[chosen[r, m]][r, v, m] for r, v, m in each[0] if m in self.metrics}
+        self.scores[BEST_BY_METRIC][name] = by_metric
 
     def score(self, images: Float[Tensor, "view 3 height width"], truth: Views) -> Scores:
         """Score one prediction (values in [0, 1]) of one scene: means over the novel views, and their `sharpness`."""
@@ -173,26 +174,29 @@ class Evaluation:
 
     def results(self) -> dict[str, Any]:
         """Return {predictor: {region: {view: {metric: mean over scenes}}, "scenes": n, "views": n of novel views}}."""
-        results: dict[str, Any] = {}
-        for predictor, scenes in self.scores.items():
-            names = sorted(scenes)
-            entry: dict[str, Any] = {"scenes": len(names), "views": sum(self.views[name] for name in names)}
-            for region, view, metric in dict.fromkeys(key for name in names for key in scenes[name]):
-                key = region, view, metric
-                values = [scenes[name][key] for name in names if key in scenes[name]]
-                entry.setdefault(region, {}).setdefault(view, {})[metric] = sum(values) / len(values)
-            for region in REGIONS:
-                entry[region]["novel"] |= self.sets.results(predictor, region, self.missing)
-            results[predictor] = entry
+        results = {predictor: self._means_of(predictor) for predictor in self.scores}
         if self.drawn:
             names = sorted(self.drawn)
             for kind in ("curve", "curve_noisy_mean"):
                 results[BEST][kind] = _means([self.drawn[name][kind] for name in names])
             results[MEAN]["diversity"] = sum(self.drawn[name]["diversity"] for name in names) / len(names)
             for region in PROPER_REGIONS:
-                known = [shares[region] for name in names if region in (shares := self.drawn[name]["ranks"])]
-                results[MEAN] |= {f"ranks_{region}": _means(known)} if known else {}
+                ranks = [self.drawn[name]["ranks"] for name in names if region in self.drawn[name]["ranks"]]
+                if ranks:
+                    results[MEAN][f"ranks_{region}"] = _means([shares[region] for shares in ranks])
         return results
+
+    def _means_of(self, predictor: str) -> dict[str, Any]:
+        scenes = self.scores[predictor]
+        names = sorted(scenes)
+        entry: dict[str, Any] = {"scenes": len(names), "views": sum(self.views[name] for name in names)}
+        for key in dict.fromkeys(key for name in names for key in scenes[name]):
+            region, view, metric = key
+            values = [scenes[name][key] for name in names if key in scenes[name]]
+            entry.setdefault(region, {}).setdefault(view, {})[metric] = sum(values) / len(values)
+        for region in REGIONS:
+            entry[region]["novel"] |= self.sets.results(predictor, region, self.missing)
+        return entry
 
 
 def _means(rows: Sequence[Sequence[float]]) -> list[float]:
@@ -265,7 +269,6 @@ def depth_errors(
 
 
 def best_sample(scores: Sequence[float], higher_is_better: bool = True) -> int:
-    """Return the index of the best sample, the first of equals."""
     return scores.index(_worst_first(scores, higher_is_better)[-1])
 
 

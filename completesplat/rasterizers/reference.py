@@ -28,7 +28,6 @@ class ReferenceRasterizer:
 
     @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Render scenes [batch] from cameras [batch view]."""
         batch, view = cameras.world_to_camera.shape[:2]
         scenes = [stack([self._render(gaussians[b], cameras[b, v]) for v in range(view)]) for b in range(batch)]
         return stack(scenes)

@@ -70,7 +70,6 @@ def group_by_protocol(measurements: Iterable[tuple[Measured, Protocol]], *more: 
 
 
 def protocol_line(protocol: Protocol, keys: Sequence[str] = DESCRIBED) -> str:
-    """Describe a protocol in one line."""
     values: Mapping[str, object] = protocol
     known = {key: value for key in keys if (value := values.get(key)) is not None}
     parts = [f"{key} {len(value) if isinstance(value, list) else value}" for key, value in known.items()]
@@ -150,13 +149,11 @@ def score_rows(
 
 
 def leading_headings(keys: Iterable[str]) -> list[Heading]:
-    """Return headings for some keys of `LEADING`."""
     named = [(key, "time per sequence" if key in COST else "") for key in keys]
     return [Heading(LEADING[key], group, key not in ("method", "speed")) for key, group in named]
 
 
 def entries_of(runs: Iterable[ResultsFile]) -> list[Entry]:
-    """Return all entries of all runs, in the order of their files."""
     return [_entry(run, predictor, scores) for run in runs for predictor, scores in run.entries.items()]
 
 

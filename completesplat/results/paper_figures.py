@@ -65,7 +65,6 @@ def read_tables() -> list[PublishedTable]:
 
 
 def printed_rows(table: PublishedTable) -> list[list[Cell]]:
-    """Return the rows of a published table."""
     return [[parse_cell(cell) for cell in line.split("|")] for line in table.rows.splitlines()]
 
 
@@ -89,24 +88,31 @@ def comparison_table(table: PublishedTable, entries: Sequence[Entry]) -> Table:
     Times are of one sequence, warm, for the complete pipeline.
     """
     notes, keys = Notes(), ["method"]
-    if not table.get("options"):
+    is_ablation = bool(table.get("options"))
+    if not is_ablation:
         keys = [key for key in LEADING if key in OF_RUNS or any(column.key == key for column in table.columns)]
+    scored = score_columns(table)
+    names = [f"{table.region}_{table.view}_{column.key}" for _, column, _ in scored]
+    data_sets = [None if is_ablation else data_set for *_, data_set in scored]
+    ours = score_rows(entries, keys, list(zip(names, data_sets, strict=True)), notes, marked=False)
+    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in scored)]
+    source = f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
+    signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.get("legend", {}).items()]
+    of_ours = [APART] if entries else []
+    remarks = [source, *signs, LEGEND, *(of_ours if is_ablation else [VIEWS]), *table.get("remarks", [])]
+    rows = [*_published_rows(table, keys), *ours]
+    return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
+
+
+def _published_rows(table: PublishedTable, keys: Sequence[str]) -> list[TableRow]:
+    """Return the paper's rows: first the cells of `keys`, then the scores."""
     rows = []
     for row in printed_rows(table):
         cells = {"resolution": Cell(table.get("resolution", ABSENT))}
         cells |= {column.key: cell for column, cell in zip(table.columns, row, strict=True)}
         scores = [row[number] for number, _, _ in score_columns(table)]
         rows.append(TableRow("paper", [*(cells.get(key, Cell(ABSENT)) for key in keys), *scores]))
-    names = [f"{table.region}_{table.view}_{column.key}" for _, column, _ in score_columns(table)]
-    data_sets = [None if table.get("options") else data_set for *_, data_set in score_columns(table)]
-    columns = list(zip(names, data_sets, strict=True))
-    rows += score_rows(entries, keys, columns, notes, marked=False)
-    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in score_columns(table))]
-    source = f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
-    signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.get("legend", {}).items()]
-    apart = ([APART] if entries else []) if table.get("options") else [VIEWS]
-    remarks = [source, *signs, LEGEND, *apart, *table.get("remarks", [])]
-    return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
+    return rows
 
 
 def is_comparable(table: PublishedTable, entry: Entry) -> bool:
@@ -160,18 +166,27 @@ def published_tables(tree: RunTree | None) -> list[Table]:
         return [comparison_table(table, []) for table in read_tables()]
     if not (tree.scores or tree.modes or tree.warnings):
         raise CompleteSplatError(f"runs={tree.folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
-    options = {option for table in read_tables() for option in table.get("options", [])}
-    jobs = {folder: [job for job in collect(folder) if job.protocol] for folder in tree.sweeps}
-    sweeps = {
-        folder: tested for folder, tested in jobs.items() if any(options & set(job.label.split(", ")) for job in tested)
-    }
+    sweeps = _ablation_sweeps(tree)
     single = entries_of(run for run in tree.scores if run.folder.parent not in sweeps)
     made, placed = [], []
     for table in read_tables():
+        entries = []
         if table.get("options"):
-            named = [(str(folder.relative_to(tree.folder)), tested) for folder, tested in sweeps.items()]
-            entries = [entry for name, tested in named for entry in sweep_entries(table, name, tested)]
+            for folder, tested in sweeps.items():
+                entries += sweep_entries(table, str(folder.relative_to(tree.folder)), tested)
         else:
-            placed += (entries := [entry for entry in single if is_comparable(table, entry)])
+            entries = [entry for entry in single if is_comparable(table, entry)]
+            placed += entries
         made.append(comparison_table(table, entries))
     return [*made, *score_tables([entry for entry in single if entry not in placed]), *mode_tables(tree.modes)]
+
+
+def _ablation_sweeps(tree: RunTree) -> dict[Path, list[Job]]:
+    """Return the tested jobs of each sweep over options of the published ablation tables, by the sweep's folder."""
+    options = {option for table in read_tables() for option in table.get("options", [])}
+    sweeps = {}
+    for folder in tree.sweeps:
+        tested = [job for job in collect(folder) if job.protocol]
+        if any(options & set(job.label.split(", ")) for job in tested):
+            sweeps[folder] = tested
+    return sweeps

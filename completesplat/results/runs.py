@@ -169,7 +169,6 @@ def collect(*folders: Path) -> list[Job]:
 
 
 def _joined(parts: Sequence[list[Job]]) -> list[Job]:
-    """Join the jobs of several machines, each once."""
     values: dict[str, list[set[str]]] = {}
     for number, jobs in enumerate(parts):
         for key, value in (pair for job in jobs for pair in job.overrides.items()):

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -13,7 +13,7 @@ from hydra.types import RunMode
 
 from completesplat.results.machine import machine
 from completesplat.results.measured import Entry, score_rows
-from completesplat.results.runs import MODEL, SEED, UPPER_BOUND, Job, collect, shell_command
+from completesplat.results.runs import MODEL, SEED, UPPER_BOUND, Job, Record, collect, shell_command
 from completesplat.results.tables import (
     SHOWN,
     SSIM_NOTE,
@@ -89,16 +89,28 @@ def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> Entry:
     tables = [job.test.get(predictor, {}) for job in jobs]
     scenes = _common(int(table["scenes"]) for table in tables if table)
     bound = any(table.get(UPPER_BOUND) for table in tables)
-    names = [name for name in tables[0] if "_novel_" in name or "_reference_" in name]
-    values = {name: [table[name] for table in tables if name in table] for name in names}
-    means = {name: fmean(each) for name, each in values.items() if len(each) == len(jobs)}
+    scores = _complete_scores(tables)
+    means = {name: fmean(values) for name, values in scores.items()}
     if predictor != MODEL:
         return Entry(label, means, scenes, predictor, bound)
-    # An infinite PSNR has no standard deviation.
-    finite = {name: all(map(math.isfinite, values[name])) for name in means if len(jobs) > 1}
-    deviations = {name: stdev(values[name]) if known else math.nan for name, known in finite.items()}
+    deviations = {name: _deviation(values) for name, values in scores.items()} if len(jobs) > 1 else {}
     steps = _common(job.steps for job in jobs)
     return Entry(label, means, scenes, predictor, bound, len(jobs), steps, deviations)
+
+
+def _complete_scores(tables: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
+    """Return the values of the views' scores that all tables have."""
+    scores = {}
+    for name in tables[0]:
+        of_views = "_novel_" in name or "_reference_" in name
+        if of_views and all(name in table for table in tables):
+            scores[name] = [table[name] for table in tables]
+    return scores
+
+
+def _deviation(values: Sequence[float]) -> float:
+    # An infinite PSNR has no standard deviation.
+    return stdev(values) if all(map(math.isfinite, values)) else math.nan
 
 
 def _common(values: Iterable[int]) -> int | str | None:
@@ -124,29 +136,45 @@ def summarize(*folders: Path) -> tuple[list[Entry], Table]:
 
 def _remarks(jobs: Sequence[Job], rows: Sequence[Entry]) -> list[str]:
     """Return sentences on finished and missing jobs, on rows that do not compare, on commit, machine and commands."""
-    finished = [job for job in jobs if job.finished]
-    remarks = [f"{len(finished)} of {len(jobs)} jobs have finished."]
-    missing = []
-    for job in (job for job in jobs if not job.finished):
+    return [
+        *_progress_remarks(jobs),
+        *_row_remarks(rows),
+        *_program_remarks([job.record for job in jobs if job.record]),
+    ]
+
+
+def _progress_remarks(jobs: Sequence[Job]) -> list[str]:
+    unfinished = [job for job in jobs if not job.finished]
+    remarks = [f"{len(jobs) - len(unfinished)} of {len(jobs)} jobs have finished."]
+    names = []
+    for job in unfinished:
         seed = [f"seed={job.overrides[SEED]}"] if SEED in job.overrides else []
-        missing.append(job.name or ", ".join([job.label, *seed]))  # a job has no folder before it starts
-    if missing:
-        remarks.append(f"Not finished: {'; '.join(missing)}.")
+        names.append(job.name or ", ".join([job.label, *seed]))  # a job has no folder before it starts
+    return [*remarks, f"Not finished: {'; '.join(names)}."] if names else remarks
+
+
+def _row_remarks(rows: Sequence[Entry]) -> list[str]:
     ours = [row for row in rows if row.seeds is not None]
     mixed = [row for row in ours if isinstance(row.scenes, str)]
-    remarks += [f"{row.label} has seen the views that it is scored on." for row in rows if row.upper_bound]
+    remarks = [f"{row.label} has seen the views that it is scored on." for row in rows if row.upper_bound]
     remarks += [f"{row.label}: its jobs were tested on different scenes ({row.scenes})." for row in mixed]
     if len({row.scenes for row in ours}) > 1:
         remarks.append("The rows were not tested on equally many scenes and do not compare.")
-    recorded = [job.record for job in jobs if job.record]
-    commits = list(dict.fromkeys(record["commit"] or "unknown" for record in recorded))
-    remarks.append(f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits) or 'unknown'}.")
+    return remarks
+
+
+def _program_remarks(records: Sequence[Record]) -> list[str]:
+    commits = list(dict.fromkeys(record["commit"] or "unknown" for record in records))
     here = machine()
-    hardware = f"{here['processor']}, {here['cores']} cores{', ' + here['gpu'] if 'gpu' in here else ''}"
+    gpu = f", {here['gpu']}" if "gpu" in here else ""
+    hardware = f"{here['processor']}, {here['cores']} cores{gpu}"
     software = f"{here['system']}, Python {here['python']}, torch {here['torch']}"
-    remarks.append(f"Summary of {here['date']}, made on {hardware}, {software}.")
-    commands = dict.fromkeys(shell_command(record["command"]) for record in recorded)
-    return [*remarks, *(f"Command: {command}" for command in commands)]
+    commands = dict.fromkeys(shell_command(record["command"]) for record in records)
+    return [
+        f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits) or 'unknown'}.",
+        f"Summary of {here['date']}, made on {hardware}, {software}.",
+        *(f"Command: {command}" for command in commands),
+    ]
 
 
 def write_summary(folder: Path, *parts: Path) -> Table:

@@ -106,7 +106,6 @@ class Heading:
     form: str = ""
 
     def joined(self, separator: str = ": ") -> str:
-        """Join group and text."""
         return separator.join(part for part in (self.group, self.text) if part)
 
 
@@ -140,7 +139,6 @@ class Table:
         return list(zip(self.rows, [*apart, False], strict=False))
 
     def below(self) -> list[str]:
-        """Return the remarks, and the notes with their numbers."""
         return [*self.remarks, *(f"[{n}] {text}" for n, text in enumerate(self.notes.texts, 1))]
 
     def __rich__(self) -> "PrintedTable":

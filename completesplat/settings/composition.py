@@ -122,7 +122,6 @@ def _nearest(verb: str, key: str, names: Sequence[str]) -> str:
 
 
 def _keys(config: DictConfig, place: str = "") -> Iterator[str]:
-    """Yield all keys of a config with their places, without following references."""
     for name in map(str, config):
         yield f"{place}{name}"
         followed = OmegaConf.is_missing(config, name) or OmegaConf.is_interpolation(config, name)

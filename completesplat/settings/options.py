@@ -61,12 +61,10 @@ def folders() -> list[Path]:
 
 
 def groups() -> list[str]:
-    """Return the names of all config groups."""
     return sorted({path.name for folder in folders() for path in folder.iterdir() if path.is_dir()})
 
 
 def options(group: str) -> list[str]:
-    """Return the options of a group; an empty list if there is no such group."""
     return sorted({file.stem for folder in folders() for file in (folder / group).glob("[!_]*.yaml")})
 
 

@@ -2,11 +2,21 @@
 
 import inspect
 import math
-import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType, UnionType
-from typing import Annotated, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints, is_typeddict
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    Union,
+    Unpack,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
 
 from completesplat.errors import CompleteSplatError
 
@@ -28,7 +38,6 @@ class Range:
     most: float = math.inf
 
     def refusal(self, value: float) -> str | None:
-        """Return why the value is refused, None if it is accepted."""
         if value == math.inf:
             return "must be finite"
         if self.least <= value <= self.most:
@@ -38,7 +47,6 @@ class Range:
         return f"must lie between {self.least:g} and {self.most:g}"
 
     def words(self) -> str:
-        """Describe the range in a few words."""
         return f"at least {self.least:g}" if self.most > MOST_SHOWN else f"{self.least:g} to {self.most:g}"
 
 
@@ -50,7 +58,6 @@ class Entries:
     most: float = math.inf
 
     def refusal(self, value: Sequence[object]) -> str | None:
-        """Return why the value is refused, None if it is accepted."""
         if self.least <= len(value) <= self.most:
             return None
         if math.isinf(self.most):
@@ -118,16 +125,23 @@ def arguments_of(target: Callable[..., object] | type) -> tuple[dict[str, object
     annotations: dict[str, object] = {}
     for function in functions:
         try:
-            hints, parameters = hints_of(function), inspect.signature(function).parameters.values()
+            further, passes_on = _named_arguments(function)
         except (NameError, TypeError, ValueError):  # other packages: names only under TYPE_CHECKING
             return annotations, False
-        named = {param.name for param in parameters if param.kind in (param.POSITIONAL_OR_KEYWORD, param.KEYWORD_ONLY)}
-        more = [param for param in parameters if param.kind is param.VAR_KEYWORD]
-        named |= {name for name in hints if name != "return"} - {param.name for param in parameters}
-        annotations = {name: hints.get(name, object) for name in named - {"self"}} | annotations
-        if not more or get_origin(get_type_hints(function).get(more[0].name)) is Unpack:
+        annotations = further | annotations
+        if not passes_on:
             return annotations, True
     return annotations, False
+
+
+def _named_arguments(function: Callable[..., object]) -> tuple[dict[str, object], bool]:
+    """Return annotations of a function's arguments by name, and whether it has a `**` that takes any others."""
+    hints, parameters = hints_of(function), inspect.signature(function).parameters.values()
+    named = {param.name for param in parameters if param.kind in (param.POSITIONAL_OR_KEYWORD, param.KEYWORD_ONLY)}
+    unpacked = hints.keys() - {param.name for param in parameters} - {"return"}
+    others = [hints.get(param.name) for param in parameters if param.kind is param.VAR_KEYWORD]
+    annotations = {name: hints.get(name, object) for name in (named | unpacked) - {"self"}}
+    return annotations, any(get_origin(hint) is not Unpack for hint in others)
 
 
 def start_weights(kind: object) -> Mapping[str, str]:
@@ -140,35 +154,59 @@ def violations(annotation: object, value: object) -> list[Violation]:
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
-        unfit = violations(kind, value)
-        return unfit or [Violation("", value, reason) for rule in rules if (reason := rule.refusal(value))]
-    members = arguments if origin in (Union, UnionType) else (annotation,)
-    if annotation is not NoneType and all(get_origin(m) is Literal or m is NoneType for m in members):
-        choices = [choice for member in members for choice in get_args(member) or (None,)]
-        written = ", ".join("null" if choice is None else str(choice) for choice in choices)
-        return [] if value in choices else [Violation("", value, f"choose one of {written}")]
+        return violations(kind, value) or _against_rules(rules, value)
+    if origin is Literal:
+        return _in_choice(arguments, value)
     if origin in (Union, UnionType):
-        # A setting is never a `Tensor`, so `float | Tensor` means float. Without numbers, other classes accept all.
-        plain = [member for member in arguments if not isinstance(member, type) or member in KINDS]
-        numbers = {int, float} & set(arguments) and isinstance(value, str | int | float | Sequence)
-        attempts = [violations(member, value) for member in (plain if numbers else arguments)]
-        return [] if [] in attempts else attempts[0]
-    if origin is Sequence:  # if an entry does not fit, the whole list is reported
-        if isinstance(value, str) or not isinstance(value, Sequence):
-            return [Violation("", value, "must be a list")]
-        return [Violation("", value, bad.reason) for entry in value for bad in violations(arguments[0], entry)]
+        return _in_union(arguments, value)
+    if origin is Sequence:
+        return _in_list(arguments[0], value)
     if origin is Mapping or is_typeddict(annotation):
-        if not isinstance(value, Mapping):
-            return [Violation("", value, "must be a mapping")]
-        typed = get_type_hints(annotation, include_extras=True) if is_typeddict(annotation) else {}
-        kinds = [(key, part, typed.get(key, object) if typed else arguments[1]) for key, part in value.items()]
-        return [bad._replace(place=f".{key}{bad.place}") for key, part, kind in kinds for bad in violations(kind, part)]
-    if isinstance(annotation, type) and annotation in KINDS and not _is_a(annotation, value):
-        return [Violation("", value, f"must be {KINDS[annotation]}")]
-    is_part = isinstance(annotation, type) and annotation not in (*KINDS, object, typing.Any)
+        return _in_mapping(annotation, value)
+    if isinstance(annotation, type) and annotation in KINDS:
+        return [] if _is_a(annotation, value) else [Violation("", value, f"must be {KINDS[annotation]}")]
+    is_part = isinstance(annotation, type) and annotation not in (object, Any)
     if value is None and (is_part or origin is Callable):
         return [Violation("", value, "must not be null; leave it out")]
     return []
+
+
+def _against_rules(rules: Sequence[Any], value: object) -> list[Violation]:
+    reasons = [rule.refusal(value) for rule in rules]
+    return [Violation("", value, reason) for reason in reasons if reason is not None]
+
+
+def _in_choice(choices: Sequence[object], value: object) -> list[Violation]:
+    written = ", ".join("null" if choice is None else str(choice) for choice in choices)
+    return [] if value in choices else [Violation("", value, f"choose one of {written}")]
+
+
+def _in_union(members: Sequence[object], value: object) -> list[Violation]:
+    if all(get_origin(member) is Literal or member is NoneType for member in members):
+        return _in_choice([choice for member in members for choice in get_args(member) or (None,)], value)
+    # A setting is never a `Tensor`, so `float | Tensor` means float. Without numbers, other classes accept all.
+    if {int, float} & set(members) and isinstance(value, str | int | float | Sequence):
+        members = [member for member in members if not isinstance(member, type) or member in KINDS]
+    attempts = [violations(member, value) for member in members]
+    return [] if [] in attempts else attempts[0]
+
+
+def _in_list(kind: object, value: object) -> list[Violation]:
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        return [Violation("", value, "must be a list")]
+    # If an entry does not fit, the whole list is reported.
+    return [Violation("", value, unfit.reason) for entry in value for unfit in violations(kind, entry)]
+
+
+def _in_mapping(annotation: object, value: object) -> list[Violation]:
+    if not isinstance(value, Mapping):
+        return [Violation("", value, "must be a mapping")]
+    hints = get_type_hints(annotation, include_extras=True) if is_typeddict(annotation) else None
+    result = []
+    for key, part in value.items():
+        kind = get_args(annotation)[1] if hints is None else hints.get(key, object)
+        result += [unfit._replace(place=f".{key}{unfit.place}") for unfit in violations(kind, part)]
+    return result
 
 
 def described(annotation: object) -> str:

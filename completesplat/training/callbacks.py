@@ -173,7 +173,6 @@ class Progress(RichProgressBar):
     def get_metrics(
         self, trainer: Trainer, pl_module: LightningModule
     ) -> dict[str, int | str | float | dict[str, float]]:
-        """Return the figures at the end of the bar."""
         metrics = super().get_metrics(trainer, pl_module)
         hidden = {"v_num"} if metrics.get(BAD_STEPS) else {"v_num", BAD_STEPS}
         return {"step": _steps(trainer), **{name: value for name, value in metrics.items() if name not in hidden}}

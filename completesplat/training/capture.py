@@ -105,7 +105,6 @@ class CaptureFit(Stage):
         self.register_buffer("count", torch.tensor(0))
 
     def gaussians(self) -> Gaussians:
-        """Return the fitted Gaussians [gaussian]."""
         used = {name: tensor[None, : int(self.count)] for name, tensor in self.raw.items()}
         return RawGaussians(**used).gaussians()[0]
 

@@ -133,7 +133,6 @@ class FixedScenes(DrawsFixedScenes):
         super().__init__(folder, every_n_steps, scenes, views=1)
 
     def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> tuple[Image.Image, dict[str, float]]:
-        """See `DrawsFixedScenes`."""
         batch = stack(scenes).to(module.device)
         with trainer.precision_plugin.forward_context():
             gaussians = module.reconstruct(batch, seed=0)
@@ -246,7 +245,6 @@ class Samples(DrawsFixedScenes):
         self.samples = samples
 
     def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> tuple[Image.Image, dict[str, float]]:
-        """See `DrawsFixedScenes`."""
         drawings = []
         for scene in (stack([scene]).to(module.device) for scene in scenes):
             views = scene.all_views()
@@ -269,7 +267,6 @@ class SceneDrawings:
     depth: Float[Tensor, "1 view 1 height width"]
 
     def scores(self) -> dict[str, float]:
-        """Score the target views."""
         images, true = self.samples[:, 1:], self.true[1:]
         scores = {
             "psnr": psnr(images.flatten(0, 1), true.expand_as(images).flatten(0, 1)).mean().item(),

@@ -158,7 +158,6 @@ class WandbRun(WandbLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, object], step: int | None = None) -> None:
-        """Log numbers, or W&B's images."""
         with self._dispensable():
             self.experiment.log({**metrics, **({} if step is None else {AXIS: step})})
 

@@ -43,7 +43,6 @@ class ReconstructionScorer(Scorer):
 
     @property
     def method(self) -> str:
-        """Return the class of the reconstruction model."""
         return type(self.model).__name__
 
     def forward(self, scenes: SceneBatch) -> Reconstruction:
@@ -170,7 +169,6 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         return int(torch.randint(1, targets, (2,)).max())
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
-        """Return the loss."""
         others = self.draw_others(scenes.targets.images.shape[1]) if self.sees_views else 0
         reconstruction = self(scenes, others)
         with torch.autocast(self.device.type, enabled=False):
@@ -257,7 +255,6 @@ class ReconstructorOnly(ReconstructionModule):
             return optimize_codes(codes, lambda x: self.reference_loss(x, scenes), self.code_steps, self.code_rate)
 
     def gaussians(self, codes: Codes, scenes: SceneBatch) -> Gaussians:
-        """Decode codes to Gaussians."""
         image: SplatterImage = self.model(codes)
         return image.gaussians(scenes.reference.cameras, scenes.depth_range)
 

@@ -105,12 +105,10 @@ class Scorer(LightningModule):
 
     @property
     def data(self) -> SceneDataModule:
-        """Return the trainer's data module."""
         return cast(SceneDataModule, self.trainer.datamodule)  # type: ignore[attr-defined]
 
     @property
     def method(self) -> str:
-        """Return the model's name in tables."""
         return type(self).__name__
 
     def render_from(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
@@ -237,7 +235,6 @@ class SceneFiles(Scorer):
         super().on_test_start()
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
-        """Read the first file of each scene."""
         return self.draw(scenes, [seed], 1)
 
     def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int, batch: int | None = None) -> Gaussians:

@@ -123,7 +123,6 @@ class Stage(Scorer):
             self.log(name, value, prog_bar=name in IN_PROGRESS_BAR, batch_size=batch_size)
 
     def novel_psnr(self, gaussians: Gaussians, scenes: SceneBatch) -> Float[Tensor, "batch target"]:
-        """Return the PSNR of the target views, in dB."""
         images, truth = self.render(gaussians, scenes.targets.cameras).clamp(0, 1), scenes.targets.images
         return psnr(images.flatten(0, 1), truth.flatten(0, 1)).view(images.shape[:2])
 

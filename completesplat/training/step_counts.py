@@ -65,7 +65,6 @@ class StepCounts:
 
     @property
     def peak(self) -> int:
-        """Return the bytes of all kinds together."""
         return sum(self.memory.values())
 
 

@@ -39,14 +39,12 @@ class Training:
         return self.module.optimizer([p for p in self.module.parameters() if p.requires_grad])
 
     def step(self, batch: Batch) -> None:
-        """Do one optimizer step on a batch of scenes or of their latents."""
         loss = self.loss(batch)
         self.optimizer.zero_grad()
         torch.autograd.backward([loss])
         self.update()
 
     def loss(self, batch: Batch) -> Tensor:
-        """Return the loss of a batch."""
         module = self.module.train()
         with autocast(module.device, self.precision):
             loss: Tensor = module.training_step(batch.to(module.device), 0)  # type: ignore[assignment]

@@ -116,7 +116,6 @@ def start_server(port: int) -> GuardedServer:
 
 
 def show_background(server: viser.ViserServer, grey: float) -> None:
-    """Show a grey value (0 to 1) behind the scene."""
     server.scene.set_background_image(np.full((1, 1, 3), round(255 * grey), np.uint8), format="png")
 
 
@@ -137,7 +136,6 @@ def cookie_name(port: int) -> str:
 
 
 def tokens(request: Request, port: int) -> list[bytes]:
-    """Return the tokens in the address and in the cookies of a request."""
     candidates = parse_qs(request.path.partition("?")[2]).get("token", [])
     pairs = [pair.strip().partition("=") for line in request.headers.get_all("Cookie") for pair in line.split(";")]
     candidates += [value for name, _, value in pairs if name == cookie_name(port)]

@@ -126,7 +126,6 @@ class Saver:
         return path
 
     def _video(self, sample: Sample) -> Path:
-        """Write a video of a full turn around a sample."""
         path = self._next("orbit", ".mp4")
         up = sample.reference.intrinsics.new_tensor(self.view.up.tolist())
         seen = sample.gaussians, sample.reference, sample.pivot()
@@ -234,7 +233,6 @@ class Page:
             browser.add_notification("Not possible", text, color="red")
 
     def close(self) -> None:
-        """Stop the worker and the server."""
         self.worker.close()
         stop_server(self.server)
 

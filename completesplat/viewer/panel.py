@@ -41,7 +41,8 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
 
     The controls of drawing are hidden if the model draws no samples.
     """
-    draws, most_steps, first_steps = model.draws_samples, 2, 1
+    draws = model.draws_samples
+    most_steps, first_steps = 2, 1
     if isinstance(model, CompleteSplat):
         most_steps = possible_steps(model.sampler)[-1]
         first_steps = nearest_steps(model.sampler, start["steps"] or model.sampler.steps)
@@ -132,9 +133,11 @@ def _source(image: Pixels) -> str:
 
 def possible_steps(sampler: Sampler) -> list[int]:
     """Return the sampler's default steps and all others up to 100; those of DDIM divide the number of noise levels."""
-    levels, divides = sampler.training_timesteps, isinstance(sampler.scheduler, DDIMScheduler)
-    possible = {n for n in range(1, min(MOST_STEPS, levels) + 1) if not (divides and levels % n)}
-    return sorted(possible | {sampler.steps})
+    levels = sampler.training_timesteps
+    steps = set(range(1, min(MOST_STEPS, levels) + 1))
+    if isinstance(sampler.scheduler, DDIMScheduler):
+        steps = {count for count in steps if levels % count == 0}
+    return sorted(steps | {sampler.steps})
 
 
 def nearest_steps(sampler: Sampler, steps: int) -> int:

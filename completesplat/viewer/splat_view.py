@@ -13,7 +13,7 @@ import viser
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.export.formats import rounded
+from completesplat.export.formats import round_to_uint8
 from completesplat.export.images import color_depth
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import matrix_to_quaternion
@@ -234,7 +234,10 @@ def to_splats(gaussians: Gaussians) -> tuple[dict[str, Any], float]:
     scale = max(largest, 1e-12) / math.sqrt(LARGEST_COVARIANCE)
     unit = replace(finite, means=finite.means / scale, scales=finite.scales / scale)
     arrays = {"centers": unit.means.float().numpy(), "covariances": unit.covariances().float().numpy()}
-    return arrays | {"rgbs": rounded(finite.colors * 255), "opacities": rounded(finite.opacities[:, None] * 255)}, scale
+    return arrays | {
+        "rgbs": round_to_uint8(finite.colors * 255),
+        "opacities": round_to_uint8(finite.opacities[:, None] * 255),
+    }, scale
 
 
 def depth_colored(scenes: Sequence[Gaussians]) -> list[Gaussians]:

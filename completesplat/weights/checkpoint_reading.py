@@ -106,13 +106,11 @@ class _DryRun(pickle._Unpickler):
         self.left = most
 
     def find_class(self, module: str, name: str) -> Callable[..., _Made]:
-        """Return the stand-in for a function or class."""
         if PLAIN.fullmatch(f"{module} {name}") is None:
             raise TensorFileError(f"made of {printable(f'{module} {name}', SHORT)}, not of tensors alone")
         return partial(self._call, name)
 
     def persistent_load(self, pid: Any) -> _Made:
-        """Return the stand-in for a storage."""
         _, _, key, _, length = pid
         # The archive's reader ignores case, so keys with letters could name one record many times.
         if re.fullmatch("[0-9]+", key) is None or type(length) is not int:

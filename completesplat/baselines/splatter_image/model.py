@@ -37,7 +37,7 @@ from completesplat.weights.checkpoint_reading import mismatch, read_tensor_file
 
 OBJECT_SIZE = 2 * 0.57
 """Largest extent of the captured objects, in scene units (`preprocess_co3d.py`: 1.2 * 0.95)."""
-OBJECT_SHARE = 0.65
+CUT_OUT_SHARE = 0.65
 """Share of the image that a cut-out object fills (`gradio_app.py`, `resize_foreground`)."""
 PHONE_FOV = 50.0
 TOLERANCE = 1e-4
@@ -52,8 +52,7 @@ STATE = "model_state_dict"
 GENERAL, GENERAL_FILE = "objaverse", "model_latest.pth"
 MODEL_FILE = re.compile(r"model_(\w+)\.pth")
 
-
-# Options that are read, by section; all published weights for one image share the literal values.
+# Options that are read, by section. All published weights for one image have the literal values.
 SECTIONS: dict[str, dict[str, object]] = {
     "data": {
         "training_resolution": Annotated[int, Range(8, 1024)],
@@ -97,7 +96,9 @@ class DepthBounds(NamedTuple):
         Its far end tells an object's distance; its near end does not, because it is clamped in front of the camera.
         """
         limits = given.new_tensor([self.near, self.far])
-        return given[..., 1:] + limits - self.far if self.around_object else limits.expand_as(given)
+        if self.around_object:
+            return given[..., 1:] + limits - self.far
+        return limits.expand_as(given)
 
 
 @dataclass(frozen=True)
@@ -147,8 +148,8 @@ class PublishedSplatterImage(ReconstructionModel):
             for name in ("v_to_sh_transform", "sh_to_v_transform"):
                 self.register_buffer(name, torch.empty(1, 3, 3))
         tensors = read_tensors(file)
-        others = (f"{name} is of {value.dtype}" for name, value in tensors.items() if value.dtype != torch.float32)
-        reason = mismatch(self.state_dict(), tensors) or next(others, None)
+        other_types = [f"{name} is of {x.dtype}" for name, x in tensors.items() if x.dtype != torch.float32]
+        reason = mismatch(self.state_dict(), tensors) or next(iter(other_types), None)
         if reason is None:
             self.load_state_dict({name: value.clone() for name, value in tensors.items()}, assign=True)
             reason = self._other_constants()
@@ -239,7 +240,8 @@ class PublishedModel(SceneModel):
         known = self.network.fov_degrees
         if known is not None and fov_degrees is not None:
             raise CompleteSplatError(f"fov={fov_degrees:g}: these weights take every image as of {known:.0f} degrees")
-        share, background = (None if known is None else OBJECT_SHARE), self.network.background
+        share = None if known is None else CUT_OUT_SHARE
+        background = self.network.background
         photo = read_photograph(image, self.image_size, fov_degrees, PHONE_FOV, remove_background, background, share)
         return photo if known is None else replace(photo, fov_degrees=known, fov_source="default")
 
@@ -304,8 +306,12 @@ def _models_in(folder: Path) -> list[Path]:
 
 
 def _config_beside(model: Path) -> Path:
-    match = MODEL_FILE.fullmatch(model.name)
-    name = GENERAL if model.name == GENERAL_FILE else match[1] if match else "NAME"
+    if model.name == GENERAL_FILE:
+        name = GENERAL
+    elif match := MODEL_FILE.fullmatch(model.name):
+        name = match[1]
+    else:
+        name = "NAME"
     return model.with_name(f"config_{name}.yaml")
 
 
@@ -316,7 +322,8 @@ def _local(path: Path) -> Path:
         raise WeightsError(f"{path}: holds {names}; give one of these files")
     if not models or not models[0].is_file():
         raise WeightsError(f"{path}: no such file")
-    if not (config := _config_beside(models[0])).is_file():
+    config = _config_beside(models[0])
+    if not config.is_file():
         raise WeightsError(f"{models[0]}: {config.name} is missing beside it; both are at https://huggingface.co/{HUB}")
     return models[0]
 
@@ -349,10 +356,14 @@ def _read_config(path: Path) -> dict[str, dict[str, Any]]:
         options = config.get(section) if isinstance(config, Mapping) else None
         options = {"input_images": 1, **options} if isinstance(options, Mapping) else {}
         sections[section] = {name: options.get(name) for name in hints}
-        for name, hint in hints.items():
-            for place, value, reason in violations(hint, sections[section][name]):
-                message = f"{path}: {section}.{name}{place} is {printable(value, SHORT)}: {reason}"
-                raise WeightsError(f"{message}; only Splatter Image's weights for one image, as published, are read")
+        _check_section(path, section, sections[section])
     if not sections["data"]["znear"] < sections["data"]["zfar"]:
         raise WeightsError(f"{path}: data.znear must be below data.zfar")
     return sections
+
+
+def _check_section(path: Path, section: str, options: Mapping[str, object]) -> None:
+    for name, hint in SECTIONS[section].items():
+        for place, value, reason in violations(hint, options[name]):
+            message = f"{path}: {section}.{name}{place} is {printable(value, SHORT)}: {reason}"
+            raise WeightsError(f"{message}; only Splatter Image's weights for one image, as published, are read")

@@ -28,16 +28,8 @@ from completesplat.data.images.files import (
     turn_upright,
 )
 from completesplat.data.sequences import first_names
-from completesplat.data.validation import (
-    LARGEST,
-    BadAnnotation,
-    BadCamera,
-    BadImage,
-    TooFewFrames,
-    errors_at,
-    require_file,
-)
-from completesplat.errors import CompleteSplatError, ImageError
+from completesplat.data.validation import LARGEST, BadAnnotation, BadCamera, BadImage, TooFewFrames, require_file
+from completesplat.errors import CompleteSplatError, ImageError, errors_at
 from completesplat.files import by_numbers
 from completesplat.geometry.cameras import Cameras
 
@@ -230,7 +222,6 @@ def undistorted_lens(lens: Lens) -> Lens:
 
 
 def undistort(image: Image.Image, lens: Lens) -> Image.Image:
-    """Return the image of `undistorted_lens`, resampled bilinearly."""
     if not any(lens.distortion):
         return image
     pycolmap = import_pycolmap()

@@ -10,15 +10,8 @@ from completesplat.data.co3d.splits import SeededSplit, split_by_seed
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.sequences import SPLITS
-from completesplat.data.validation import (
-    BadAnnotation,
-    MissingFile,
-    SharedSequences,
-    errors_at,
-    field,
-    read_json,
-    require_file,
-)
+from completesplat.data.validation import BadAnnotation, MissingFile, SharedSequences, field, read_json, require_file
+from completesplat.errors import errors_at
 from completesplat.settings.schema import Natural, Share
 
 SPLITS_FILE = "splits.json"
@@ -116,7 +109,6 @@ class CaptureSetDataModule(ObjectDataModule):
         }
 
     def _members(self, names: list[str]) -> dict[str, list[str]]:
-        """Return the captures of each split."""
         listed = self.root / SPLITS_FILE if self.splits is None else require_file(Path(self.splits))
         if listed.is_file():
             return read_splits(listed, names)
@@ -129,7 +121,6 @@ def _all_frames(frames: int) -> list[int]:
 
 
 def _capture_folders(root: Path) -> list[Path]:
-    """Return the folders below `root` that may be captures, in the order of their names."""
     found: list[Path] = []
     for folder, below, files in os.walk(root):
         below.sort()

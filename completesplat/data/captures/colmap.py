@@ -17,13 +17,12 @@ from completesplat.data.validation import (
     BadCamera,
     MissingFile,
     UnreadableFile,
-    errors_at,
     finite_array,
     path_below,
     read_text,
     require_file,
 )
-from completesplat.errors import DataError
+from completesplat.errors import DataError, errors_at
 from completesplat.geometry.rotations import quaternion_to_matrix
 
 # Names and numbers of parameters by model id (colmap, `src/colmap/sensor/models.h`); other models are refused.
@@ -65,12 +64,10 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
 
 
 def is_model(folder: Path) -> bool:
-    """Return whether a folder has a model."""
     return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
 
 
 def image_count(model: Path) -> int:
-    """Return the number of a model's images, 0 if they cannot be read."""
     suffix, read = _form(model)
     with suppress(DataError):
         return len(_parsed(len, read, model / f"images.{suffix}"))

@@ -28,8 +28,8 @@ from completesplat.data.placement import (
     upright_axes,
 )
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import MissingFile, errors_at, refused_to
-from completesplat.errors import DataError
+from completesplat.data.validation import MissingFile, refused_to
+from completesplat.errors import DataError, errors_at
 from completesplat.settings.schema import Range
 
 logger = logging.getLogger(__name__)

@@ -20,7 +20,6 @@ from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
     TooFewFrames,
-    errors_at,
     field,
     finite_array,
     path_below,
@@ -29,7 +28,7 @@ from completesplat.data.validation import (
     require_file,
     require_rotation,
 )
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, errors_at
 from completesplat.geometry.cameras import Cameras, crop_resize
 from completesplat.scene import Views
 from completesplat.tensors import stack
@@ -153,7 +152,6 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
 
 
 def _read_frames(path: Path, content: Any) -> list[CapturedFrame]:
-    """Return all frames of a file's content that have images."""
     root, frames, missing = path.parent, [], []
     with errors_at(path):
         entries = field(content, "frames", list)

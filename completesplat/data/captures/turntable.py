@@ -38,12 +38,11 @@ from completesplat.data.validation import (
     BadImage,
     MissingFile,
     TooFewFrames,
-    errors_at,
     field,
     read_json,
     refused_to,
 )
-from completesplat.errors import DataError, ImageError
+from completesplat.errors import DataError, ImageError, errors_at
 from completesplat.files import writing
 from completesplat.geometry.cameras import Cameras, invert_rigid, look_at, mirror
 from completesplat.settings.schema import Range

@@ -15,7 +15,6 @@ from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
     Refuse,
-    errors_at,
     field,
     finite_array,
     path_below,
@@ -23,6 +22,7 @@ from completesplat.data.validation import (
     refused_to,
     require_rotation,
 )
+from completesplat.errors import errors_at
 from completesplat.geometry.cameras import Cameras
 
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up), and back.

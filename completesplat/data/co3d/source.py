@@ -27,8 +27,8 @@ from completesplat.data.placement import (
     upright_axes,
 )
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import BadImage, errors_at, read_points
-from completesplat.errors import DataError
+from completesplat.data.validation import BadImage, read_points
+from completesplat.errors import DataError, errors_at
 from completesplat.geometry.cameras import pixel_centers, unproject
 
 DEPTH_MAPS = 8
@@ -114,7 +114,6 @@ class CO3DSource(SequenceSource):
         self._sequences: dict[str, PosedSequence] = {}
 
     def with_images(self, path_of: Callable[[Path], Path]) -> "CO3DSource":
-        """Return the same sequences with images of other paths."""
         frames = {
             name: [replace(frame, image=path_of(frame.image)) for frame in frames]
             for name, frames in self._members.frames.items()

@@ -13,13 +13,12 @@ from completesplat.data.validation import (
     BadAnnotation,
     Refuse,
     SharedSequences,
-    errors_at,
     field,
     path_below,
     read_json,
     refused_to,
 )
-from completesplat.errors import DataError
+from completesplat.errors import DataError, errors_at
 
 Listed = dict[str, set[tuple[str, int]]]
 """(sequence name, frame number) of each split."""
@@ -173,28 +172,41 @@ def read_category(
         raise DataError("no such CO3D category", str(folder))
     frames_file, videos_file = folder / "frame_annotations.jgz", folder / "sequence_annotations.jgz"
     set_list, refused = set_list_path(folder, subset), list[DataError]()
-    refuse: Refuse = refused.append
-    listed, lost = read_set_list(set_list, refuse) if set_list else None, list[str]()
-    if set_list and listed is not None and not allow_shared:
-        listed, lost = remove_test_sequences(set_list, listed, seeded)
-    wanted = set().union(*listed.values()) if listed is not None else None
-    videos = read_videos(root, videos_file, refuse)
-    frames = read_frames(root, frames_file, lambda *key: wanted is None or key in wanted, refuse)
-    places = {(error.sequence, error.frame) for error in refused}
-    for name in sorted(frames.keys() - videos.keys()):
-        if (name, None) not in places:
-            refuse(BadAnnotation("the sequence is not annotated", str(videos_file), name))
-            places.add((name, None))
-        del frames[name]
-    for name, number in sorted(wanted or ()):
-        if number not in frames.get(name, ()) and not {(name, None), (name, number)} & places:
-            refuse(BadAnnotation("the frame is listed, but not annotated", str(set_list), name, number))
+    listed, lost = None, list[str]()
+    if set_list is not None:
+        listed = read_set_list(set_list, refused.append)
+        if not allow_shared:
+            listed, lost = remove_test_sequences(set_list, listed, seeded)
+    wanted = None if listed is None else set().union(*listed.values())
+    videos = read_videos(root, videos_file, refused.append)
+    frames = read_frames(root, frames_file, lambda *key: wanted is None or key in wanted, refused.append)
+    _refuse_unannotated(frames, videos, videos_file, refused)
+    if wanted is not None:
+        _refuse_missing_frames(frames, wanted, set_list, refused)
     listed = split_by_seed(frames, seeded) if listed is None else listed
     splits = {split: _members(split, listed[split], frames, videos, filters) for split in SPLITS}
     if lost:
         splits["val"].left_out["in training too"] = lost
-    files = [frames_file, videos_file, *([set_list] if set_list else [])]
-    return Category(splits, files, refused)
+    return Category(splits, [file for file in (frames_file, videos_file, set_list) if file is not None], refused)
+
+
+def _refuse_unannotated(frames: Frames, videos: Collection[str], file: Path, refused: list[DataError]) -> None:
+    """Remove the frames of sequences that have no annotation; refuse those sequences, each once."""
+    known = {error.sequence for error in refused if error.frame is None}
+    for name in sorted(frames.keys() - videos):
+        if name not in known:
+            refused.append(BadAnnotation("the sequence is not annotated", str(file), name))
+        del frames[name]
+
+
+def _refuse_missing_frames(
+    frames: Frames, wanted: Iterable[tuple[str, int]], file: Path | None, refused: list[DataError]
+) -> None:
+    """Refuse frames of a set list that no annotation has, unless they or their sequences are refused already."""
+    known = {(error.sequence, error.frame) for error in refused}
+    for name, number in sorted(wanted):
+        if number not in frames.get(name, ()) and not {(name, None), (name, number)} & known:
+            refused.append(BadAnnotation("the frame is listed, but not annotated", str(file), name, number))
 
 
 def _members(

@@ -80,7 +80,6 @@ def write_points(path: Path, points: Float[np.ndarray, "n 3"], colors: UInt8[np.
 
 
 def write_annotations(category: Path, frames: Sequence[Annotation], sequences: Sequence[Annotation]) -> None:
-    """Write the annotations of a category's frames and sequences."""
     for name, content in (("frame_annotations", frames), ("sequence_annotations", sequences)):
         # A fixed time stamp and no file name in the gzip header, so that equal content gives equal bytes.
         write_bytes(category / f"{name}.jgz", gzip.compress(json.dumps(content).encode(), mtime=0))

@@ -136,7 +136,6 @@ def _loaded(source: ImageLike) -> tuple[Image.Image, Tags]:
 
 
 def _require_content(path: Path) -> None:
-    """Refuse a file that does not exist or is empty."""
     try:
         exists = path.is_file()
     except OSError as error:  # such as a name that is too long

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import asdict, dataclass, replace
-from functools import reduce
 from hashlib import sha256
 from pathlib import Path
 from zlib import crc32
@@ -17,15 +16,8 @@ from completesplat.data.loading.scenes import TrainingScenes
 from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, read_as
 from completesplat.data.packed.source import OpenShard
 from completesplat.data.sequences import SequenceSource
-from completesplat.data.validation import (
-    BadAnnotation,
-    ChangedFile,
-    MissingFile,
-    UnreadableFile,
-    errors_at,
-    require_file,
-)
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.data.validation import BadAnnotation, ChangedFile, MissingFile, UnreadableFile, require_file
+from completesplat.errors import CompleteSplatError, DataError, errors_at
 from completesplat.files import write_text
 from completesplat.scene import CachedScene
 
@@ -101,14 +93,14 @@ def latent_schema(origin: Origin) -> pa.Schema:
 
 def frame_checksums(rows: Rows) -> UInt32[np.ndarray, " frame"]:
     """Return one CRC-32 for each frame, computed over all arrays in order."""
-    content = zip(*(rows[name] for name in ARRAYS), strict=True)
-    return np.array(
-        [reduce(lambda value, part: crc32(part.tobytes(), value), parts, 0) for parts in content], np.uint32
-    )
+    checksums = np.zeros(len(rows[ARRAYS[0]]), np.uint32)
+    for frame in range(len(checksums)):
+        for array in ARRAYS:
+            checksums[frame] = crc32(rows[array][frame].tobytes(), checksums[frame])
+    return checksums
 
 
 def latent_row(name: str, rows: Rows, schema: pa.Schema) -> pa.RecordBatch:
-    """Return the row of a sequence."""
     columns = [*(rows[array].reshape(-1) for array in ARRAYS), frame_checksums(rows)]
     lists = [pa.LargeListArray.from_arrays(pa.array([0, len(x)], pa.int64()), pa.array(x)) for x in columns]
     return pa.RecordBatch.from_arrays([pa.array([name]), *lists], schema=schema)
@@ -157,8 +149,7 @@ class LatentCache:
         if frame not in sequence.stored:
             raise DataError("was not encoded", str(self.folder), name, frame)
         place = sequence.stored.index(frame)
-        arrays = self.arrays(name)
-        rows = {name: np.array(array[place : place + 1]) for name, array in arrays.items()}
+        rows = {column: np.array(array[place : place + 1]) for column, array in self.arrays(name).items()}
         if frame_checksums(rows) != rows[CHECKSUMS]:
             raise ChangedFile(f"its checksum is another: {ADVICE}", str(self.folder), name, frame)
         mean, log_variance, condition = (torch.from_numpy(rows[array][0].astype(np.float32)) for array in ARRAYS)
@@ -178,7 +169,8 @@ class LatentCache:
                 row = self._rows[self._places[name]]
                 row.validate(full=True)  # Without this check, damaged offsets could crash the process.
                 lists = {column: row.column(column)[0].values.to_numpy() for column in (*ARRAYS, CHECKSUMS)}
-                shapes, count = {**self.manifest.shapes, CHECKSUMS: ()}, len(self.sequences[name].stored)
+                count = len(self.sequences[name].stored)
+                shapes = {**self.manifest.shapes, CHECKSUMS: ()}
                 arrays = {column: values.reshape(count, *shapes[column]) for column, values in lists.items()}
                 stored_name = row.column("name")[0].as_py()
             except (pa.ArrowException, OSError, ValueError, LookupError, AttributeError) as error:

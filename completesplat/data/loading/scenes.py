@@ -14,8 +14,7 @@ from torch.utils.data import Dataset
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.view_selection import item_generator
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import errors_at
-from completesplat.errors import DataError
+from completesplat.errors import DataError, errors_at
 from completesplat.scene import CachedScene, SceneBatch, Views
 from completesplat.tensors import stack
 
@@ -60,12 +59,11 @@ class SceneStore:
         pairs = [self._read(sequence, view) for view in views]
         images, masks = _as_floats([pair.image for pair in pairs]), self._masks(pairs)
         cameras = sequence.cameras[views].relative_to(sequence.cameras[reference]).to(torch.float32)
-        loaded, visible = Views(images, cameras, masks), torch.ones_like(masks[0])
-        ranges, frame = sequence.depth_ranges[reference], torch.tensor(reference)
-        return SceneBatch(loaded[0], loaded[1:], ranges, visible, frame, sequence.name)
+        loaded = Views(images, cameras, masks)
+        depth_range, frame = sequence.depth_ranges[reference], torch.tensor(reference)
+        return SceneBatch(loaded[0], loaded[1:], depth_range, torch.ones_like(masks[0]), frame, sequence.name)
 
     def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
-        """Return the image of one view."""
         return self._read(sequence, view).image
 
     def _read(self, sequence: PosedSequence, view: int) -> MaskedImage:
@@ -197,8 +195,9 @@ class EvaluationScenes(Dataset[LoadedScenes]):
 
 def with_true_depths(scene: SceneBatch, sequence: PosedSequence, reference: int, targets: list[int]) -> SceneBatch:
     """Return a scene with the true depth of its views, if the data set has it."""
-    read = sequence.read_depth
-    return scene if read is None else _with_depths(scene, torch.stack([read(view) for view in (reference, *targets)]))
+    if sequence.read_depth is None:
+        return scene
+    return _with_depths(scene, torch.stack([sequence.read_depth(view) for view in (reference, *targets)]))
 
 
 def _with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]) -> SceneBatch:
@@ -206,16 +205,18 @@ def _with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]
     return replace(scene, reference=reference, targets=targets)
 
 
+def _with_any_depths(scene: SceneBatch | CachedScene) -> SceneBatch | CachedScene:
+    if isinstance(scene, SceneBatch) and scene.reference.depths is None:
+        return _with_depths(scene, torch.zeros_like(scene.all_views().masks))
+    return scene
+
+
 def collate(items: Sequence[LoadedScenes]) -> LoadedScenes:
     """Stack the scenes that could be read; if only some have depths, the depths of the others are 0 (unknown)."""
     scenes = [item.scenes for item in items if item.scenes is not None]
-    if any(isinstance(scene, SceneBatch) and scene.reference.depths is not None for scene in scenes):
-        scenes = [
-            _with_depths(scene, torch.zeros_like(scene.all_views().masks))
-            if isinstance(scene, SceneBatch) and scene.reference.depths is None
-            else scene
-            for scene in scenes
-        ]
+    unknown = [isinstance(scene, SceneBatch) and scene.reference.depths is None for scene in scenes]
+    if any(unknown) and not all(unknown):
+        scenes = list(map(_with_any_depths, scenes))
     return LoadedScenes(
         stack(scenes) if scenes else None,
         tuple(error for item in items for error in item.refused),

@@ -27,7 +27,6 @@ class GrowingGap:
             raise CompleteSplatError("data.max_gap: needs 1 <= first <= last and 0 <= epochs")
 
     def at(self, epoch: int) -> int:
-        """Return the gap in an epoch."""
         return round(self.first + (self.last - self.first) * min(epoch / max(self.epochs, 1), 1))
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from completesplat.data.validation import BadAnnotation, UnreadableFile, errors_at, field, parsed, read_json
-from completesplat.errors import DataError
+from completesplat.data.validation import BadAnnotation, UnreadableFile, field, parsed, read_json
+from completesplat.errors import DataError, errors_at
 
 MANIFEST = "manifest.json"
 HEADER = {"format": 2}
@@ -27,7 +27,6 @@ class Refusal:
 
     @staticmethod
     def of(error: DataError) -> "Refusal":
-        """Make the record of an error."""
         return Refusal(error.kind, error.reason, error.file, error.sequence, error.frame)
 
 

@@ -19,11 +19,10 @@ from completesplat.data.validation import (
     ChangedFile,
     MissingFile,
     UnreadableFile,
-    errors_at,
     path_below,
     require_file,
 )
-from completesplat.errors import DataError
+from completesplat.errors import DataError, errors_at
 from completesplat.files import atomic_path, write_bytes
 from completesplat.weights import sha256_of
 
@@ -188,7 +187,6 @@ class OpenShard:
             self.places.append(place)
 
     def __getitem__(self, row: int) -> pa.Table:
-        """Return a table of one row."""
         stream = pa.BufferReader(self._content)
         stream.seek(self.places[row])
         return pa.Table.from_batches([pa.ipc.read_record_batch(pa.ipc.read_message(stream), self.schema)])

@@ -4,7 +4,7 @@ import hashlib
 import json
 import logging
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
@@ -28,9 +28,9 @@ from completesplat.data.packed.manifest import (
 )
 from completesplat.data.packed.rows import CODECS, SCHEMA, encode_image, to_row
 from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource
-from completesplat.data.validation import TooFewFrames, errors_at, field, parsed, read_json, refused_to
+from completesplat.data.validation import TooFewFrames, field, parsed, read_json, refused_to
 from completesplat.data.validation.processes import map_in_processes
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import CompleteSplatError, DataError, errors_at
 from completesplat.files import atomic_path, write_json
 from completesplat.weights import sha256_of
 
@@ -185,18 +185,31 @@ def prepare(
     # The old manifest may be wrong until it is written again.
     for path in (out / MANIFEST, *out.glob(f"*{UNFINISHED}")):
         path.unlink(missing_ok=True)
-    listed = [error for source in writer.sources.values() for error in source.refused]
-    if on_bad == "raise" and listed:
-        raise listed[0]
+    if on_bad == "raise":
+        _raise_first(writer.sources.values())
     if missing:
-        with Progress(disable=not progress) as bar:
-            task = bar.add_task("preparing sequences", total=sum(len(plan.names) for plan in missing))
-            for plan, record in zip(missing, map_in_processes(writer.write, missing, workers), strict=True):
-                bar.advance(task, len(record.names))
-                records[plan] = record
+        records |= _write_shards(writer, missing, workers, progress)
     splits = {split: _split(split, source, records.values()) for split, source in writer.sources.items()}
     _finish(PackedManifest(codec, dict(settings), splits), out, max_bad_fraction)
     return out
+
+
+def _raise_first(sources: Iterable[SequenceSource]) -> None:
+    for source in sources:
+        for error in source.refused:
+            raise error
+
+
+def _write_shards(
+    writer: ShardWriter, plans: list[ShardPlan], workers: int | None, progress: bool
+) -> dict[ShardPlan, ShardRecord]:
+    records = {}
+    with Progress(disable=not progress) as bar:
+        task = bar.add_task("preparing sequences", total=sum(len(plan.names) for plan in plans))
+        for plan, record in zip(plans, map_in_processes(writer.write, plans, workers), strict=True):
+            bar.advance(task, len(record.names))
+            records[plan] = record
+    return records
 
 
 def _plan(writer: ShardWriter, settings: Mapping[str, Scalar], plans: list[ShardPlan]) -> dict[str, dict[str, Scalar]]:
@@ -249,9 +262,7 @@ def _finish(manifest: PackedManifest, out: Path, max_bad_fraction: float) -> Non
     kinds = ", ".join(f"{count:,} x {kind}" for kind, count in counts.most_common()) or "nothing"
     if not sequences:
         raise DataError(f"not one sequence can be used: {kinds}", str(out))
-    bad_frames = sum(refusal.frame is not None for refusal in refused)
-    bad_sequences = len({refusal.sequence or refusal.file for refusal in refused if refusal.frame is None})
-    share = max(bad_frames / (bad_frames + frames), bad_sequences / (bad_sequences + sequences))
+    share = _bad_share(refused, sequences, frames)
     if share > max_bad_fraction:
         remedy = "put the data right (then remove this folder) or raise data.max_bad_fraction"
         bad = f"{share:.1%} of the data are bad, at most {max_bad_fraction:.1%} may be ({kinds})"
@@ -260,3 +271,10 @@ def _finish(manifest: PackedManifest, out: Path, max_bad_fraction: float) -> Non
     size = decimal(sum(shard.bytes for shard in shards))
     held = f"{frames:,} frames of {sequences:,} sequences, {size} in {len(shards):,} shards"
     logger.info("%s: %s; refused: %s", out, held, kinds)
+
+
+def _bad_share(refused: Sequence[Refusal], sequences: int, frames: int) -> float:
+    """Return the share of refused frames or of refused sequences, the larger one, given the numbers of the others."""
+    of_sequences = {refusal.sequence or refusal.file for refusal in refused if refusal.frame is None}
+    bad_frames, bad_sequences = sum(refusal.frame is not None for refusal in refused), len(of_sequences)
+    return max(bad_frames / (bad_frames + frames), bad_sequences / (bad_sequences + sequences))

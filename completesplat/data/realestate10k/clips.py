@@ -29,14 +29,13 @@ from completesplat.data.validation import (
     MissingFile,
     TooFewFrames,
     UnreadableFile,
-    errors_at,
     path_below,
     read_json,
     read_text,
     refused_to,
     require_file,
 )
-from completesplat.errors import DataError, TensorFileError
+from completesplat.errors import DataError, TensorFileError, errors_at
 from completesplat.geometry.cameras import Cameras
 from completesplat.weights.checkpoint_reading import read_tensor_file
 
@@ -206,7 +205,6 @@ class ChunkedClips:
         self._loaded: dict[Path, Chunk] = {}
 
     def chunks(self, keys: Sequence[str]) -> list[list[int]]:
-        """Group the indices of `keys` by chunk."""
         members: dict[Path, list[int]] = {}
         for number, key in enumerate(keys):
             members.setdefault(self._files[key], []).append(number)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from completesplat.data.loading.scenes import Choice
 from completesplat.data.sequences import PosedSequence, SequenceSource, first_names
-from completesplat.data.validation import BadAnnotation, errors_at, read_json, read_text
-from completesplat.errors import DataError
+from completesplat.data.validation import BadAnnotation, read_json, read_text
+from completesplat.errors import DataError, errors_at
 
 CONTEXT, TARGET, SCORED = "context", "target", "target_quantify"
 LINE = "KEY source target target target"

@@ -17,8 +17,8 @@ from completesplat.data.packed.manifest import Scalar
 from completesplat.data.realestate10k.clips import ChunkedClips, Clip, TextClips
 from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource, split_by_hash
-from completesplat.data.validation import errors_at, refused_to, require_file
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.data.validation import refused_to, require_file
+from completesplat.errors import CompleteSplatError, DataError, errors_at
 from completesplat.geometry.cameras import crop_resize
 from completesplat.settings.schema import Natural, Positive, Share
 from completesplat.tensors import stack
@@ -59,7 +59,6 @@ class RE10KSource(SequenceSource):
         self._clips = clips
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """Group the clips by chunk."""
         return self._clips.chunks(names)
 
     def fingerprint(self) -> str:
@@ -202,7 +201,6 @@ class RE10KDataModule(SceneDataModule):
         return len({len(views[name][1]) for name in scenes.store.names if name in views}) <= 1
 
     def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
-        """Return a random reference and random targets near it."""
         return nearby_views(frames, self.targets, self.min_gap, self.max_gap.at(epoch), rng)
 
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:

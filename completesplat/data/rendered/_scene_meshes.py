@@ -70,7 +70,6 @@ def find_factory(name: str) -> Any:
 
 
 def make_object(name: str, seed: int) -> None:
-    """Make a procedural object of Infinigen in the empty scene."""
     factory_class = find_factory(name)
     from infinigen.core.util.math import FixedSeed
 

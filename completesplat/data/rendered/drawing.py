@@ -192,7 +192,6 @@ def draw_back(rng: np.random.Generator, first: Cameras, hidden: str) -> dict[str
 
 
 def textures_of(folder: Path) -> list[str]:
-    """Return the absolute paths of a folder's images, in order."""
     paths = sorted(
         str(path.absolute()) for path in folder.glob("*") if path.suffix.lower() in TEXTURES and path.is_file()
     )

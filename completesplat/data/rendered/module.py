@@ -6,8 +6,8 @@ from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.rendered.drawing import PAINTS
 from completesplat.data.rendered.rendering import CATEGORY, DESCRIPTION, OBJECT
-from completesplat.data.validation import errors_at, field, read_json
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.data.validation import field, read_json
+from completesplat.errors import CompleteSplatError, DataError, errors_at
 
 
 class RenderedDataModule(CO3DDataModule):

@@ -283,7 +283,6 @@ def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Came
 
 
 def _write_modes(folder: Path, modes: Sequence[str], files: Path) -> None:
-    """Write the images with each paint of the back into a folder of its name."""
     for index, mode in enumerate(modes):
         (folder / mode).mkdir()
         prefix = f"{index}_" if index else ""

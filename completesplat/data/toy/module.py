@@ -9,8 +9,8 @@ from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS
 from completesplat.data.toy.writing import DESCRIPTION, FORMAT_VERSION, ROOMS, SUBSET, DataSetSize, write
-from completesplat.data.validation import MissingFile, errors_at, field, read_json
-from completesplat.errors import DataError
+from completesplat.data.validation import MissingFile, field, read_json
+from completesplat.errors import DataError, errors_at
 from completesplat.settings.schema import Natural, Positive, Side
 
 OWN_PLACE = Path("outputs/data")
@@ -103,5 +103,4 @@ class ToyRoomsDataModule(RE10KDataModule):
         return super().describe() | {"data_set": ROOMS}
 
     def prepare_data(self) -> None:
-        """Write the rooms if there are none."""
         _provide("rooms", self.home, self.make, self.making)

@@ -70,14 +70,13 @@ class _Painter:
 
 
 def ball(center: Point, half_sizes: Point | float, look: Look, axes: Array | None = None) -> Part:
-    """Make an ellipsoid."""
     sizes = half_sizes if isinstance(half_sizes, tuple) else (half_sizes,) * 3
     return make_part(ELLIPSOID, center, sizes, look, axes)
 
 
 def _frustum(center: Point, radius: float, half_height: float, look: Look, taper: float = 0.0, axis: str = "y") -> Part:
-    axes = {"y": np.eye(3), "x": rotation_about("z", -np.pi / 2), "z": rotation_about("x", np.pi / 2)}[axis]
-    return make_part(FRUSTUM, center, (radius, half_height, radius), look, axes, taper)
+    rotations = {"y": np.eye(3), "x": rotation_about("z", -np.pi / 2), "z": rotation_about("x", np.pi / 2)}
+    return make_part(FRUSTUM, center, (radius, half_height, radius), look, rotations[axis], taper)
 
 
 def bear(rng: np.random.Generator) -> Blueprint:
@@ -140,8 +139,6 @@ def hydrant(rng: np.random.Generator) -> Blueprint:
 
 
 FAMILIES = (hydrant, bear)
-
-
 DOME_RADIUS = 3.5
 SURFACE_DIRECTIONS, SURFACE_RAYS = 60, 130
 PATCH_COLORS = {
@@ -305,12 +302,7 @@ def _surface(
 ) -> tuple[Array, Array]:
     """Sample points on the object that are visible from above, and their colours, by random, nearly parallel rays."""
     shapes = as_arrays(parts)
-    # An upper bound of the distance from the origin to any point of the object.
-    reach = max(
-        float(np.linalg.norm(part.center))
-        + (1.0 if part.kind == ELLIPSOID else float(np.hypot(1 + abs(part.taper), 1.0))) * part.half_sizes.max()
-        for part in parts
-    )
+    reach = max(map(_farthest_point, parts))
     points, colors = [], []
     for _ in range(SURFACE_DIRECTIONS):
         azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0, 1)
@@ -324,3 +316,9 @@ def _surface(
         points.append((pose[:3, 3] + distances[:, None] * rays @ pose[:3, :3].T)[coverage > 0])
         colors.append(seen[coverage > 0])
     return np.concatenate(points), np.concatenate(colors)
+
+
+def _farthest_point(part: Part) -> float:
+    """Return an upper bound of the distance from the origin to any point of a part."""
+    corner = 1.0 if part.kind == ELLIPSOID else float(np.hypot(1 + abs(part.taper), 1.0))
+    return float(np.linalg.norm(part.center) + corner * part.half_sizes.max())

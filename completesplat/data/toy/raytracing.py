@@ -85,7 +85,6 @@ inlined = partial(helper, fastmath=False)
 
 @inlined
 def map_direction(m, x, y, z):
-    """Apply the linear part of a map [3 4] to a direction."""
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
         m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
@@ -95,7 +94,6 @@ def map_direction(m, x, y, z):
 
 @inlined
 def map_point(m, x, y, z):
-    """Apply a map [3 4] to a point."""
     x, y, z = map_direction(m, x, y, z)
     return x + m[0, 3], y + m[1, 3], z + m[2, 3]
 

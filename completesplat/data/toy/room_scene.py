@@ -70,7 +70,6 @@ def sofa(rng: np.random.Generator) -> Piece:
 
 
 def pouf(rng: np.random.Generator) -> Piece:
-    """Draw an ellipsoid."""
     half = (rng.uniform(0.2, 0.4), rng.uniform(0.18, 0.3), rng.uniform(0.2, 0.4))
     return [make_part(ELLIPSOID, (0, half[1], 0), half, _look(rng))]
 

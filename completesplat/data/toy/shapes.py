@@ -73,7 +73,6 @@ def make_part(kind: int, center: Point, half: Point, look: Look, axes: Array | N
 
 
 def as_arrays(parts: Sequence[Part]) -> Shapes:
-    """Convert parts to arrays for the ray tracer."""
     squared_radii = [(part.half_sizes**2).sum() * (1 + abs(part.taper)) ** 2 for part in parts]
     return Shapes(
         kinds=np.array([part.kind for part in parts]),

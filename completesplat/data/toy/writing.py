@@ -115,7 +115,6 @@ def _write_scene(
 
 
 def _write_modes(folder: Path, scene: ToyScene, size: int) -> None:
-    """Write the images with each colour of the patch into a folder of its name."""
     for mode, color in PATCH_COLORS.items():
         (folder / mode).mkdir()
         painted = replace(scene, patch=scene.patch._replace(color=np.array(color)))

@@ -71,16 +71,6 @@ class ChangedFile(DataError, kind="changed file"):
 
 
 @contextmanager
-def errors_at(file: Path | str | None = None, sequence: str | None = None, frame: int | None = None) -> Iterator[None]:
-    """Add file, sequence and frame to a DataError raised within the context, unless it already has them."""
-    try:
-        yield
-    except DataError as error:
-        place = error.file or (None if file is None else str(file)), error.sequence or sequence
-        raise type(error)(error.reason, *place, frame if error.frame is None else error.frame) from error.__cause__
-
-
-@contextmanager
 def refused_to(refuse: Refuse) -> Iterator[None]:
     """Pass a DataError raised within the context to `refuse`, which may collect it or raise it."""
     try:

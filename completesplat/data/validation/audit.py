@@ -1,6 +1,6 @@
 """Check of a whole data set: numbers of usable sequences and frames, and reasons for those that are not usable."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -11,9 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from completesplat.data.sequences import SequenceSource, overlaps, shared_names
-from completesplat.data.validation import TooFewFrames, errors_at, refused_to
+from completesplat.data.validation import TooFewFrames, refused_to
 from completesplat.data.validation.processes import map_in_processes
-from completesplat.errors import DataError
+from completesplat.errors import DataError, errors_at
 from completesplat.files import printable, write_json
 
 FEWEST_FRAMES = 2
@@ -54,7 +54,6 @@ class AuditReport:
         return dict(sorted(kinds.items(), key=lambda item: -len(item[1])))
 
     def json(self) -> dict[str, object]:
-        """Return the content of `check.json`."""
         parts = ("sequence", "frame", "file", "reason")
         return {
             "usable": {"sequences": self.sequences, "frames": self.frames},
@@ -65,7 +64,6 @@ class AuditReport:
         }
 
     def write(self, path: Path) -> None:
-        """Write `json()` to a file."""
         write_json(path, self.json())
 
 
@@ -78,12 +76,7 @@ def check(
     each core); with several, the sources (by split) must be picklable. Shared sequences are reported unless the splits
     share them on purpose (`SceneDataModule.splits_share_sequences`).
     """
-    refused: list[DataError] = []
-    for source in sources.values():
-        refused += source.refused
-        for reason, names in source.left_out.items():
-            refused += [ExcludedSequence(reason, sequence=name) for name in names]
-        refused += source.verify()
+    refused = [error for source in sources.values() for error in _source_errors(source)]
     sequences, batches = list[_Sequence](), _batches(sources)
     with Progress(disable=not progress) as bar:
         task = bar.add_task("reading sequences", total=sum(map(len, batches)))
@@ -91,20 +84,29 @@ def check(
             sequences += batch
             bar.advance(task, len(batch))
     refused += [error for sequence in sequences for error in sequence.refused]
-    explained = {error.sequence for error in refused}
-    for sequence in sequences:
-        if len(sequence.usable) < FEWEST_FRAMES and sequence.name not in explained:
-            refused.append(TooFewFrames(f"{len(sequence.usable)} usable, 2 are needed", sequence=sequence.name))
+    refused += _too_short(sequences, {error.sequence for error in refused})
     unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in refused}
+    usable = {split: [sequence.usable_in(split) for sequence in sequences] for split in sources}
+    names = {split: source.names for split, source in sources.items()}
     return AuditReport(
         **_numbers([sequence.usable for sequence in sequences]),
         refused=list(unique.values()),
-        splits={
-            split: _numbers([sequence.usable & sequence.frames.get(split, set()) for sequence in sequences])
-            for split in sources
-        },
-        shared={} if splits_share_sequences else shared_names({split: sources[split].names for split in sources}),
+        splits={split: _numbers(frames) for split, frames in usable.items()},
+        shared={} if splits_share_sequences else shared_names(names),
     )
+
+
+def _source_errors(source: SequenceSource) -> list[DataError]:
+    """Return what a source refuses or leaves out before its sequences are read."""
+    errors = list(source.refused)
+    for reason, names in source.left_out.items():
+        errors += [ExcludedSequence(reason, sequence=name) for name in names]
+    return [*errors, *source.verify()]
+
+
+def _too_short(sequences: Sequence["_Sequence"], explained: Set[str | None]) -> list[DataError]:
+    short = [s for s in sequences if len(s.usable) < FEWEST_FRAMES and s.name not in explained]
+    return [TooFewFrames(f"{len(s.usable)} usable, 2 are needed", sequence=s.name) for s in short]
 
 
 def show_findings(findings: AuditReport) -> None:
@@ -134,6 +136,9 @@ class _Sequence:
     frames: dict[str, set[int]] = field(default_factory=dict)
     usable: set[int] = field(default_factory=set)
     refused: list[DataError] = field(default_factory=list)
+
+    def usable_in(self, split: str) -> set[int]:
+        return self.usable & self.frames.get(split, set())
 
 
 def _batches(sources: Sources) -> list[_Batch]:

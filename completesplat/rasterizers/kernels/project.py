@@ -19,7 +19,7 @@ from completesplat.rasterizers.kernels.projection import (
     image_jacobian,
     lane_gaussians,
     lane_sums_of_view,
-    nine,
+    load_nine,
     rotation_matrix,
     row_times_matrix,
     unit_quaternion,
@@ -132,7 +132,7 @@ def project(
         The number of visible Gaussians.
     """
     count = 0
-    rotation = nine(camera, layout.ROTATION)
+    rotation = load_nine(camera, layout.ROTATION)
     flat, stride = prepared.reshape(-1), prepared.shape[1]
     unsorted_flat, depths = unsorted.reshape(-1), keys[0].view(np.float64)
     for start in range(0, stride, LANES):
@@ -158,10 +158,10 @@ def project(
         inverse_u = square_root(TWO * LN2 * determinant * inverse_yy)
         # In the order of the records' columns.
         shape = narrow((center_x, center_y, ONE / inverse_u, xy * inverse_yy, square_root(reach) / extent_y))
-        look = four_columns(flat, stride, layout.LOG2_OPACITY_AND_COLOR * stride + start)
+        opacity_and_color = four_columns(flat, stride, layout.LOG2_OPACITY_AND_COLOR * stride + start)
         extents = narrow((z, inverse_u, xy / xx * extent_x, extent_y))
         rest = (packed_blocks(top, bottom), index_bits(start), splat(ZERO))
-        count = append(inside, shape + look + extents + rest, unsorted_flat, z, depths, count)
+        count = append(inside, shape + opacity_and_color + extents + rest, unsorted_flat, z, depths, count)
     radix_sort(depths, keys, order, count)
     records_flat = records.reshape(-1)
     for j in range(count):
@@ -204,9 +204,9 @@ def radix_sort(depths, keys, order, count):
 @vector_function(VECTOR)
 def packed_blocks(builder, first, last):
     """Return, as the bits of int32, the block of each first pixel, and that of each last pixel shifted up."""
-    low, high = (builder.fptosi(pixel, INTEGERS_IR) for pixel in (first, last))
-    low, high = (builder.ashr(pixel, ir.Constant(INTEGERS_IR, [layout.BLOCK_SHIFT] * LANES)) for pixel in (low, high))
-    return builder.bitcast(builder.or_(low, builder.shl(high, ir.Constant(INTEGERS_IR, [16] * LANES))), VECTOR_IR)
+    block_shift, half_word = (ir.Constant(INTEGERS_IR, [bits] * LANES) for bits in (layout.BLOCK_SHIFT, 16))
+    low, high = (builder.ashr(builder.fptosi(pixel, INTEGERS_IR), block_shift) for pixel in (first, last))
+    return builder.bitcast(builder.or_(low, builder.shl(high, half_word)), VECTOR_IR)
 
 
 @vector_function(VECTOR)

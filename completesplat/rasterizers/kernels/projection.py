@@ -70,7 +70,7 @@ def matrix_times_column(m, a):
 
 
 @helper
-def nine(array, start):
+def load_nine(array, start):
     """Return nine neighbouring entries of a flat array, as float64."""
     return (
         np.float64(array[start]), np.float64(array[start + 1]), np.float64(array[start + 2]),
@@ -201,7 +201,7 @@ def splat_gradients(row_x, row_y, root, blur, sums):
 @helper
 def view_gradients(mean, root, camera, blur, sums):
     """Return the gradients of means and roots from one view's sums: through pixel position, Jacobian and depth."""
-    rotation = nine(camera, layout.ROTATION)
+    rotation = load_nine(camera, layout.ROTATION)
     x, y, z = camera_point(camera, rotation, mean)
     inverse_z = ONE / z
     slope_x, slope_y = x * inverse_z, y * inverse_z
