@@ -24,8 +24,8 @@ from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.data.rendered.rendering import render
 from completesplat.data.sequences import SequenceSource
-from completesplat.data.validation import errors_at, refused_to
-from completesplat.errors import DataError
+from completesplat.data.validation import refused_to
+from completesplat.errors import DataError, errors_at
 from completesplat.export.ply import write_ply
 from completesplat.ply_files import read_vertices
 from completesplat.training.encoding import encode_training_set
