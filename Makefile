@@ -63,10 +63,10 @@ demo-train: $(READY) ## Make toy scenes, train both stages briefly, evaluate, co
 # OpenMP's do by default, would keep another process off its core. Where an environment forbids Python to keep compiled
 # modules, rewriting every assertion takes ten seconds each time.
 test: check ## Lint, types and the tests (CPU, 4 to 8 minutes on two cores)
-	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=3000 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q --numprocesses auto --maxprocesses 4 --dist worksteal
+	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=1500 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q --numprocesses auto --maxprocesses 4 --dist worksteal
 
 test-processes: $(READY) ## The tests that start processes and servers, send signals, damage files at random, fill disks
-	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=3000 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -m "processes and not slow" --numprocesses auto --maxprocesses 4 --dist worksteal
+	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=1500 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -m "processes and not slow" --numprocesses auto --maxprocesses 4 --dist worksteal
 
 test-slow: $(READY) ## The tests that take minutes each
 	$(BIN)/python -m pytest -q -m slow

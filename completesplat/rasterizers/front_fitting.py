@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -14,6 +13,7 @@ from completesplat.rasterizers import Rasterizer
 
 # Rates of Adam: sRGB units, logits of opacities, logarithms of scales.
 RATES = {"colors": 0.1, "opacities": 0.4, "scales": 0.12}
+BETAS = 0.9, 0.999
 DAMPING = 0.01
 """Adam's epsilon: a Gaussian moves slowly if the image's squared error changes by less than this with its values."""
 WARM_UP = 8  # rounds in which the rates rise, so that a scene that is nearly right moves little
@@ -48,30 +48,27 @@ def fit_front(
         fixed, views = gaussians.map(torch.clone).detach(), cameras.map(lambda x: x[:, None].clone())
         image = images[:, None].clone()
         shown = torch.ones_like(image) if visible is None else visible[:, None].expand_as(image).clone()
-        moves = {name: torch.zeros_like(getattr(fixed, name), requires_grad=True) for name in RATES}
-        optimizer = torch.optim.Adam(
-            [{"params": [moves[name]], "lr": rate} for name, rate in RATES.items()], eps=DAMPING
-        )
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, partial(_rate, rounds=rounds))
+        moves = [torch.zeros_like(getattr(fixed, name), requires_grad=True) for name in RATES]
+        means, squares = ([torch.zeros_like(move) for move in moves] for _ in range(2))
         best, least = gaussians, math.inf
-        for number in range(rounds + 1):
-            moved = _moved(fixed, **moves)
+        for number in range(1, rounds + 2):
+            moved = _moved(fixed, *moves)
             error = ((rasterizer(moved, views).over(background) - image) * shown).square().sum() / 2
             if error.item() < least:
                 best, least = moved.detach(), error.item()
-            if least <= ENOUGH * shown.sum().item() / 2:
+            if number > rounds or least <= ENOUGH * shown.sum().item() / 2:
                 break
-            if number < rounds:
-                optimizer.zero_grad()
-                torch.autograd.backward(error)
-                optimizer.step()
-                schedule.step()
+            gradients = torch.autograd.grad(error, moves)
+            # torch.optim's Adam is the same; its first step imports torch's compiler, which takes a second.
+            factor = min(1, number / WARM_UP) * (1 + math.cos(math.pi * (number - 1) / rounds)) / 2
+            for move, mean, square, gradient, rate in zip(
+                moves, means, squares, gradients, RATES.values(), strict=True
+            ):
+                mean.lerp_(gradient, 1 - BETAS[0])
+                square.lerp_(gradient.square(), 1 - BETAS[1])
+                deviation = (square / (1 - BETAS[1] ** number)).sqrt() + DAMPING
+                move.data -= rate * factor * mean / (1 - BETAS[0] ** number) / deviation
     return best
-
-
-def _rate(number: int, rounds: int) -> float:
-    """Return the factor of the rates in a round: a linear rise times half a cosine."""
-    return min(1, (number + 1) / WARM_UP) * (1 + math.cos(math.pi * number / max(rounds, 1))) / 2
 
 
 def _moved(gaussians: Gaussians, colors: Tensor, opacities: Tensor, scales: Tensor) -> Gaussians:

@@ -56,7 +56,7 @@ def test_torch_is_loaded_with_threads_that_spin_briefly(user, given):
     program += f"sys.meta_path.insert(0, Watch())\n{user}"
     environment = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
     environment |= {} if given is None else {"GOMP_SPINCOUNT": given}
-    assert f"torch with {given or 3000}" in python(program, env=environment).splitlines()
+    assert f"torch with {given or 1500}" in python(program, env=environment).splitlines()
 
 
 def test_help_shows_all_verbs_and_the_settings_of_each(command):

@@ -21,8 +21,8 @@ from completesplat.training.reconstruction import ReconstructionModule
 HOLDER = """
 import os, sys, time
 from pathlib import Path
-from completesplat.commands.jobs import alone_in
-with alone_in(Path(sys.argv[1])):
+from completesplat.commands.jobs import hold_job_lock
+with hold_job_lock(Path(sys.argv[1])):
     if os.fork() == 0:
         time.sleep(900)
         os._exit(0)
