@@ -262,14 +262,14 @@ def distances_to_shipped(image: ImageLike, remove_background: bool = False) -> d
     square = read_photograph(image, largest, remove_background=remove_background).image
     distances: dict[str, float] = {}
     for name, config in configs.items():
-        if not _is_border(config["training"].get("background"), square):
+        if not _shows(config["training"].get("background"), square):
             continue
         distance = distance_to_training(read_photograph(square, config["image_size"]), config)
         distances |= {} if distance is None else {name: distance}
     return dict(sorted(distances.items(), key=itemgetter(1)))
 
 
-def _is_border(background: float | None, square: Float[Tensor, "3 size size"]) -> bool:
+def _shows(background: float | None, square: Float[Tensor, "3 size size"]) -> bool:
     """Return whether at least half of an image's border has this grey value, up to 0.1; None: any."""
     border = torch.cat([square[:, [0, -1]].flatten(1), square[:, :, [0, -1]].flatten(1)], 1)
     return background is None or ((border - background).abs().amax(0) < 0.1).float().mean().item() >= 0.5

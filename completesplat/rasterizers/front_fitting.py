@@ -76,7 +76,8 @@ def _moved(gaussians: Gaussians, colors: Tensor, opacities: Tensor, scales: Tens
     logits = torch.logit(gaussians.opacities, SMALLEST)
     return replace(
         gaussians,
-        colors=(gaussians.colors + colors).clamp(min=0),
+        # No colour becomes brighter than white: it would show from the side.
+        colors=(gaussians.colors + colors).clamp(gaussians.colors.clamp(max=0), gaussians.colors.clamp(min=1)),
         opacities=(gaussians.opacities + (torch.sigmoid(logits + opacities) - torch.sigmoid(logits))).clamp(0, 1),
         scales=gaussians.scales * scales.exp(),
     )

@@ -112,3 +112,10 @@ def test_of_directional_colors_the_means_move_and_the_photo_is_met(image: torch.
     assert isinstance(after, DirectionalGaussians)
     assert torch.equal(after.harmonics, slopes)
     assert (render(after) - image).square().mean() <= ENOUGH * 1.01
+
+
+def test_no_colour_becomes_brighter_than_white():
+    dim = replace(wall(2, 0.9), opacities=torch.full((1, SIDE**2), 0.2), scales=wall(2, 0.9).scales / 8)
+    result = fitted(dim, torch.ones(1, 3, SIDE, SIDE), 20)
+    assert result.colors.max() == 1
+    assert result.colors.min() >= 0
