@@ -41,6 +41,7 @@ class AutoDecoder(nn.Module):
         self.make_room(rows)
 
     def forward(self, codes: Codes) -> SplatterImage:
+        """Reconstruct from codes."""
         image: SplatterImage = self.reconstructor(codes, ())
         return image
 
@@ -75,6 +76,7 @@ class AutoDecoder(nn.Module):
         return [[name, frame] for name, frame in self._rows]
 
     def set_extra_state(self, state: Any) -> None:
+        """Restore the rows of a checkpoint."""
         self._rows = {(name, frame): row for row, (name, frame) in enumerate(state)}
 
 
