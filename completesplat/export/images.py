@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from einops import rearrange
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
@@ -49,6 +50,14 @@ def enlarge(
 ) -> Float[Tensor, "*batch channel tall wide"]:
     """Enlarge images by repeating every pixel `factor` times in both directions, without interpolation."""
     return images.repeat_interleave(factor, dim=-2).repeat_interleave(factor, dim=-1)
+
+
+def image_grid(*rows: Float[Tensor, "_ 3 height width"], factor: int = 3) -> Image.Image:
+    """Return enlarged rows of images (sRGB, 0 to 1) of one size; short rows are filled with white."""
+    columns = max(len(row) for row in rows)
+    filled = [torch.cat([row, torch.ones(columns - len(row), *row.shape[1:]).to(row)]) for row in rows]
+    whole = rearrange(torch.stack(filled), "row column rgb height width -> rgb (row height) (column width)")
+    return Image.fromarray(to_pixels(enlarge(whole, factor)))
 
 
 @dataclass(frozen=True)

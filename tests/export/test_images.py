@@ -8,8 +8,23 @@ from completesplat.export.images import (
     SheetCell,
     color_depth,
     color_normals,
+    image_grid,
     image_sheet,
+    to_pixels,
 )
+
+
+def test_images_stand_where_they_were_given_each_pixel_a_square():
+    first, second = torch.rand(3, 3, 4, 5), torch.rand(2, 3, 4, 5)
+    large = np.asarray(image_grid(first, second, factor=3))
+    plain = large[::3, ::3]
+    assert large.shape == (24, 45, 3)
+    assert np.array_equal(large, plain.repeat(3, axis=0).repeat(3, axis=1))
+    for row, images in enumerate((first, second)):
+        for column, image in enumerate(images):
+            place = plain[4 * row : 4 * row + 4, 5 * column : 5 * column + 5]
+            assert np.array_equal(place, to_pixels(image))
+    assert np.all(plain[4:, 10:] == 255)
 
 
 def test_every_image_of_a_sheet_lies_in_its_row_and_column_and_places_may_be_empty():
