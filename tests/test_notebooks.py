@@ -3,7 +3,9 @@
 import base64
 import io
 import json
+import re
 from copy import deepcopy
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from PIL import Image
 from stored_notebooks import HASH, NOTEBOOKS, ROOT, WIDEST, code_cells, hash_of, slimmed
 
 MOST_BYTES = 1_000_000
+IMPORT = re.compile(r"^from (completesplat[\w.]*) import ([\w, ]+)", re.MULTILINE)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -26,6 +29,14 @@ def test_a_notebook_has_the_outputs_of_its_code_and_nothing_of_the_machine(path)
     assert any("image/jpeg" in output.get("data", {}) for output in outputs)
     assert path.stat().st_size <= MOST_BYTES
     assert not any(place in path.read_text() for place in (str(ROOT), str(Path.home()) + "/", "site-packages"))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_what_a_notebook_imports_from_the_package_exists(path):
+    code = "\n".join(line for cell in code_cells(json.loads(path.read_text())) for line in cell["source"])
+    names = [(module, name) for module, names in IMPORT.findall(code) for name in names.split(", ")]
+    assert names
+    assert [name for module, name in names if not hasattr(import_module(module), name)] == []
 
 
 def test_the_first_notebook_installs_the_package_before_anything_needs_it():
