@@ -3,7 +3,6 @@
 import json
 from collections.abc import Mapping
 from functools import cache
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -249,10 +248,11 @@ def distance_to_training(photograph: Photograph, architecture: Mapping[str, Any]
 
 
 def distances_to_shipped(image: ImageLike, remove_background: bool = False) -> dict[str, float]:
-    """Return the distances of an image from the training images of the weights in the package, the nearest first.
+    """Return the distances of an image from the training images of the weights in the package, the likeliest first.
 
-    They depend on the resolution, so the image, which is read once, is resized for each model. Weights of objects on
-    one background are left out if the image's border does not show it.
+    Likely are near training images, and those that differ little among themselves (the density of normal
+    distributions). Distances depend on the resolution, so the image, which is read once, is resized for each model.
+    Weights of objects on one background are left out if the image's border does not show it.
 
     Raises:
         CompleteSplatError: as `read_photograph`.
@@ -260,13 +260,15 @@ def distances_to_shipped(image: ImageLike, remove_background: bool = False) -> d
     configs = {name: json.loads(read_small(folder / CONFIG_FILE)) for name, folder in shipped().items()}
     largest = max((config["image_size"] for config in configs.values()), default=1)
     square = read_photograph(image, largest, remove_background=remove_background).image
-    distances: dict[str, float] = {}
+    distances, unlikely = dict[str, float](), dict[str, float]()
     for name, config in configs.items():
         if not _shows(config["training"].get("background"), square):
             continue
         distance = distance_to_training(read_photograph(square, config["image_size"]), config)
-        distances |= {} if distance is None else {name: distance}
-    return dict(sorted(distances.items(), key=itemgetter(1)))
+        if distance is not None:
+            distances[name] = distance
+            unlikely[name] = distance**2 / 2 + torch.tensor(config["training"]["picture_std"]).log().mean().item()
+    return {name: distances[name] for name in sorted(unlikely, key=unlikely.__getitem__)}
 
 
 def _shows(background: float | None, square: Float[Tensor, "3 size size"]) -> bool:

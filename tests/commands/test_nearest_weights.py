@@ -42,15 +42,25 @@ def test_the_nearest_to_the_first_image_that_can_be_read_are_chosen_and_the_othe
     assert name == "greens"
     # Two of eight features differ by 1 from the other weights' mean, and deviations are 0.1: sqrt(2 / 8) / 0.1 = 5.
     distances = "(0.0 standard deviations, blues 5.0, reds 5.0)"
-    assert reason == f"; their training images are the nearest to lime.png {distances}"
+    assert reason == f"; their training images are the likest to lime.png {distances}"
     name, reason = nearest_weights([tmp_path / "broken.png", tmp_path / "gone.png", red, green], False)
     assert name == "reds"
-    assert "nearest to the first image, red.png (0.0" in reason
+    assert "likest to the first image, red.png (0.0" in reason
     name, reason = nearest_weights([tmp_path / "broken.png"], False)
     assert (name, reason) == ("blues", "; there is no image to choose by (weights=NAME takes others: greens, reds)")
     package.clear()
     with pytest.raises(WeightsError, match="this package has no weights; give weights=DIR"):
         nearest_weights([red], False)
+
+
+def test_weights_of_anything_are_for_images_that_are_like_no_others(package, tmp_path):
+    config = json.loads((package["blues"] / "config.json").read_text())
+    config["training"] = {"picture_mean": [0.5] * 3 + [0.0] * 5, "picture_std": [0.5] * 8}
+    (package["blues"] / "config.json").write_text(json.dumps(config))
+    for color, chosen, distances in (("red", "reds", [0.0, 0.6, 5.0]), ("black", "blues", [0.6, 3.5, 3.5])):
+        found = distances_to_shipped(photo(tmp_path / "photo.png", color))
+        assert next(iter(found)) == chosen
+        assert list(found.values()) == pytest.approx(distances, abs=0.05)
 
 
 @pytest.mark.parametrize(("border", "chosen"), [("white", "reds"), ("red", "blues")])
@@ -84,7 +94,7 @@ def test_the_default_chooses_and_says_so_in_one_line(command, tmp_path):
     finished = command.succeeds("predict", f"image={COUCH}", f"out={tmp_path / 'out'}", *quick)
     (line,) = [line for line in finished.out.splitlines() if line.startswith("weights: ")]
     assert line.startswith("weights: rendered_couches, which come with the package and know renders of ")
-    assert "nearest to held_out.jpg (" in line
+    assert "likest to held_out.jpg (" in line
     assert all(name in line for name in shipped())
     assert strict_json(tmp_path / "out/held_out/scene.json")["settings"]["weights"] == "rendered_couches"
 
