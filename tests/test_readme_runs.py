@@ -26,7 +26,8 @@ BRIEF = {
     "fit": [*SMALL, "test=false", "data.scenes=20", "callbacks.images=null"],
     "predict": ["frames=2", "steps=2"],
     "test": ["trainer.accelerator=cpu"],
-    **{f"report {study}": ["scenes=1", "samples=2"] for study in ("calibration", "controls", "depth", "modes")},
+    **{f"report {study}": ["scenes=1", "samples=2"] for study in ("calibration", "controls", "depth")},
+    "report ladder": ["scenes=1", "samples=2", "fits=1"],
 }
 CAPTURE = ["trainer.max_steps=2", "trainer.accelerator=cpu", "data.image_size=12", "model.formats=[]", "model.frames=2"]
 BRIEF["fit experiment=capture"] = [*CAPTURE, "model.fitting.initial=100", "model.fitting.most=120"]

@@ -6,18 +6,15 @@ Each study raises the errors of `TrainedModel.open`, `diffusion_of`, `first_scen
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Annotated, NotRequired, Unpack
 
 import torch
 from rich.console import Console
-from rich.progress import track
 
 from completesplat.commands import quieten
 from completesplat.commands.trained import TrainedModel, diffusion_of
 from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.errors import CompleteSplatError
 from completesplat.export.images import image_sheet, write_png
 from completesplat.files import write_json
 from completesplat.results.tables import records_table, show
@@ -27,7 +24,7 @@ from completesplat.settings.schema import Entries, Positive, Range, Share
 from completesplat.studies.calibration import calibration_rows, plot_calibration
 from completesplat.studies.controls import OnProgress, controls_rows, controls_strips, grid, plot_controls
 from completesplat.studies.depth import depth_rows, depth_strips
-from completesplat.studies.noise_levels import noise_level_rows, plot_noise_levels, scenes_in_all_modes
+from completesplat.studies.ladder import ladder_rows
 from completesplat.studies.samples import SampleRenderer, first_scenes
 from completesplat.training.scoring import Scorer
 
@@ -94,19 +91,12 @@ def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Un
     _report(out / "calibration.json", f"Novel views; {ideal}", rows, run, **weights)
 
 
-def modes(spread_views: Positive, out: Path, **run: Unpack[Run]) -> None:
-    """Write `modes.json` and `modes.png`, and print the table; `noise_level_rows` explains its columns."""
-    stage, data = _opened_stage(run)
-    model = diffusion_of(stage)
-    if not model.autoreconstructor.sees_views:
-        raise CompleteSplatError("these latents are equal in all modes: report modes needs posterior=views")
-    data.setup("test")
-    progress = partial(track, description="Scenes in all modes", console=Console(stderr=True))
-    scenes = scenes_in_all_modes(data.hidden_modes(1, spread_views), run["scenes"], progress)
-    rows = noise_level_rows(model, [x.to(stage.device) for x in scenes], run["samples"], run["seed"])
-    plot_noise_levels(rows, out / "modes.png", f"Hidden modes of {len(scenes)} scenes in noisy latents")
-    used = {"scenes": len(scenes), "spread_views": spread_views}
-    _report(out / "modes.json", "Share of the true mode in noisy latents", rows, run, **used)
+def ladder(fits: Positive, out: Path, **run: Unpack[Run]) -> None:
+    """Write `ladder.json`, and print the table; `ladder_rows` explains its rows."""
+    with _opened(run) as (renderer, scenes, tick):
+        rows = ladder_rows(renderer, scenes, fits, tick)
+    title = f"Where quality is lost: all views and those from behind, PSNR (dB), {len(scenes)} scenes"
+    _report(out / "ladder.json", title, rows, run, fits=fits)
 
 
 def _report(path: Path, title: str, rows: Sequence[Mapping[str, object]], run: Run, **settings: float) -> None:

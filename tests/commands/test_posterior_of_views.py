@@ -2,7 +2,6 @@
 
 import csv
 
-import imageio.v3 as imageio
 import numpy as np
 import pytest
 from conftest import made
@@ -48,15 +47,22 @@ def test_hidden_modes_have_every_rung_of_the_ladder(runs, command, tmp_path):
     assert results["mean_predictor"]["energy_hidden"] > 0.02
 
 
-def test_modes_has_shares_by_noise_level_and_a_figure(runs, command, tmp_path):
-    given = [f"ckpt={runs / 'diffusion/checkpoints/last.ckpt'}", "scenes=1", "samples=2", "spread_views=2"]
-    finished = command.succeeds("report", "modes", *given, f"out={tmp_path}")
-    results = strict_json(tmp_path / "modes.json")
-    assert results["settings"] == {"scenes": 1, "samples": 2, "seed": 0, "spread_views": 2}
-    assert all(0 <= row["best_share"] <= 1 for row in results["rows"])
-    assert sum(row["training_share"] for row in results["rows"]) == pytest.approx(1)
-    assert imageio.imread(tmp_path / "modes.png").ndim == 3
-    assert "Share of the true mode" in finished.out
+def test_the_ladder_of_reconstructions_has_every_rung_and_fitting_helps(runs, command, tmp_path):
+    given = [f"ckpt={runs / 'diffusion/checkpoints/last.ckpt'}", "scenes=1", "samples=2", "fits=20"]
+    given += ["overrides=['data.evaluation_targets=null']"]
+    finished = command.succeeds("report", "ladder", *given, f"out={tmp_path}")
+    results = strict_json(tmp_path / "ladder.json")
+    assert results["settings"] == {"scenes": 1, "samples": 2, "seed": 0, "fits": 20}
+    rows = {row.pop("rung"): row for row in results["rows"]}
+    posterior, samples, alone = "posterior, all views", "samples", "reference alone"
+    fitted = ["raw values fitted", "decoder fitted", "latent fitted"]
+    assert list(rows) == [*fitted, posterior, samples, alone]
+    for name in fitted:
+        assert rows[name]["psnr"] > rows[posterior]["psnr"] + 0.05
+    assert rows[fitted[0]]["psnr"] > rows[fitted[2]]["psnr"]
+    assert rows[posterior]["psnr"] != rows[alone]["psnr"]
+    assert all(row["sharpness_behind"] > 0 and 0 < row["behind"] < 60 for row in rows.values())
+    assert "Where quality is lost" in finished.out
 
 
 def test_several_samples_have_proper_scores_of_the_hidden_part(runs, command, tmp_path):
