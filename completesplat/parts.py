@@ -61,13 +61,15 @@ class TrainingImages(TypedDict, total=False):
     """Facts about the training images that are stored with weights; older weights have none.
 
     `content`: what they show, in words, for weights in the package. `box_masks`: how often parts of an image were
-    hidden. `background`: grey value behind the objects, if images show nothing else. The others: mean and standard
-    deviation of the training images' features, see `completesplat.data.images.photograph.image_features`.
+    hidden. `background`: grey value behind the objects, if images show nothing else. `depth_before`: depth range before
+    the centre of an object of the common size. The others: mean and standard deviation of the training images'
+    features, see `completesplat.data.images.photograph.image_features`.
     """
 
     content: str
     box_masks: Share
     background: Share
+    depth_before: Annotated[float, Range(1e-6, 1e6)]
     picture_mean: Annotated[Sequence[Share], Entries(8, 8)]
     picture_std: Annotated[Sequence[Annotated[float, Range(1e-6, 1)]], Entries(8, 8)]
 

@@ -1,6 +1,7 @@
 """Base class of all models that make scenes from photos: inputs, cameras, units and files."""
 
 import json
+import math
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.encoder import Images
 from completesplat.autoreconstructor.model import DepthRange, Reconstruction, ReconstructionModel
 from completesplat.data.images.photograph import ImageLike, Photograph, image_features, read_photograph
+from completesplat.data.placement import SMALLEST_NEAR
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import make_folder, write_bytes, write_text
 from completesplat.gaussians import Gaussians
@@ -158,8 +160,16 @@ class SceneModel(nn.Module):
         return [scenes[i] for i in range(len(scenes.means))]
 
     def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
-        """Return near and far of the scene in a photo: those of the training set."""
-        return self.depth_range
+        """Return near and far of the scene in a photo: those of the training set.
+
+        Weights of objects, which have one size, move it to where an object is as large in the photo as in training.
+        """
+        before = (self.architecture.get("training") or {}).get("depth_before")
+        if before is None:
+            return self.depth_range
+        trained, own = (math.tan(math.radians(x) / 2) for x in (self.fov_degrees.item(), photograph.fov_degrees))
+        center: Tensor = self.depth_range[0] + before
+        return (self.depth_range + center * (trained / own - 1)).clamp(min=SMALLEST_NEAR)
 
     @torch.no_grad()
     def reconstruct(self, views: Views) -> Gaussians:

@@ -252,7 +252,8 @@ def _predict(
 
 def photo_warnings(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]:
     """Return warnings about a photo that is unlike the training images; its contents are compared only if `whole`."""
-    warnings = [unusual_field_of_view(photograph, model.fov_degrees.item())]
+    moves = "depth_before" in (model.architecture.get("training") or {})  # the depth range, by the field of view
+    warnings = [None if moves else unusual_field_of_view(photograph, model.fov_degrees.item())]
     distance = distance_to_training(photograph, model.architecture) if whole else None
     if distance is not None and distance > UNLIKE:
         warnings.append(

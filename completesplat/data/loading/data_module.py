@@ -359,6 +359,9 @@ class ObjectDataModule(SceneDataModule):
         self.evaluation_targets = evaluation_targets
         self.validation_targets = evaluation_targets if validation_targets is None else validation_targets
 
+    def training_facts(self) -> dict[str, float | list[float]]:
+        return super().training_facts() | {"depth_before": self.framing.depth_before}
+
     def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
         """Draw a random reference and targets at random, or spread around it."""
         return (draw_spread_views if self.spread_targets else training_views)(frames, self.targets, rng)
