@@ -82,7 +82,9 @@ def run(config: DictConfig, out: Path) -> None:
     if tested is not None:
         tested.check_test()
     if trainer.is_global_zero:
-        print(ModelSummary(module, max_depth=2))
+        # The last column and line count floating-point operations, which are 0 before the first step.
+        rows = str(ModelSummary(module, max_depth=2)).splitlines()
+        print("\n".join(row.rpartition("|")[0] or row for row in rows if not row.endswith("Total Flops")))
         logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, share)
     metrics = {}
     with wandb_runs(loggers, config):

@@ -34,18 +34,20 @@ FASTER: dict[str, Callable[[RenderingConstants | None], Rasterizer]] = {"cuda": 
 
 
 def auto(constants: RenderingConstants | None = None) -> Rasterizer:
-    """Return the fastest backend that works here with these constants; log the choice and its reasons.
+    """Return the fastest backend that works here with these constants; log the choice if there is a GPU, and failures.
 
     Every backend takes tensors of any device, so the choice does not depend on where a model runs: if there is a GPU,
     the Gaussians of a model on the CPU are drawn on it, too.
     """
+    gpu = torch.cuda.is_available()
     for name, make in FASTER.items():
         reason = None if name == "tiled" and _passed_before(constants) else failure(name, constants)
         if reason is None:
-            logger.info("rasterizer: %s (a test rendering agrees with the reference)", name)
+            level = logging.INFO if gpu else logging.DEBUG
+            logger.log(level, "rasterizer: %s (a test rendering agrees with the reference)", name)
             return make(constants)
-        expected = name == "cuda" and not torch.cuda.is_available()
-        logger.log(logging.INFO if expected else logging.WARNING, "rasterizer: not %s: %s", name, reason)
+        expected = name == "cuda" and not gpu
+        logger.log(logging.DEBUG if expected else logging.WARNING, "rasterizer: not %s: %s", name, reason)
     logger.warning("rasterizer: reference, which is very slow")
     return ReferenceRasterizer(constants)
 
