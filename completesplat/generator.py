@@ -36,7 +36,7 @@ class CompleteSplat(SceneModel):
     """Conditioning, denoiser, sampler and the frozen autoreconstructor: everything that inference needs.
 
     The four parts are given as configs (`_target_` and arguments, as in `conf/`), which are written beside the weights,
-    so that `from_pretrained` can build the parts again.
+    so that `from_pretrained` can build the parts again. They may name the caller's own modules, which are imported.
 
     Args:
         autoreconstructor, conditioning, denoiser, sampler: configs of the parts.
@@ -212,11 +212,7 @@ class DeterministicModel(SceneModel):
 
     Args:
         network: config of the network, as in `conf/`.
-        image_size: side of the square images, in pixels.
-        training: facts about the training images (`completesplat.parts.TrainingImages`).
-
-    Raises:
-        WeightsError: the config has a part or an option that weights may not name (`completesplat.parts`).
+        image_size, training: as of `CompleteSplat`, which raises the same error.
     """
 
     def __init__(self, network: PartConfig, image_size: int, training: Mapping[str, object] | None = None) -> None:

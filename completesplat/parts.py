@@ -3,8 +3,8 @@
 Anyone can publish weights and runs. Their configs may name only classes of this list, with plain values as settings:
 nothing else that they name is imported or called, and a model takes no more memory than its weights file holds.
 Weights store a class by its name alone. A path in this package or diffusers stands for the class at its end, so weights
-and runs of earlier versions open when a class has moved. Any other path is that of a class in a module of the user's.
-`completesplat.run_configs.check_names` decides whether a file may name it, before a function of this module sees it.
+and runs of earlier versions open when a class has moved. Any other path stands for a class of the user's own modules;
+`completesplat.run_configs.check_names` decides first whether a file may name it.
 """
 
 import inspect
@@ -201,11 +201,9 @@ def _check_part(place: str, part: object, allowed: Sequence[type]) -> None:
     own = kind is not None and kind not in PARTS.values()
     if not isinstance(part, Mapping) or not (own or kind in allowed):
         target = part.get("_target_") if isinstance(part, Mapping) else part
-        names = ", ".join(kind.__name__ for kind in allowed)
-        raise WeightsError(
-            f"{place} names {printable(target, SHORT)}, which is no part of a model; allowed are {names},"
-            " and classes of your own modules"
-        )
+        names = ", ".join([*(kind.__name__ for kind in allowed), "classes of your own modules"])
+        reason = f"names {printable(target, SHORT)}, which is no part of a model; allowed are {names}"
+        raise WeightsError(f"{place} {reason}")
     settings = {name: value for name, value in part.items() if name != "_target_"}
     if own:
         _check_parts_in(place, settings)

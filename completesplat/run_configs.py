@@ -1,7 +1,6 @@
-"""Models of weights and runs, whose configs name nothing that `check_names` has not allowed (SECURITY.md).
+"""Models of weights and runs; `check_names` checks all configs before anything is imported or built (SECURITY.md).
 
-It decides before anything is imported or built. A config may name all parts of models and data in `conf/`, and the
-user's modules if weights or run are the user's or trusted.
+A config may name all parts of models and data in `conf/`, and the user's modules if its file is the user's or trusted.
 """
 
 import json
@@ -32,16 +31,7 @@ from completesplat.settings.checks import (
 )
 from completesplat.settings.options import conf_folder
 from completesplat.settings.schema import check_value
-from completesplat.weights import (
-    CAMERA,
-    CONFIG_FILE,
-    RUN_CONFIG_FILE,
-    RUN_WEIGHTS,
-    SCENES,
-    WEIGHTS_FILE,
-    first_line,
-    read_small,
-)
+from completesplat.weights import CAMERA, CONFIG_FILE, RUN_CONFIG_FILE, RUN_WEIGHTS, SCENES, first_line, read_small
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
 # The classes of runs whose models make scenes from photos: the setting of the model, which begins its tensors' names.
@@ -94,8 +84,7 @@ def read_weights(file: Path, trust: bool) -> tuple[dict[str, Any], dict[str, Ten
     """Return a model's config and its tensors by name from `model.safetensors` and the `config.json` beside it.
 
     Raises:
-        WeightsError: the config cannot be read, `check_names` or `check_architecture` refuses it, or the tensors do not
-            belong to it.
+        WeightsError: the config is unreadable, names or holds what it may not, or the tensors do not belong to it.
     """
     path = file.with_name(CONFIG_FILE)
     try:
@@ -106,7 +95,7 @@ def read_weights(file: Path, trust: bool) -> tuple[dict[str, Any], dict[str, Ten
     architecture = check_names(architecture, path, folder.parent if folder.name == RUN_WEIGHTS else folder, trust)
     check_architecture(architecture, path)
     architecture, tensors = stored_config(architecture), load_file(file)
-    check_sizes(architecture, tensors, (WEIGHTS_FILE, CONFIG_FILE))
+    check_sizes(architecture, tensors, (file.name, CONFIG_FILE))
     return architecture, tensors
 
 
@@ -114,8 +103,8 @@ def read_run(checkpoint: Path, trust: bool) -> tuple[dict[str, Any], dict[str, T
     """Return a model's config and its tensors by name from a run's checkpoint, averaged tensors if it has such.
 
     Raises:
-        WeightsError: the run's model makes no scene from a photo, `check_names` or `check_architecture` refuses it, or
-            the checkpoint cannot be read or does not belong to the config.
+        WeightsError: the model makes no scene from a photo, its config names or holds what it may not, or the
+            checkpoint cannot be read or does not belong to it.
     """
     path, config = read_run_config(checkpoint)
     model, target = config["model"], printable(config["model"].get("_target_"), SHORT)
@@ -221,10 +210,9 @@ def _known_paths() -> dict[str, str]:
 def _belongs_to_user(file: Path, run: Path) -> bool:
     """Whether the user owns a run below the working folder, and has therefore made it or brought it there.
 
-    What the hub's client has downloaded into its cache was not brought there, even if the user works in a folder above.
-
-    The working folder itself must not be the run's, because modules that came with it would pass as the user's.
+    The hub's client brings files into its cache without the user. The working folder itself must not be the run's,
+    because modules that came with it would pass as the user's.
     """
-    downloaded = Path(constants.HF_HUB_CACHE).resolve() in run.parents
-    owners = {run.stat().st_uid, file.stat().st_uid}
-    return Path.cwd() in run.parents and not downloaded and owners == {os.getuid()}
+    if Path(constants.HF_HUB_CACHE).resolve() in run.parents:
+        return False
+    return Path.cwd() in run.parents and {run.stat().st_uid, file.stat().st_uid} == {os.getuid()}
