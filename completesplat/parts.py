@@ -215,8 +215,8 @@ def _check_parts_in(place: str, value: object) -> None:
     """Check the parts in the settings of a user's own class, which may have any settings but Hydra's."""
     if isinstance(value, Mapping) and "_target_" in value:
         return _check_part(place, value, tuple(PARTS.values()))
-    inner = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
-    for name, part in inner:
+    settings = dict(enumerate(value)) if isinstance(value, list) else value
+    for name, part in settings.items() if isinstance(settings, Mapping) else ():
         if name in HYDRA_KEYS:
             raise WeightsError(f"{place}.{name}: weights cannot store this setting")
         _check_parts_in(f"{place}.{name}", part)

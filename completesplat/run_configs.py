@@ -1,7 +1,4 @@
-"""Models of weights and runs; `check_names` checks all configs before anything is imported or built (SECURITY.md).
-
-A config may name all parts of models and data in `conf/`, and the user's modules if its file is the user's or trusted.
-"""
+"""Models of weights and runs; `check_names` checks all configs before anything is imported or built (SECURITY.md)."""
 
 import json
 import os
@@ -84,7 +81,7 @@ def read_weights(file: Path, trust: bool) -> tuple[dict[str, Any], dict[str, Ten
     """Return a model's config and its tensors by name from `model.safetensors` and the `config.json` beside it.
 
     Raises:
-        WeightsError: the config is unreadable, names or holds what it may not, or the tensors do not belong to it.
+        WeightsError: the config is unreadable or refused, or the tensors do not belong to it.
     """
     path = file.with_name(CONFIG_FILE)
     try:
@@ -103,8 +100,7 @@ def read_run(checkpoint: Path, trust: bool) -> tuple[dict[str, Any], dict[str, T
     """Return a model's config and its tensors by name from a run's checkpoint, averaged tensors if it has such.
 
     Raises:
-        WeightsError: the model makes no scene from a photo, its config names or holds what it may not, or the
-            checkpoint cannot be read or does not belong to it.
+        WeightsError: the model makes no scene from a photo, its config is refused, or the checkpoint is not its own.
     """
     path, config = read_run_config(checkpoint)
     model, target = config["model"], printable(config["model"].get("_target_"), SHORT)
@@ -160,14 +156,13 @@ def without_training(config: Any) -> Any:
 
 
 def check_names(config: Any, source: Path, run: Path, trust: bool, name: object = "") -> Any:
-    """Return a plain config from the file `source`, with the present paths of parts that it names by name or by PATH.
+    """Return a plain config from the file `source`, with the present paths of parts that it names by name or old path.
 
     A config may name what `conf/` names for models and data, and optimizers of torch. If the run is trusted or belongs
-    to the user, the config may also name the user's modules, such as those in the working folder.
+    to the user (`_belongs_to_user`), it may also name the user's modules, such as those in the working folder.
 
     Args:
-        run: the folder of the run or of weights without a run, with links resolved. It belongs to the user who owns it
-            and `source`, if it lies below the working folder and not in the cache of the Hugging Face hub.
+        run: the folder of the run, or of weights without a run, with links resolved.
         name: the setting that has the value `config`.
 
     Raises:
@@ -187,11 +182,9 @@ def check_names(config: Any, source: Path, run: Path, trust: bool, name: object 
         raise WeightsError(f"{refusal}, which a stored configuration does not")
     if name != "_target_" or OPTIMIZER.fullmatch(value):
         return config
-    known, own_name = _known_paths(), value.rpartition(".")[2]
-    if value in known.values():
-        return value
-    if PATH.fullmatch(value) and own_name in known:
-        return known[own_name]
+    path = PATH.fullmatch(value)
+    if path is not None and path[1] in _known_paths():
+        return _known_paths()[path[1]]
     refusal = f"{source} names {printable(value, SHORT)}, which is no part of models or data in this package"
     if not trust and not _belongs_to_user(source, run):
         raise WeightsError(f"{refusal}; if it is a module of your own, and you trust who made the file: trust=true")
@@ -213,6 +206,5 @@ def _belongs_to_user(file: Path, run: Path) -> bool:
     The hub's client brings files into its cache without the user. The working folder itself must not be the run's,
     because modules that came with it would pass as the user's.
     """
-    if Path(constants.HF_HUB_CACHE).resolve() in run.parents:
-        return False
-    return Path.cwd() in run.parents and {run.stat().st_uid, file.stat().st_uid} == {os.getuid()}
+    downloaded = Path(constants.HF_HUB_CACHE).resolve() in run.parents
+    return not downloaded and Path.cwd() in run.parents and {run.stat().st_uid, file.stat().st_uid} == {os.getuid()}

@@ -127,9 +127,9 @@ def test_what_the_hub_has_sent_is_not_the_users_own_even_below_the_working_folde
 def test_trust_allows_only_what_the_users_modules_define(runs, imported, foreign):
     weights = runs / "STAGE2/weights"
     (weights / SUMS_FILE).unlink()
-    written = json.loads((weights / CONFIG_FILE).read_text())
-    for place in (written["autoreconstructor"], written["autoreconstructor"]["encoder"]):
-        place["encoder"] = {"_target_": foreign, "inner": [{"x": {"_target_": foreign}}]}
+    for settings in ({"_target_": foreign}, {"_target_": "myenc.Enc", "inner": [{"x": {"_target_": foreign}}]}):
+        written = json.loads((runs / "STAGE2/weights" / CONFIG_FILE).read_text())
+        written["autoreconstructor"]["encoder"] = settings
         (weights / CONFIG_FILE).write_text(json.dumps(written))
         with pytest.raises(WeightsError, match=rf"names {foreign}, .* not defined in a module of your own"):
             CompleteSplat.from_pretrained(weights, trust=True)
