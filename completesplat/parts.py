@@ -206,9 +206,8 @@ def _check_part(place: str, part: object, allowed: Sequence[type]) -> None:
         raise WeightsError(f"{place} {reason}")
     settings = {name: value for name, value in part.items() if name != "_target_"}
     if own:
-        _check_parts_in(place, settings)
-    else:
-        _check_settings(place, settings_of(kind), settings)
+        return _check_parts_in(place, settings)
+    _check_settings(place, settings_of(kind), settings)
 
 
 def _check_parts_in(place: str, value: object) -> None:
