@@ -137,6 +137,7 @@ def test_trust_allows_only_what_the_users_modules_define(runs, imported, foreign
 
 def test_view_refuses_weights_before_it_prints_its_address(command, runs, imported, tmp_path, monkeypatch):
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    monkeypatch.setattr("completesplat.commands.view.time", None)  # a page that opens would stay until it is ended
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     for weights in (runs / "STAGE2", runs / "STAGE1/checkpoints/last.ckpt"):
