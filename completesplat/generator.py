@@ -21,8 +21,8 @@ from completesplat.diffusion.sampling import PART, Sampler, draw_noise, in_parts
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.parts import PartConfig, build, check_architecture, read_weights, stored_config
-from completesplat.run_configs import read_run
+from completesplat.parts import PartConfig, build, check_architecture, stored_config
+from completesplat.run_configs import read_run, read_weights
 from completesplat.scene import Views
 from completesplat.scene_model import SceneModel, Visible
 from completesplat.settings.schema import Natural, Positive, Seed
@@ -36,7 +36,7 @@ class CompleteSplat(SceneModel):
     """Conditioning, denoiser, sampler and the frozen autoreconstructor: everything that inference needs.
 
     The four parts are given as configs (`_target_` and arguments, as in `conf/`), which are written beside the weights,
-    so that `from_pretrained` can build the parts again.
+    so that `from_pretrained` can build the parts again. They may name the caller's own modules, which are imported.
 
     Args:
         autoreconstructor, conditioning, denoiser, sampler: configs of the parts.
@@ -183,19 +183,20 @@ class CompleteSplat(SceneModel):
 
     @staticmethod
     @in_float32()
-    def from_pretrained(path: Path | str) -> SceneModel:
+    def from_pretrained(path: Path | str, trust: bool = False) -> SceneModel:
         """Load a saved or trained model in evaluation mode on the CPU; stage 1 gives a `DeterministicModel`.
 
         Args:
             path: a name of shipped weights, a folder of weights or of a run, a checkpoint, or an id on the Hugging Face
                 hub (`locate`). Published weights of Splatter Image (`is_published`) give a `PublishedModel`.
+            trust: the weights name your own modules, and you trust their author; not needed below the working folder.
 
         Raises:
             WeightsError: files are missing, unreadable, changed, not finite, do not belong together, or name parts that
-                `completesplat.parts` does not allow; or the run's model makes no scene from a photo.
+                `completesplat.run_configs.check_names` does not allow; or the run's model makes no scene from a photo.
         """
         try:
-            model = _opened(path)
+            model = _opened(path, trust)
             name = not_finite(model.state_dict())
         except WeightsError:
             raise
@@ -211,11 +212,7 @@ class DeterministicModel(SceneModel):
 
     Args:
         network: config of the network, as in `conf/`.
-        image_size: side of the square images, in pixels.
-        training: facts about the training images (`completesplat.parts.TrainingImages`).
-
-    Raises:
-        WeightsError: the config has a part or an option that weights may not name (`completesplat.parts`).
+        image_size, training: as of `CompleteSplat`, which raises the same error.
     """
 
     def __init__(self, network: PartConfig, image_size: int, training: Mapping[str, object] | None = None) -> None:
@@ -234,11 +231,11 @@ def _architecture(
     return config
 
 
-def _opened(path: Path | str) -> SceneModel:
+def _opened(path: Path | str, trust: bool) -> SceneModel:
     if is_published(path):
         return PublishedModel(str(path))
     file = locate(path)
-    architecture, tensors = (read_weights if file.name == WEIGHTS_FILE else read_run)(file)
+    architecture, tensors = (read_weights if file.name == WEIGHTS_FILE else read_run)(file, trust)
     model: SceneModel = (DeterministicModel if "network" in architecture else CompleteSplat)(**architecture)
     if (difference := mismatch(model.state_dict(), tensors)) is not None:
         raise ValueError(difference)

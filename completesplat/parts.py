@@ -3,13 +3,15 @@
 Anyone can publish weights and runs. Their configs may name only classes of this list, with plain values as settings:
 nothing else that they name is imported or called, and a model takes no more memory than its weights file holds.
 Weights store a class by its name alone. A path in this package or diffusers stands for the class at its end, so weights
-and runs of earlier versions open when a class has moved.
+and runs of earlier versions open when a class has moved. Any other path stands for a class of the user's own modules;
+`completesplat.run_configs.check_names` decides first whether a file may name it.
 """
 
 import inspect
-import json
 import re
+import sysconfig
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, TypedDict, is_typeddict
@@ -21,7 +23,7 @@ from diffusers import (
     FlowMatchEulerDiscreteScheduler,
     UniPCMultistepScheduler,
 )
-from safetensors.torch import load_file
+from hydra.utils import get_object
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import Encoder
@@ -34,9 +36,9 @@ from completesplat.diffusion.denoiser import Denoiser, TextlessStableDiffusion
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import WeightsError
 from completesplat.files import SHORT, printable
+from completesplat.settings.checks import HYDRA_KEYS
 from completesplat.settings.schema import Entries, Range, Share, hints_of, start_weights, violations
 from completesplat.splatter_image import Parameterization
-from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, read_small
 
 # The classes that each setting may name, for settings that are parts of a model.
 CHOICES: dict[str, tuple[type, ...]] = {
@@ -116,9 +118,37 @@ class SchedulerSettings(TypedDict, total=False):
 
 
 def class_of(part: object) -> Any:
-    """Return the class of `PARTS` that a part's config names, by its name or by a path of any version; None if none."""
-    path = PATH.fullmatch(str(part.get("_target_"))) if isinstance(part, Mapping) else None
-    return None if path is None else PARTS.get(path[1])
+    """Return the class that a part's config names: of `PARTS`, by name or a path of any version, or the user's own."""
+    target = part.get("_target_") if isinstance(part, Mapping) else None
+    if not isinstance(target, str):
+        return None
+    path = PATH.fullmatch(target)
+    return own_part(target) if path is None else PARTS.get(path[1])
+
+
+def own_part(target: str) -> Any:
+    """Import what a path names, and return it if a module that is neither installed nor this package's defines it."""
+    top = target.partition(".")[0]
+    try:
+        spec = find_spec(top)  # imports nothing, because the name has no dot
+    except (ImportError, ValueError):
+        return None
+    if spec is None or top == "completesplat":
+        return None
+    places = [spec.origin] if spec.has_location else spec.submodule_search_locations or []
+    if not places or any(_is_installed(Path(str(place)).resolve()) for place in places):
+        return None
+    try:
+        part = get_object(target)
+    except (ImportError, ValueError) as error:
+        raise WeightsError(f"{target}: cannot be imported ({error})") from error
+    # A user's module also holds what it imports from others, which may not be named.
+    return part if str(getattr(part, "__module__", None)).partition(".")[0] == top else None
+
+
+def _is_installed(path: Path) -> bool:
+    libraries = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    return not {"site-packages", "dist-packages"}.isdisjoint(path.parts) or not libraries.isdisjoint(path.parents)
 
 
 def settings_of(kind: Any) -> dict[str, Any]:
@@ -131,30 +161,13 @@ def settings_of(kind: Any) -> dict[str, Any]:
     return hints | dict.fromkeys(hints.keys() & start_weights(kind), NoneType)
 
 
-def read_weights(file: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return a model's config and its tensors by name from `model.safetensors` and the `config.json` beside it.
-
-    Raises:
-        WeightsError: the config cannot be read, `check_architecture` refuses it, or the tensors do not belong to it.
-    """
-    path = file.with_name(CONFIG_FILE)
-    try:
-        architecture = json.loads(read_small(path))
-    except (ValueError, RecursionError) as error:
-        raise WeightsError(f"{path}: not readable as JSON ({error})") from error
-    check_architecture(architecture, path)
-    architecture, tensors = stored_config(architecture), load_file(file)
-    check_sizes(architecture, tensors, (WEIGHTS_FILE, CONFIG_FILE))
-    return architecture, tensors
-
-
 def stored_config(part: Any) -> Any:
-    """Return a part's config as weights store it: classes by name, and without weights that training started from."""
+    """Return a part's config as weights store it: by the classes' names, without weights that training started from."""
     if not isinstance(part, Mapping):
         return part
     kind = class_of(part)
     settings = {name: None if name in start_weights(kind) else stored_config(value) for name, value in part.items()}
-    return settings if kind is None else settings | {"_target_": kind.__name__}
+    return settings | {"_target_": kind.__name__} if kind in PARTS.values() else settings
 
 
 def check_architecture(architecture: object, file: Path | None = None) -> None:
@@ -185,20 +198,37 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
 
 def _check_part(place: str, part: object, allowed: Sequence[type]) -> None:
     kind = class_of(part)
-    if kind not in allowed or not isinstance(part, Mapping):
+    own = kind is not None and kind not in PARTS.values()
+    if not isinstance(part, Mapping) or not (own or kind in allowed):
         target = part.get("_target_") if isinstance(part, Mapping) else part
-        names = ", ".join(kind.__name__ for kind in allowed)
-        raise WeightsError(
-            f"{place} names {printable(target, SHORT)}, which is no part of a model; allowed are {names}"
-        )
-    _check_settings(place, settings_of(kind), {name: value for name, value in part.items() if name != "_target_"})
+        names = ", ".join([*(kind.__name__ for kind in allowed), "classes of your own modules"])
+        reason = f"names {printable(target, SHORT)}, which is no part of a model; allowed are {names}"
+        raise WeightsError(f"{place} {reason}")
+    settings = {name: value for name, value in part.items() if name != "_target_"}
+    if own:
+        return _check_parts_in(place, settings)
+    _check_settings(place, settings_of(kind), settings)
 
 
-def build(part: PartConfig) -> Any:
+def _check_parts_in(place: str, value: object) -> None:
+    """Check the parts in the settings of a user's own class, which may have any settings but Hydra's."""
+    if isinstance(value, Mapping) and "_target_" in value:
+        return _check_part(place, value, tuple(PARTS.values()))
+    settings = dict(enumerate(value)) if isinstance(value, list) else value
+    for name, part in settings.items() if isinstance(settings, Mapping) else ():
+        if name in HYDRA_KEYS:
+            raise WeightsError(f"{place}.{name}: weights cannot store this setting")
+        _check_parts_in(f"{place}.{name}", part)
+
+
+def build(part: Any) -> Any:
     """Build a part, and the parts in it, from a config that `check_architecture` has accepted."""
-    settings = {name: build(value) if isinstance(value, Mapping) else value for name, value in part.items()}
-    del settings["_target_"]
-    return class_of(part)(**settings)
+    if isinstance(part, list):
+        return [build(value) for value in part]
+    if not isinstance(part, Mapping):
+        return part
+    settings = {name: build(value) for name, value in part.items() if name != "_target_"}
+    return class_of(part)(**settings) if "_target_" in part else settings
 
 
 def check_sizes(architecture: Mapping[str, PartConfig], tensors: Mapping[str, Tensor], files: tuple[str, str]) -> None:

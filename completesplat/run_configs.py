@@ -1,27 +1,23 @@
-"""Training runs: their models, and configs whose names are checked before anything is imported or built (SECURITY.md).
+"""Models of weights and runs; `check_names` checks all configs before anything is imported or built (SECURITY.md)."""
 
-A run's config may name all parts of models and data in `conf/`, and the user's modules if the run is the user's or
-trusted (`check_names`).
-"""
-
+import json
 import os
 import re
-import sysconfig
 from collections.abc import Mapping
 from functools import cache, partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import get_object
+from huggingface_hub import constants
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from safetensors.torch import load_file
 from torch import Tensor
 from yaml import YAMLError
 
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import SHORT, printable
-from completesplat.parts import check_architecture, check_sizes, stored_config
+from completesplat.parts import PATH, check_architecture, check_sizes, own_part, stored_config
 from completesplat.scene_model import camera_tensors
 from completesplat.settings.checks import (
     check_image_size,
@@ -32,7 +28,7 @@ from completesplat.settings.checks import (
 )
 from completesplat.settings.options import conf_folder
 from completesplat.settings.schema import check_value
-from completesplat.weights import CAMERA, RUN_CONFIG_FILE, SCENES, first_line, read_small
+from completesplat.weights import CAMERA, CONFIG_FILE, RUN_CONFIG_FILE, RUN_WEIGHTS, SCENES, first_line, read_small
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
 # The classes of runs whose models make scenes from photos: the setting of the model, which begins its tensors' names.
@@ -81,12 +77,30 @@ def read_run_config(checkpoint: Path) -> tuple[Path, dict[str, Any]]:
     return path, plain
 
 
-def read_run(checkpoint: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def read_weights(file: Path, trust: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return a model's config and its tensors by name from `model.safetensors` and the `config.json` beside it.
+
+    Raises:
+        WeightsError: the config is unreadable or refused, or the tensors do not belong to it.
+    """
+    path = file.with_name(CONFIG_FILE)
+    try:
+        architecture = json.loads(read_small(path))
+    except (ValueError, RecursionError) as error:
+        raise WeightsError(f"{path}: not readable as JSON ({error})") from error
+    folder = path.resolve().parent
+    architecture = check_names(architecture, path, folder.parent if folder.name == RUN_WEIGHTS else folder, trust)
+    check_architecture(architecture, path)
+    architecture, tensors = stored_config(architecture), load_file(file)
+    check_sizes(architecture, tensors, (file.name, CONFIG_FILE))
+    return architecture, tensors
+
+
+def read_run(checkpoint: Path, trust: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return a model's config and its tensors by name from a run's checkpoint, averaged tensors if it has such.
 
     Raises:
-        WeightsError: the run's model makes no scene from a photo, has parts that weights may not name, or the
-            checkpoint cannot be read or does not belong to the config.
+        WeightsError: the model makes no scene from a photo, its config is refused, or the checkpoint is not its own.
     """
     path, config = read_run_config(checkpoint)
     model, target = config["model"], printable(config["model"].get("_target_"), SHORT)
@@ -101,7 +115,7 @@ def read_run(checkpoint: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     architecture = {key: x for key, x in settings.items() if key not in ("_target_", "_recursive_")}
     if one_answer:
         architecture = {"network": part, "image_size": config["data"].get("image_size")}
-    architecture = stored_config(architecture)
+    architecture = stored_config(check_names(architecture, path, path.resolve().parent, trust))
     check_architecture(architecture, path)
     contents, name = read_checkpoint(checkpoint), "network." if one_answer else ""
     tensors = {name + k.removeprefix(prefix): x for k, x in contents["state_dict"].items() if k.startswith(prefix)}
@@ -142,14 +156,13 @@ def without_training(config: Any) -> Any:
 
 
 def check_names(config: Any, source: Path, run: Path, trust: bool, name: object = "") -> Any:
-    """Return a plain config from the file `source`, with the present paths of parts that have moved in this package.
+    """Return a plain config from the file `source`, with the present paths of parts that it names by name or old path.
 
     A config may name what `conf/` names for models and data, and optimizers of torch. If the run is trusted or belongs
-    to the user, the config may also name the user's modules, such as those in the working folder.
+    to the user (`_belongs_to_user`), it may also name the user's modules, such as those in the working folder.
 
     Args:
-        run: the run's folder, with links resolved. It belongs to the user who owns it and `source`, if it lies below
-            the working folder.
+        run: the folder of the run, or of weights without a run, with links resolved.
         name: the setting that has the value `config`.
 
     Raises:
@@ -166,18 +179,16 @@ def check_names(config: Any, source: Path, run: Path, trust: bool, name: object 
     # `fit` writes resolved values. References are refused because a resolver can read the environment and more.
     if "${" in value:
         refusal = f"{source}: {printable(value, SHORT)} refers to something else"
-        raise WeightsError(f"{refusal}, which a run's configuration does not")
+        raise WeightsError(f"{refusal}, which a stored configuration does not")
     if name != "_target_" or OPTIMIZER.fullmatch(value):
         return config
-    known, own_name = _known_paths(), value.rpartition(".")[2]
-    if value in known.values():
-        return value
-    if value.startswith("completesplat.") and own_name in known:
-        return known[own_name]
+    path = PATH.fullmatch(value)
+    if path is not None and path[1] in _known_paths():
+        return _known_paths()[path[1]]
     refusal = f"{source} names {printable(value, SHORT)}, which is no part of models or data in this package"
     if not trust and not _belongs_to_user(source, run):
-        raise WeightsError(f"{refusal}; if it is a module of your own, and you trust who made the run: trust=true")
-    if not _is_users_module(value):
+        raise WeightsError(f"{refusal}; if it is a module of your own, and you trust who made the file: trust=true")
+    if own_part(value) is None:
         raise WeightsError(f"{refusal}, and not defined in a module of your own (SECURITY.md)")
     return value
 
@@ -192,31 +203,8 @@ def _known_paths() -> dict[str, str]:
 def _belongs_to_user(file: Path, run: Path) -> bool:
     """Whether the user owns a run below the working folder, and has therefore made it or brought it there.
 
-    The working folder itself must not be the run's, because modules that came with it would pass as the user's.
+    The hub's client brings files into its cache without the user. The working folder itself must not be the run's,
+    because modules that came with it would pass as the user's.
     """
-    return Path.cwd() in run.parents and {run.stat().st_uid, file.stat().st_uid} == {os.getuid()}
-
-
-def _is_users_module(target: str) -> bool:
-    """Whether the module that defines the target is neither part of this package nor installed with Python."""
-    top = target.partition(".")[0]
-    try:
-        spec = find_spec(top)  # imports nothing, because the name has no dot
-    except (ImportError, ValueError):
-        return False
-    if spec is None or top == "completesplat":
-        return False
-    places = [spec.origin] if spec.has_location else spec.submodule_search_locations or []
-    if not places or any(_is_installed(Path(str(place)).resolve()) for place in places):
-        return False
-    try:
-        part = get_object(target)
-    except (ImportError, ValueError) as error:
-        raise WeightsError(f"{target}: cannot be imported ({error})") from error
-    # A user's module also holds what it imports from others, which may not be named.
-    return str(getattr(part, "__module__", None)).partition(".")[0] == top
-
-
-def _is_installed(path: Path) -> bool:
-    libraries = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")}
-    return not {"site-packages", "dist-packages"}.isdisjoint(path.parts) or not libraries.isdisjoint(path.parents)
+    downloaded = Path(constants.HF_HUB_CACHE).resolve() in run.parents
+    return not downloaded and Path.cwd() in run.parents and {run.stat().st_uid, file.stat().st_uid} == {os.getuid()}

@@ -3,6 +3,7 @@
 import copy
 import json
 import math
+import re
 import shutil
 import sys
 from collections.abc import Iterator
@@ -14,7 +15,8 @@ from support import compose_config
 
 from completesplat.errors import WeightsError
 from completesplat.generator import CompleteSplat
-from completesplat.parts import CHOICES, PARTS, check_architecture, settings_of
+from completesplat.parts import CHOICES, PARTS, build, check_architecture, settings_of
+from completesplat.run_configs import check_names
 from completesplat.settings.schema import violations
 from completesplat.weights import CONFIG_FILE, LARGEST_TEXT, SHIPPED, SUMS_FILE
 
@@ -74,17 +76,18 @@ def test_a_configuration_names_nothing_but_parts_of_a_model(folder, trap, place,
     message = refusal(folder)
     assert not trap()
     assert "trap" not in sys.modules
-    assert message.startswith(f"{folder / CONFIG_FILE}: {place.split('.')[0]}")
-    assert "no part of a model" in message or "must be a whole number" in message
+    assert message.startswith(f"{folder / CONFIG_FILE} names ")
+    assert "no part of models" in message
 
 
 @pytest.mark.parametrize(
     ("place", "value", "reason"),
     [
-        ("denoiser._target_", "mine.Mine", "denoiser names mine.Mine, which is no part of a model; allowed are Den"),
-        ("denoiser._target_", "\x1b[2J", r"denoiser names \x1b[2J, which is no part"),
+        ("denoiser._target_", "Encoder", "encoder.Encoder, which is no part of a model; allowed are Denoiser, "),
+        ("denoiser._target_", "torch.optim.Adam", "denoiser names torch.optim.Adam, which is no part of a model"),
+        ("denoiser._target_", ["Denoiser"], "Denoiser'], which is no part of a model"),
         ("sampler._partial_", True, "sampler._partial_: there is no such setting, but scheduler, steps"),
-        ("sampler.steps", "${oc.env:HOME}", "sampler.steps=${oc.env:HOME}: must be a whole number"),
+        ("sampler.steps", "7", "sampler.steps=7: must be a whole number"),
         ("autoreconstructor.pretrained", "some/hub-id", "autoreconstructor.pretrained=some/hub-id: must be null"),
         ("image_size", 1_000_000, "image_size=1000000: must lie between 8 and 1024"),
         (f"{ENCODER}.channels", [10**9] * 4, "must lie between 1 and 8192"),
@@ -104,6 +107,22 @@ def test_settings_are_of_their_kinds_and_within_bounds(folder, place, value, rea
     assert len(message) < 1000
 
 
+@pytest.mark.parametrize(
+    ("target", "reason"),
+    [
+        ("mine.Mine", "names mine.Mine, which is no part of models or data in this package; "),
+        ("\x1b[2J", r"names \x1b[2J, which is no part"),
+        ("${oc.env:HOME}", "${oc.env:HOME} refers to something else"),
+    ],
+)
+def test_names_that_are_not_the_packages_are_refused_in_one_line(folder, target, reason):
+    change(folder, "denoiser._target_", target)
+    message = refusal(folder)
+    assert message.startswith(f"{folder / CONFIG_FILE}")
+    assert reason in message
+    assert message.isprintable()
+
+
 def targets(part: dict) -> list[str]:
     inner = [name for value in part.values() if isinstance(value, dict) for name in targets(value)]
     return [part["_target_"], *inner] if "_target_" in part else inner
@@ -112,6 +131,7 @@ def targets(part: dict) -> list[str]:
 def test_weights_name_classes_by_name_and_their_paths_in_other_versions_count_too(folder):
     assert set(targets(json.loads((folder / CONFIG_FILE).read_text()))) <= PARTS.keys()
     assert any("completesplat.autoreconstructor." in path for path in targets(SHIPPED_CONFIG))
+    assert all(check_names({"_target_": name}, folder, folder, trust=False)["_target_"] for name in PARTS)
     before = CompleteSplat.from_pretrained(folder)
     for place in ("denoiser", ENCODER, SCHEDULER):
         part = reduce(dict.__getitem__, place.split("."), before.architecture)
@@ -146,6 +166,35 @@ def test_a_network_is_not_larger_than_its_file(folder, place, value, tensor):
     message = refusal(folder)
     assert tensor in message
     assert f"by {CONFIG_FILE}" in message
+
+
+HOLDER = """
+class Holder:
+    def __init__(self, network, **held):
+        self.network, self.held = network, held
+"""
+
+
+def test_a_part_of_the_users_own_takes_plain_values_and_parts_in_any_place(tmp_path, monkeypatch):
+    (tmp_path / "holder.py").write_text(HOLDER)
+    monkeypatch.syspath_prepend(tmp_path)
+    part = {"_target_": "holder.Holder", "network": 3, "held": [{"a": {"_target_": "Parameterization"}, "b": [None]}]}
+    check_architecture({"network": part, "image_size": 32})
+    built = build(part)
+    held = built.held["held"][0]
+    assert (type(built).__name__, built.network, held["b"]) == ("Holder", 3, [None])
+    assert type(held["a"]) is PARTS["Parameterization"]
+    for name, value, reason in (
+        ("first_depth", "x", "network.held.0.a.first_depth=x: must be a number"),
+        ("_partial_", True, "network.held.0.a._partial_: there is no such setting"),
+    ):
+        with pytest.raises(WeightsError, match=re.escape(reason)):
+            check_architecture(
+                {"network": changed(part, "held", [{"a": part["held"][0]["a"] | {name: value}}]), "image_size": 32}
+            )
+    with pytest.raises(WeightsError, match=r"network\._partial_: weights cannot store this setting"):
+        check_architecture({"network": part | {"_partial_": True}, "image_size": 32})
+    sys.modules.pop("holder")
 
 
 def settings(part: dict, place: str = "") -> Iterator[str]:

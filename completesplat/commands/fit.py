@@ -25,13 +25,7 @@ from completesplat.files import write_json
 from completesplat.results.measured import evaluation_table
 from completesplat.results.runs import PLAN, read_record
 from completesplat.results.tables import show
-from completesplat.settings.checks import (
-    check_image_size,
-    check_optimizer,
-    check_verb,
-    each_part,
-    remove_start_weights,
-)
+from completesplat.settings.checks import check_image_size, check_optimizer, check_verb, each_part, remove_start_weights
 from completesplat.settings.schema import start_weights
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs

@@ -32,7 +32,7 @@ class TrainedModel:
     """A model with its data: a run's checkpoint, weights, or files of scenes that any program wrote.
 
     `conf/test.yaml` explains the arguments; with `ckpt`, those of its run replace `data` and `rasterizer`.
-    `config_of_run` explains what a run's config may name, and when it needs `trust`.
+    `check_names` explains what configs of runs and weights may name, and when they need `trust`.
     """
 
     ckpt: str | None
@@ -54,7 +54,7 @@ class TrainedModel:
 
     @cached_property
     def model(self) -> SceneModel:
-        return CompleteSplat.from_pretrained(str(self.weights))
+        return CompleteSplat.from_pretrained(str(self.weights), self.trust)
 
     @cached_property
     def files(self) -> "SceneFiles":
@@ -163,7 +163,7 @@ def open_generator(config: Any, images: Sequence[Path]) -> SceneModel:
     reason = ""
     if config.weights == AUTO:
         config.weights, reason = nearest_weights(images, config.background == REMOVE)
-    model = CompleteSplat.from_pretrained(config.weights)
+    model = CompleteSplat.from_pretrained(config.weights, config.trust)
     if config.weights in shipped():
         content = model.architecture["training"]["content"]
         print(f"weights: {config.weights}, which come with the package and know {content}{reason}")

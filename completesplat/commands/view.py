@@ -15,7 +15,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.files import SPLATS, printable
 from completesplat.settings.checks import REMOVE, check_parts
 from completesplat.signals import Interrupted
-from completesplat.weights import AUTO, CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, check_name
+from completesplat.weights import AUTO, CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, shipped
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 KINDS = dict.fromkeys(SPLATS, "scene") | {".ckpt": "weights", ".pth": "weights"}
@@ -27,7 +27,8 @@ AT_STEP = "step {} of the training"
 def run(config: DictConfig, out: Path) -> None:
     """Open the page, fill it and stay until Ctrl-C; with `export`, write it to a file instead.
 
-    The page first says that it is loading, because importing torch takes a second and loading the model longer.
+    The page first says that it is loading, because importing torch takes a second and loading the model longer. The
+    address of a page with the user's own weights is printed when they are open, because they may be refused.
     """
     try:
         import viser  # noqa: F401
@@ -38,17 +39,17 @@ def run(config: DictConfig, out: Path) -> None:
 
     config.update(setting_of_path(Path(config.path)) if config.path is not None else {})
     drawn = config.scene is None and config.watch is None
-    if drawn and config.weights != AUTO and ":" not in config.weights:  # as in `splatter_image:NAME`
-        check_name(config.weights)
+    checked_first = drawn and config.weights not in (AUTO, *shipped())
     server = start_server(0 if config.export is not None else config.port)
-    page = None
+    address, page, step = f"{server.address} (Ctrl-C ends it)", None, None
     try:
-        if config.export is None:
-            print(f"{server.address} (Ctrl-C ends it)", flush=True)
+        if config.export is None and not checked_first:
+            print(address, flush=True)
         page = make_page(server, config, out)
-        step = None
         if config.export is not None:
             return export(page, Path(config.export))
+        if checked_first:
+            print(address, flush=True)
         while True:
             time.sleep(PAUSE)
             if config.watch is not None:

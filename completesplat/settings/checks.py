@@ -80,6 +80,7 @@ class SceneSettings(TypedDict):
     """Settings that `completesplat predict` and `view` share."""
 
     weights: str
+    trust: bool
     skip_weight: Share | None
     guidance_weight: Share
     color_fits: Annotated[int, Range(0, 100)]

@@ -39,10 +39,12 @@ def locate(weights: Path | str) -> Path:
         WeightsError: there is no such folder, a file is missing, or its checksum differs.
     """
     name, path = str(weights), Path(weights).expanduser()
-    check_name(name)
     if name in shipped():
         path = shipped()[name]
-    elif not os.path.exists(path):
+    elif not os.path.exists(path):  # `Path.exists` raises if a name is too long
+        if HUB_ID.fullmatch(name) is None:
+            included = ", ".join(shipped()) or "no weights"
+            raise WeightsError(f"{printable(name)}: no such folder; with the package come {included}")
         path = from_hub(name)
     elif path.is_file() and path.name != WEIGHTS_FILE:
         return path
@@ -55,14 +57,6 @@ def locate(weights: Path | str) -> Path:
             return path / RUN_CHECKPOINT
     check_folder(path)
     return path / WEIGHTS_FILE
-
-
-def check_name(name: str) -> None:
-    """Raise WeightsError for a name that is no file or folder here, no shipped weights, and no id for the hub."""
-    # `Path.exists` raises if a name is too long.
-    if name not in shipped() and not os.path.exists(Path(name).expanduser()) and HUB_ID.fullmatch(name) is None:
-        included = ", ".join(shipped()) or "no weights"
-        raise WeightsError(f"{printable(name)}: no such folder; with the package come {included}")
 
 
 def check_folder(folder: Path) -> None:

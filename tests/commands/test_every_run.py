@@ -104,16 +104,15 @@ def strangers(pipeline, tmp_path):
     return tmp_path / "run"
 
 
-@pytest.mark.parametrize("place", ["model.model.encoder.channels", "model"])
+@pytest.mark.parametrize("place", ["model.model.encoder", "model.model.encoder.channels", "model"])
 def test_a_checkpoint_names_nothing_but_parts_of_a_model(strangers, tmp_path, monkeypatch, place):
     (tmp_path / "trap.py").write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')\nclass Trap: pass\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.chdir(tmp_path)
     config = OmegaConf.load(strangers / "config.yaml")
     OmegaConf.update(config, place, {"_target_": "trap.Trap"}, merge=False)
     OmegaConf.save(config, strangers / "config.yaml")
     for path in (strangers, strangers / "checkpoints/last.ckpt"):
-        with pytest.raises(WeightsError, match=r"trap\.Trap|must be a list"):
+        with pytest.raises(WeightsError, match=r"names trap\.Trap"):
             CompleteSplat.from_pretrained(path)
     assert not (tmp_path / "sprung").exists()
     assert "trap" not in sys.modules
@@ -140,11 +139,11 @@ def test_weights_of_one_answer_name_nothing_foreign(pipeline, tmp_path):
             CompleteSplat.from_pretrained(tmp_path / "weights")
 
 
-def test_a_network_of_the_users_own_is_trained_and_not_exported(tmp_path, caplog, monkeypatch):
+def test_a_network_that_weights_may_not_name_is_trained_and_not_exported(tmp_path, caplog, monkeypatch):
     config = compose_config("fit", "experiment=toy_var", *SMALL, "out=RUN")
     module = instantiate(config.model, _convert_="all")
     monkeypatch.setattr(type(module), "data", SimpleNamespace(image_size=32))
-    module.config = {"model": {"model": {"_target_": "mine.Network"}}}
+    module.config = {"model": {"model": {"_target_": "torch.nn.Identity"}}}
     module.save_weights(tmp_path / "weights")
     assert not (tmp_path / "weights").exists()
-    assert "mine.Network" in caplog.text
+    assert "torch.nn.Identity" in caplog.text

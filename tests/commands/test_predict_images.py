@@ -156,7 +156,7 @@ def test_one_warning_says_that_the_weights_were_not_trained_with_hidden_parts(
     predict, tiny_weights, tmp_path, monkeypatch, facts, times
 ):
     model = model_with(tiny_weights, **facts)
-    monkeypatch.setattr(CompleteSplat, "from_pretrained", lambda _: model)
+    monkeypatch.setattr(CompleteSplat, "from_pretrained", lambda *_: model)
     for name in ("a.png", "b.png"):
         save(tmp_path / "photos" / name)
     finished = predict(tmp_path / "photos", "box=[0,0,0.5,0.5]")

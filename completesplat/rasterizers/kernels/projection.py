@@ -9,15 +9,7 @@ import numpy as np
 
 from completesplat.rasterizers.kernels import array_layout as layout
 from completesplat.rasterizers.kernels.compilation import helper
-from completesplat.rasterizers.kernels.simd import (
-    add_each,
-    choose,
-    columns,
-    gathered_rows,
-    keep,
-    square_root,
-    zeros,
-)  # fmt: skip
+from completesplat.rasterizers.kernels.simd import add_each, choose, columns, gathered_rows, keep, square_root, zeros
 
 ZERO = np.float32(0)
 Array = np.ndarray
