@@ -10,6 +10,8 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from completesplat.imports import importing
+
 if TYPE_CHECKING:
     from completesplat.export.ply import read_ply as read_ply
     from completesplat.export.ply import write_ply as write_ply
@@ -32,7 +34,8 @@ def __getattr__(name: str) -> object:
     """Import a public name when it is first used, so that importing the package does not import torch."""
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+    with importing():
+        return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -28,8 +28,6 @@ REASONS = {
     "baselines/autodecoder.py _load_from_state_dict": "makes room for a checkpoint's codes before they are compared",
     "commands/__init__.py logging.raiseExceptions": "documented: no reports of logging's own errors",
     "commands/__init__.py sys.argv": DURING_JOB,
-    "commands/imports.py _disable_dynamo": "diffusers' functions stay excluded from compilation, as by torch's",
-    "commands/imports.py importlib.metadata.packages_distributions": "diffusers reads all packages when imported",
     "commands/jobs.py sys.argv": DURING_JOB,
     f"data/loading/loader.py {LOADERS}._BaseDataLoaderIter": "the type of `_iterator`, by which Lightning ends workers",
     "data/validation/processes.py _processes": "executors cannot end workers before Python 3.14",

@@ -21,10 +21,10 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from completesplat.commands.imports import importing, postponing
 from completesplat.commands.protocol import git_commit
 from completesplat.errors import CompleteSplatError
 from completesplat.files import UNFINISHED, atomic_path, write_bytes, write_json, writing
+from completesplat.imports import importing, postponing
 from completesplat.settings.checks import check_verb
 from completesplat.settings.composition import resolved_settings, use_working_folder
 from completesplat.settings.options import did_you_mean

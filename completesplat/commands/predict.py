@@ -17,7 +17,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 from torch import Tensor
 
 from completesplat.commands.trained import open_generator, shown_background
@@ -114,9 +114,7 @@ def _names(value: object) -> tuple[str, ...]:
 def predict_images(
     config: DictConfig, model: SceneModel, images: Sequence[Path], wanted: OutputFiles, out: Path
 ) -> None:
-    """Write each image's files into a folder below `out`, with a progress bar, or a line per image without a terminal.
-
-    The background is `shown_background`.
+    """Write each image's files into a folder below `out`, with a progress bar, or a line per step without a terminal.
 
     Raises:
         CompleteSplatError: the only image failed, or some of several, which the message names; the others are written.
@@ -128,20 +126,28 @@ def predict_images(
     wanted = replace(wanted, background=shown_background(config.background, model))
     folders = folder_names(image.stem for image in images)
     with Progress(console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=len(images) * config.samples)
+        steps = 1 + config.samples * (len(wanted.formats) + len(wanted.videos))
+        task = bar.add_task("", total=len(images) * steps)
         for index, (image, folder) in enumerate(zip(images, folders, strict=True)):
             name, start = printable(image.name), time.perf_counter()
-            bar.update(task, description=escape(name), completed=index * config.samples)
-            on_sample = partial(bar.advance, task)
-            predict = partial(_predict, config, model, rasterizer, wanted, image, out / folder, on_sample)
+            begin = partial(_begin, bar, task, name)
+            predict = partial(_predict, config, model, rasterizer, wanted, image, out / folder, begin)
             if not _succeeds(predict, image, is_only=len(images) == 1):
                 failed.append(name)
             elif not console.is_terminal:
                 seconds = f"{time.perf_counter() - start:.0f} s"
                 print(f"{index + 1}/{len(images)} {name}: {out / folder} ({seconds})", flush=True)
+            bar.update(task, completed=(index + 1) * steps)
     if failed:
         share = f"{len(failed)} of {len(images)} images failed ({', '.join(failed)})"
         raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(images) else share)
+
+
+def _begin(bar: Progress, task: TaskID, image: str, step: str, advance: int = 1) -> None:
+    """Show which step of an image begins, on the bar or, if there is none, in a line; `advance` ends earlier steps."""
+    if bar.disable:
+        print(f"{image}: {step}", flush=True)
+    bar.update(task, description=escape(f"{image}: {step}"), advance=advance)
 
 
 def _warn_of_hidden_parts(config: DictConfig, model: SceneModel) -> None:
@@ -203,7 +209,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Outpu
     wanted = replace(wanted, background=shown_background(config.background, model))
     rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / safe_name(images[0].stem)
     shot = Shot(scene, views.cameras[0], model.up)
-    write_prediction(folder, views.images[0], [shot], rasterizer, wanted, recorded)
+    write_prediction(folder, views.images[0], [shot], rasterizer, wanted, recorded, partial(print, flush=True))
     print(f"one scene of {len(images)} images, at the posterior's mean: {folder}")
 
 
@@ -214,7 +220,7 @@ def _predict(
     wanted: OutputFiles,
     image: Path,
     folder: Path,
-    on_sample: Callable[[], None],
+    begin: Callable[..., None],
 ) -> None:
     photograph = model.read(image, config.fov, config.background == REMOVE)
     visible = visible_part(config, image, model.image_size)
@@ -227,6 +233,7 @@ def _predict(
         settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
         settings["steps"] = model.sampler.steps if config.steps is None else config.steps
         sampler = {"sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2]}
+    begin(f"drawing {config.samples} sample{'s' if config.samples > 1 else ''}", advance=0)
     scenes = model(photograph, visible, batch=config.batch, **settings)
     recorded = {
         **settings,
@@ -247,7 +254,7 @@ def _predict(
     if model.background is not None:  # images of objects, whose centre is in the middle of the depth range
         wanted = replace(wanted, pivot_depth=model.middle_depth(model.depth_range_of(photograph)))
     shots = [Shot(scene, camera, model.up) for scene in scenes]
-    write_prediction(folder, visible_image, shots, rasterizer, wanted, recorded, on_sample)
+    write_prediction(folder, visible_image, shots, rasterizer, wanted, recorded, begin)
 
 
 def photo_warnings(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]:

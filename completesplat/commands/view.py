@@ -9,10 +9,10 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from completesplat.commands.imports import importing, postponing
 from completesplat.commands.jobs import is_running
 from completesplat.errors import CompleteSplatError
 from completesplat.files import SPLATS, printable
+from completesplat.imports import importing, postponing
 from completesplat.settings.checks import REMOVE, check_parts
 from completesplat.signals import Interrupted
 from completesplat.weights import AUTO, CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, shipped

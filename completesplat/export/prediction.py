@@ -16,6 +16,7 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
 from completesplat.export.formats import FORMATS, write_formats
+from completesplat.export.formats import suffix as format_suffix
 from completesplat.export.images import (
     SheetCell,
     color_depth,
@@ -138,7 +139,7 @@ def write_prediction(
     rasterizer: Rasterizer,
     wanted: OutputFiles,
     settings: Mapping[str, Any],
-    on_sample: Callable[[], None] = lambda: None,
+    on_file: Callable[[str], None] = lambda name: None,
 ) -> None:
     """Write `sample_00.ply`, `orbit_00.mp4`, ..., `sheet.png` and `scene.json`.
 
@@ -146,7 +147,7 @@ def write_prediction(
         image: the input image.
         shots: the samples, all with the image's camera; broken Gaussians are left out, with a warning.
         settings: recorded in `scene.json`; must hold the seed and the image's name.
-        on_sample: called after the files of each sample are written.
+        on_file: called with the name of each scene's file and video before it is written.
 
     Raises:
         CompleteSplatError: all Gaussians of a sample are broken, or a converter fails.
@@ -160,11 +161,11 @@ def write_prediction(
     files: dict[str, str] = {}
     for i, shot in enumerate(shots):
         comments = [*(f"{name} {value}" for name, value in settings.items()), f"sample {i}"]
-        around, depth, written = write_scene(folder, f"sample_{i:02}", f"_{i:02}", shot, rasterizer, wanted, comments)
+        name, number = f"sample_{i:02}", f"_{i:02}"
+        around, depth, written = write_scene(folder, name, number, shot, rasterizer, wanted, comments, on_file)
         views.append(around)
         depths.append(depth)
         files |= written
-        on_sample()
     title = f"{settings['image']}: views around each sample"
     contact_sheet(folder / "sheet.png", title, image, torch.stack(views), torch.stack(depths))
     recorded = {**settings, "gaussians": [scene.count for scene in scenes], "up": shots[0].up.tolist()}
@@ -227,6 +228,7 @@ def write_scene(
     rasterizer: Rasterizer,
     wanted: OutputFiles,
     comments: Sequence[str],
+    on_file: Callable[[str], None] = lambda name: None,
 ) -> tuple[Frames, Float[Tensor, "1 height width"], dict[str, str]]:
     """Write a scene's splats (`NAME.ply`, ...) in the units of files, and videos (`orbitSUFFIX.mp4`).
 
@@ -238,9 +240,13 @@ def write_scene(
     dilated = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
     stored, camera = shot.units.stored(dilated, reference)
     view = PageView(camera, shot.units.points(pivot), shot.up, wanted.background)
-    files = write_formats(folder, name, stored, wanted.formats, view, wanted.converter, comments, rasterizer)
+    files: dict[str, str] = {}
+    for kind in wanted.formats:
+        on_file(name + format_suffix(kind))
+        files |= write_formats(folder, name, stored, [kind], view, wanted.converter, comments, rasterizer)
     for kind in wanted.videos:
         files[f"{kind}{suffix}"] = f"{kind}{suffix}.mp4"
+        on_file(f"{kind}{suffix}.mp4")
         cameras = PATHS[kind](reference, pivot, shot.up, wanted.frames)
         frames, _ = render_views(rasterizer, scene, cameras, wanted.background)
         write_video(folder / f"{kind}{suffix}.mp4", frames)

@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.export.images import enlarge, to_pixels
+from completesplat.export.images import to_pixels
 from completesplat.files import atomic_path
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -61,14 +62,14 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
         raise ValueError(f"{path}: a video needs at least one frame and a name that ends in .mp4")
     height, width = frames.shape[-2:]
     factor = -(-SMALLEST_SIDE // min(height, width))
-    tall, wide = height * factor, width * factor
     with atomic_path(path) as temporary:
         options = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p", "macro_block_size": 2}
+        options["output_params"] = ["-preset", "veryfast"]  # two fifths of the default's time; files of about its size
         with imageio.get_writer(temporary, format="FFMPEG", fps=fps, **options) as writer:  # type: ignore[arg-type]
             for frame in frames:
-                large = enlarge(frame, factor)
-                padded = torch.nn.functional.pad(large[None], (0, wide % 2, 0, tall % 2), mode="replicate")[0]
-                writer.append_data(to_pixels(padded))  # type: ignore[attr-defined]
+                large = to_pixels(frame).repeat(factor, axis=0).repeat(factor, axis=1)
+                padded = np.pad(large, ((0, len(large) % 2), (0, large.shape[1] % 2), (0, 0)), mode="edge")
+                writer.append_data(padded)  # type: ignore[attr-defined]
         # ffmpeg is another process, and imageio does not pass on its errors.
         if not _is_whole(temporary):
             raise RuntimeError(f"{path}: was not written to its end")

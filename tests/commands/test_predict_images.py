@@ -13,6 +13,7 @@ import pytest
 import torch
 from fake_converter import calls, install
 from PIL import Image
+from rich.progress import Progress
 from support import compose_config, some_gaussians, strict_json
 
 from completesplat.commands.predict import find_images, output_files, photo_warnings, run, unusual_field_of_view
@@ -89,6 +90,25 @@ def test_images_of_any_name_are_written_below_out(predict, tmp_path, monkeypatch
     recorded = {strict_json(folder / "scene.json")["settings"]["image"] for folder in folders}
     assert {"...png", "\\udcff.png", "new\\nline.png"} < recorded
     assert "\x1b[31m" not in finished.out
+
+
+@pytest.mark.parametrize("terminal", ["0", "1"])
+def test_each_scene_file_and_video_is_announced_in_a_line_or_on_the_bar_of_a_terminal(
+    predict, tmp_path, monkeypatch, terminal
+):
+    monkeypatch.setenv("TTY_COMPATIBLE", terminal)
+    monkeypatch.setattr(Progress, "update", lambda bar, task, **new: steps.append((bar.disable, new)))
+    steps: list[tuple[bool, dict[str, object]]] = []
+    for name in ("a.png", "[b].png"):
+        save(tmp_path / "x" / name)
+    finished = predict(tmp_path / "x", "formats=[ply,splat]", "video=[orbit,swipe]")
+    files = ["drawing 1 sample", "sample_00.ply", "sample_00.splat", "orbit_00.mp4", "swipe_00.mp4"]
+    begun = [f"{name}: {file}" for name in ("[b].png", "a.png") for file in files]
+    shown = [str(new["description"]).replace("\\[", "[") for _, new in steps if "description" in new]
+    lines = [line for line in finished.out.splitlines() if line in begun]
+    assert (shown, lines) == (begun, [] if terminal == "1" else begun)
+    assert sum(int(new.get("advance", 0)) for _, new in steps) == 2 * 4
+    assert [new["completed"] for _, new in steps if "completed" in new] == [5, 10]
 
 
 @pytest.mark.processes

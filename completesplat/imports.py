@@ -1,16 +1,12 @@
-"""Imports of commands: without the garbage collector, and without modules that no prediction uses."""
+"""Imports of heavy libraries: without the garbage collector, and without modules that no prediction uses."""
 
 import gc
-import importlib.metadata
 import sys
-from collections import UserDict
-from collections.abc import Callable, Iterator, MutableSequence
+from collections.abc import Iterator, MutableSequence
 from contextlib import contextmanager
-from functools import cached_property
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from importlib.metadata import packages_distributions
 from importlib.util import spec_from_loader
 from types import ModuleType
 from typing import Any
@@ -22,39 +18,37 @@ POSTPONED = ("requests", *SCIPY, "torch._dynamo", "torch.distributed._functional
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Pause the garbage collector during imports, because it took a fifth of a prediction's time.
+    """Pause the garbage collector during imports, because it took a third of the time from the first to the exit.
 
     The objects that exist after the first import of torch are frozen: the collector does not examine them again.
     """
-    before = "torch" in sys.modules
+    before, enabled = "torch" in sys.modules, gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
         if not before and "torch" in sys.modules:
             gc.freeze()
-        gc.enable()
+        if enabled:
+            gc.enable()
 
 
 @contextmanager
 def postponing() -> Iterator[None]:
-    """Put stand-ins for `POSTPONED` into `sys.modules`, because these modules took half of the time of imports.
+    """Put stand-ins for `POSTPONED` into `sys.modules`.
 
-    This is the only place with stand-ins. It stays until `bench startup` finds that a first scene takes at most 0.3
-    times `import torch` longer without it.
-
+    This is the only place with stand-ins. Lazy imports cannot replace it: each module of diffusers imports
+    `diffusers.utils`, and this imports `torch._dynamo` (notebooks/experiments.md, "The first scene").
     The first use of a stand-in imports the real module. Afterwards `sys.modules` holds the real modules or none.
-    Only for commands that compile no network: diffusers' blocks are not marked for torch.compile (`allow_in_graph`).
+    Only for commands that compile no network: nothing is marked for torch.compile (`allow_in_graph`, `disable`).
     """
     finder, stand_ins = _Submodules(), {name: _StandIn(name) for name in POSTPONED}
-    vars(stand_ins["torch._dynamo"]).update(allow_in_graph=lambda marked: marked, disable=_disable)
+    vars(stand_ins["torch._dynamo"]).update(allow_in_graph=_unmarked, disable=_unmarked)
     sys.modules.update({name: stand_in for name, stand_in in stand_ins.items() if name not in sys.modules})
     sys.meta_path.append(finder)
-    importlib.metadata.packages_distributions = _Distributions
     try:
         yield
     finally:
-        importlib.metadata.packages_distributions = packages_distributions
         sys.meta_path.remove(finder)
         for name, stand_in in stand_ins.items():
             if sys.modules.get(name) is stand_in:
@@ -67,22 +61,8 @@ def _real(name: str) -> ModuleType:
     return import_module(name)
 
 
-def _disable(function: Callable[..., Any] | None = None, recursive: bool = True, **settings: Any) -> Any:
-    """Exclude a function from compilation when it is called first, as torch does with functions of its own."""
-    import torch
-
-    if "wrapping" in settings:  # torch does so now
-        return _real("torch._dynamo").disable(function, recursive, **settings)
-    return torch._disable_dynamo(function, recursive)  # type: ignore[attr-defined]
-
-
-class _Distributions(UserDict[str, list[str]]):
-    """`packages_distributions`, but the records of all installed packages are read when one is looked up."""
-
-    data = cached_property(lambda self: packages_distributions())  # type: ignore[assignment]
-
-    def __init__(self) -> None:
-        pass
+def _unmarked(marked: Any = None, *settings: object, **options: object) -> Any:
+    return _unmarked if marked is None else marked
 
 
 class _StandIn(ModuleType):
