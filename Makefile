@@ -34,7 +34,8 @@ demo: $(READY) ## Complete four images with the weights in the package, and scor
 	cp `$(BIN)/python -c "import skimage; print(skimage.__path__[0])"`/data/coffee.png $(DEMO)/photograph.png
 	$(BIN)/completesplat predict image=$(DEMO)/fruit.jpg weights=fruits out=$(DEMO)
 	$(BIN)/completesplat predict image=$(DEMO)/couch.jpg weights=rendered_couches out=$(DEMO)
-	$(BIN)/completesplat predict 'image=[$(DEMO)/toy.jpg,$(DEMO)/photograph.png]' weights=toy_objects out=$(DEMO)
+	$(BIN)/completesplat predict image=$(DEMO)/toy.jpg weights=toy_objects out=$(DEMO)
+	$(BIN)/completesplat predict image=$(DEMO)/photograph.png weights=general out=$(DEMO)
 	$(BIN)/completesplat test weights=toy_objects data=toy_objects data.root=$(DEMO)/data out=$(DEMO)/test
 	@echo
 	@echo "In $(DEMO):"
@@ -42,7 +43,7 @@ demo: $(READY) ## Complete four images with the weights in the package, and scor
 	@echo "                sample_0*.ply open in any splat viewer, orbit_0*.mp4 in any player"
 	@echo "  couch/        the same for a rendered couch that training never saw"
 	@echo "  toy/          the same for a toy scene that training never saw"
-	@echo "  photograph/   the same for a photograph of a cup, which no weights in the package understand"
+	@echo "  photograph/   the same for a photograph of a cup, by weights that have seen no photograph: it keeps its front"
 	@echo "  test/         metrics.json: scores of one sample for each held-out toy scene, beside naive predictors"
 	@echo "Next: $(BIN)/completesplat predict image=FILE, and make demo-train for both stages of training"
 
