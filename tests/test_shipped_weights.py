@@ -1,8 +1,10 @@
 """The weights that come with the package: whole, small, and better than guessing on scenes never seen."""
 
 import os
+from pathlib import Path
 
 import pytest
+import skimage
 import torch
 from support import strict_json
 
@@ -40,6 +42,17 @@ def test_samples_agree_with_the_photo_in_front_and_differ_behind(name, backgroun
     front, behind = images[:, 0], images[:, 1]
     assert psnr(front, photo.image.expand(4, -1, -1, -1)).min() > 24
     assert behind.std(0).mean() > 1.5 * front.std(0).mean()
+
+
+def test_a_photo_of_anything_keeps_its_front_and_gets_depth():
+    """A cup, and no photograph in training: the input view, without fitting, and a relief."""
+    model = CompleteSplat.from_pretrained(GENERAL)
+    photo = model.read(Path(skimage.__file__).parent / "data/coffee.png")
+    (scene,) = model(photo)
+    rendering = TiledRasterizer()(scene[None], model.camera(photo)[None, None])
+    assert psnr(rendering.over(0.5)[0], photo.image[None]).item() > 20
+    depth = rendering.depth[0, 0, 0]
+    assert depth[24:40, 24:40].mean() < depth[:6].mean() - 0.3
 
 
 def test_samples_fit_the_image_they_are_drawn_for(tmp_path, monkeypatch):
