@@ -71,7 +71,7 @@ class TrainingImages(TypedDict, total=False):
     content: str
     box_masks: Share
     background: Share
-    depth_before: Annotated[float, Range(1e-6, 1e6)]
+    depth_before: Annotated[float, Range(0, 1e6)]
     picture_mean: Annotated[Sequence[Share], Entries(8, 8)]
     picture_std: Annotated[Sequence[Annotated[float, Range(1e-6, 1)]], Entries(8, 8)]
 

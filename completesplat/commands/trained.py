@@ -145,7 +145,7 @@ def nearest_weights(images: Sequence[Path], remove_background: bool) -> tuple[st
             far = f"{distance:.1f} standard deviations{''.join(f', {other} {x:.1f}' for other, x in others)}"
             far += "".join(f", {other} needs a plain background" for other in shipped() if other not in distances)
             photo = f"{'the first image, ' if len(images) > 1 else ''}{printable(image.name)}"
-            return name, f"; their training images are the likest to {photo} ({far})"
+            return name, f"; their training images are most like {photo} ({far})"
     name, *names = shipped()
     return name, f"; there is no image to choose by (weights=NAME takes others: {', '.join(names)})"
 

@@ -42,10 +42,10 @@ def test_the_nearest_to_the_first_image_that_can_be_read_are_chosen_and_the_othe
     assert name == "greens"
     # Two of eight features differ by 1 from the other weights' mean, and deviations are 0.1: sqrt(2 / 8) / 0.1 = 5.
     distances = "(0.0 standard deviations, blues 5.0, reds 5.0)"
-    assert reason == f"; their training images are the likest to lime.png {distances}"
+    assert reason == f"; their training images are most like lime.png {distances}"
     name, reason = nearest_weights([tmp_path / "broken.png", tmp_path / "gone.png", red, green], False)
     assert name == "reds"
-    assert "likest to the first image, red.png (0.0" in reason
+    assert "most like the first image, red.png (0.0" in reason
     name, reason = nearest_weights([tmp_path / "broken.png"], False)
     assert (name, reason) == ("blues", "; there is no image to choose by (weights=NAME takes others: greens, reds)")
     package.clear()
@@ -94,7 +94,7 @@ def test_the_default_chooses_and_says_so_in_one_line(command, tmp_path):
     finished = command.succeeds("predict", f"image={COUCH}", f"out={tmp_path / 'out'}", *quick)
     (line,) = [line for line in finished.out.splitlines() if line.startswith("weights: ")]
     assert line.startswith("weights: rendered_couches, which come with the package and know renders of ")
-    assert "likest to held_out.jpg (" in line
+    assert "most like held_out.jpg (" in line
     assert all(name in line for name in shipped())
     assert strict_json(tmp_path / "out/held_out/scene.json")["settings"]["weights"] == "rendered_couches"
 
