@@ -57,7 +57,8 @@ def test_weights_of_anything_are_for_images_that_are_like_no_others(package, tmp
     config = json.loads((package["blues"] / "config.json").read_text())
     config["training"] = {"picture_mean": [0.5] * 3 + [0.0] * 5, "picture_std": [0.5] * 8}
     (package["blues"] / "config.json").write_text(json.dumps(config))
-    for color, chosen, distances in (("red", "reds", [0.0, 0.6, 5.0]), ("black", "blues", [0.6, 3.5, 3.5])):
+    # For the darker red the others are nearer, but its own are likelier.
+    for color, chosen, distances in (("#b70000", "reds", [1.0, 0.5, 4.4]), ("black", "blues", [0.6, 3.5, 3.5])):
         found = distances_to_shipped(photo(tmp_path / "photo.png", color))
         assert next(iter(found)) == chosen
         assert list(found.values()) == pytest.approx(distances, abs=0.05)
