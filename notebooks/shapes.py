@@ -1,20 +1,27 @@
 """Scenes of random solids with random pictures on them, anywhere, as captures (experiments.md, "Anything").
 
-python notebooks/shapes.py OUT SCENES SEED
+python notebooks/shapes.py OUT SCENES SEED [SIZE]
 
-Solids are composed as in LRM-Zero (arXiv 2406.09371), pictures are dead leaves (Lee, Mumford and Huang, IJCV 2001) with
+With CuPy, rays are traced on a GPU. Solids are composed as in LRM-Zero (arXiv 2406.09371), pictures are dead leaves (Lee, Mumford and Huang, IJCV 2001) with
 noise. Behind the solids there is one colour, a ground below a dome, or a room. Nothing here is a photograph.
 """
 
 import json
+import os
 import sys
+from contextlib import suppress
 from multiprocessing import Pool
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-SIZE, SAMPLES, FRAMES, PICTURES, PICTURE = 64, 2, 16, 300, 128
+xp = np
+with suppress(ImportError):
+    import cupy as xp
+
+SIZE = int(sys.argv[4]) if len(sys.argv) > 4 else 64
+SAMPLES, FRAMES, PICTURES, PICTURE = 2, 16, 300, 2 * SIZE
 BALL, CYLINDER, CUBE = 0, 1, 2
 
 
@@ -49,7 +56,7 @@ def draw_picture(rng):
 
 def look_up(pictures, index, u, v):
     u, v = (u % 1) * PICTURE, (v % 1) * PICTURE
-    return pictures[index, v.astype(int) % PICTURE, u.astype(int) % PICTURE]
+    return pictures[int(index), v.astype(int) % PICTURE, u.astype(int) % PICTURE]
 
 
 class Solids:
@@ -107,64 +114,62 @@ class Solids:
             points.append(center + (p * half) @ axes.T)
         return np.concatenate(points)
 
-    def hit(self, origin, rays):
+    def hit(self, origins, rays):
         """Return distance [n], part [n] (-1: none), local point and world normal [n 3] of the nearest hits."""
         n = len(rays)
-        nearest, which = np.full(n, np.inf, np.float32), np.full(n, -1)
-        local, normal = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
+        nearest, which = xp.full(n, np.inf, np.float32), xp.full(n, -1)
+        local, normal = xp.zeros((n, 3), np.float32), xp.zeros((n, 3), np.float32)
         for number, (kind, half, axes, center, taper, _) in enumerate(self.parts):
-            inverse = (axes / half).T
-            o = ((origin - center) @ inverse.T).astype(np.float32)
+            inverse = xp.asarray((axes / half).T)
+            o = ((origins - xp.asarray(center)) @ inverse.T).astype(np.float32)
             d = (rays @ inverse.T).astype(np.float32)
-            o = np.broadcast_to(o, d.shape)
             with np.errstate(all="ignore"):
                 t, ln = INTERSECT[kind](o, d, taper)
             better = t < nearest
-            nearest[better], which[better] = t[better], number
-            local[better] = (o + t[:, None] * d)[better]
-            world = ln[better] @ inverse
-            normal[better] = world / np.linalg.norm(world, axis=1, keepdims=True)
+            nearest, which = xp.where(better, t, nearest), xp.where(better, number, which)
+            local = xp.where(better[:, None], o + xp.where(better, t, 0)[:, None] * d, local)
+            world = (ln @ inverse).astype(np.float32)
+            length = xp.maximum(xp.linalg.norm(world, axis=1, keepdims=True), 1e-9)
+            normal = xp.where(better[:, None], world / length, normal)
         return nearest, which, local, normal
 
 
 def _ball(o, d, taper):
     a, b, c = (d * d).sum(1), (o * d).sum(1), (o * o).sum(1) - 1
     square = b * b - a * c
-    t = (-b - np.sqrt(np.maximum(square, 0))) / a
-    t = np.where((square > 0) & (t > 1e-4), t, np.inf)
-    return t, o + np.where(np.isfinite(t), t, 0)[:, None] * d
+    t = (-b - xp.sqrt(xp.maximum(square, 0))) / a
+    t = xp.where((square > 0) & (t > 1e-4), t, np.inf)
+    return t, o + xp.where(xp.isfinite(t), t, 0)[:, None] * d
 
 
 def _cube(o, d, taper):
     middle, half = -o / d, abs(1 / d)
     enter, leave = middle - half, middle + half
     face, t = enter.argmax(1), enter.max(1)
-    t = np.where((t <= leave.min(1)) & (t > 1e-4), t, np.inf)
-    n = np.zeros_like(o)
-    n[np.arange(len(o)), face] = -np.sign(d[np.arange(len(o)), face])
-    return t, n
+    t = xp.where((t <= leave.min(1)) & (t > 1e-4), t, np.inf)
+    return t, -xp.sign(d) * (face[:, None] == xp.arange(3))
 
 
 def _cylinder(o, d, taper):
-    best, n = np.full(len(o), np.inf, np.float32), np.zeros_like(o)
+    best, n = xp.full(len(o), np.inf, np.float32), xp.zeros_like(o)
     a = d[:, 0] ** 2 + d[:, 2] ** 2 - (taper * d[:, 1]) ** 2
     side = 1 + taper * o[:, 1]
     b = o[:, 0] * d[:, 0] + o[:, 2] * d[:, 2] - taper * d[:, 1] * side
     c = o[:, 0] ** 2 + o[:, 2] ** 2 - side**2
     square = b * b - a * c
-    root = np.sqrt(np.maximum(square, 0))
+    root = xp.sqrt(xp.maximum(square, 0))
     for sign in (-1, 1):
         t = (-b + sign * root) / a
         p = o + t[:, None] * d
         good = (square > 0) & (t > 1e-4) & (t < best) & (abs(p[:, 1]) <= 1)
-        best = np.where(good, t, best)
-        n[good] = np.stack([p[:, 0], -taper * (1 + taper * p[:, 1]), p[:, 2]], 1)[good]
+        best = xp.where(good, t, best)
+        n = xp.where(good[:, None], xp.stack([p[:, 0], -taper * (1 + taper * p[:, 1]), p[:, 2]], 1), n)
     for cap in (-1.0, 1.0):
         t = (cap - o[:, 1]) / d[:, 1]
         p = o + t[:, None] * d
-        good = (t > 1e-4) & (t < best) & (np.hypot(p[:, 0], p[:, 2]) <= 1 + taper * cap)
-        best = np.where(good, t, best)
-        n[good] = np.array([0, cap, 0])
+        good = (t > 1e-4) & (t < best) & (xp.hypot(p[:, 0], p[:, 2]) <= 1 + taper * cap)
+        best = xp.where(good, t, best)
+        n = xp.where(good[:, None], xp.asarray([0, cap, 0]), n)
     return best, n
 
 
@@ -193,55 +198,55 @@ class Scene:
         self.tone = rng.uniform(0.8, 1.15, 3) * rng.uniform(0.75, 1.2)
 
     def brightness(self, points, normals):
-        direct = np.maximum(0, normals @ self.light)
+        direct = xp.maximum(0, normals @ xp.asarray(self.light))
         t = self.towards_light(points + 2e-3 * normals)
-        direct = np.where(np.isfinite(t), self.shadow * 0.5, 1) * direct
+        direct = xp.where(xp.isfinite(t), self.shadow * 0.5, 1) * direct
         return (self.ambient * (0.85 + 0.15 * normals[:, 1]) + (1 - self.ambient) * 1.4 * direct)[:, None]
 
     def towards_light(self, points):
         """Return how far the solids are from points on the way to the light; points far from the object see it."""
-        near = np.linalg.norm(points, axis=1) < 2.5
-        distances = np.full(len(points), np.inf, np.float32)
+        near = xp.linalg.norm(points, axis=1) < 2.5
+        distances = xp.full(len(points), np.inf, np.float32)
         points, t = points[near], distances[near]
         for kind, half, axes, center, taper, _ in self.solids.parts:
             inverse = (axes / half).T
-            o = ((points - center) @ inverse.T).astype(np.float32)
-            d = np.broadcast_to((inverse @ self.light).astype(np.float32), o.shape)
+            o = ((points - xp.asarray(center)) @ xp.asarray(inverse).T).astype(np.float32)
+            d = xp.broadcast_to(xp.asarray((inverse @ self.light).astype(np.float32)), o.shape)
             with np.errstate(all="ignore"):
-                t = np.minimum(t, INTERSECT[kind](o, d, taper)[0])
+                t = xp.minimum(t, INTERSECT[kind](o, d, taper)[0])
         distances[near] = t
         return distances
 
-    def colors(self, origin, rays):
+    def colors(self, origins, rays):
         """Return colours [n 3] along rays of unit length, and whether they meet a solid."""
-        t, part, local, normal = self.solids.hit(origin, rays)
-        colors = np.zeros((len(rays), 3), np.float32)
+        t, part, local, normal = self.solids.hit(origins, rays)
+        colors = xp.zeros((len(rays), 3), np.float32)
         for number, (kind, half, *_, (picture, scale, offset)) in enumerate(self.solids.parts):
             chosen = part == number
-            p = local[chosen] * half / 0.57
+            here = local[chosen]
+            p = here * xp.asarray(half / 0.57)
             if kind == CUBE:
-                face = np.abs(local[chosen]).argmax(1)
-                uv = np.where(
-                    (face == 0)[:, None], p[:, [2, 1]], np.where((face == 1)[:, None], p[:, [0, 2]], p[:, :2])
-                )
+                face = xp.abs(here).argmax(1)[:, None]
+                uv = xp.where(face == 0, p[:, [2, 1]], xp.where(face == 1, p[:, [0, 2]], p[:, :2]))
             else:
-                flat = (kind == CYLINDER) & (np.abs(local[chosen][:, 1]) > 0.999)
-                around = np.arctan2(local[chosen][:, 0], local[chosen][:, 2]) * max(half[0], half[2]) / 0.57
-                uv = np.where(flat[:, None], p[:, [0, 2]], np.stack([around, p[:, 1]], 1))
-            u, v = (uv * scale + offset).T
+                flat = (kind == CYLINDER) & (xp.abs(here[:, 1:2]) > 0.999)
+                around = xp.arctan2(here[:, 0], here[:, 2]) * (max(half[0], half[2]) / 0.57)
+                uv = xp.where(flat, p[:, [0, 2]], xp.stack([around, p[:, 1]], 1))
+            u, v = (uv * scale + xp.asarray(offset)).T
             colors[chosen] = look_up(self.pictures, picture, u, v)
         hit = part >= 0
-        points = origin + np.where(hit, t, 0)[:, None] * rays
-        colors[hit] *= self.brightness(points[hit], normal[hit])
-        colors[~hit] = self.behind(origin, rays[~hit])
-        return np.clip(colors * (1 if self.kind in ("white", "plain") else self.tone), 0, 1), hit
+        points = (origins + xp.where(hit, t, 0)[:, None] * rays)[hit]
+        colors[hit] *= self.brightness(points, normal[hit])
+        colors[~hit] = self.behind(origins[~hit], rays[~hit])
+        return xp.clip(colors * (1 if self.kind in ("white", "plain") else xp.asarray(self.tone)), 0, 1), hit
 
-    def behind(self, origin, rays):
+    def behind(self, origins, rays):
         """Return the colours of rays that meet no solid."""
         if self.kind in ("white", "plain"):
-            return np.broadcast_to(self.plain, rays.shape)
-        o, d = self.turn @ origin, rays @ self.turn.T
-        best, face = np.full(len(d), np.inf), np.zeros(len(d), int)
+            return xp.broadcast_to(xp.asarray(self.plain), rays.shape)
+        turn = xp.asarray(self.turn)
+        o, d = origins @ turn.T, rays @ turn.T
+        best, face = xp.full(len(d), np.inf), xp.zeros(len(d), int)
         with np.errstate(all="ignore"):
             planes = [(1, self.floor, 0)]
             if self.kind == "room":
@@ -253,40 +258,42 @@ class Scene:
                     (2, self.room[1][1], 5),
                 ]
             for axis, place, number in planes:
-                t = (place - o[axis]) / d[:, axis]
+                t = (place - o[:, axis]) / d[:, axis]
                 # Walls between the camera and the object are left out, so that cameras may stand outside.
-                good = (t > 1e-3) & (t < best) & ((d[:, axis] > 0) == (place > 0))
-                best[good], face[good] = t[good], number
-        b, c = d @ o, o @ o - (self.dome_radius + max(0, np.linalg.norm(o) - self.dome_radius + 0.3)) ** 2
-        dome = -b + np.sqrt(np.maximum(b * b - c, 0)) if self.kind == "ground" else np.inf
-        sky = best > dome
-        best = np.where(sky, dome, best)
+                good = (t > 1e-3) & (t < best) & ((d[:, axis] > 0) == bool(place > 0))
+                best, face = xp.where(good, t, best), xp.where(good, number, face)
+        far = xp.linalg.norm(o, axis=1)
+        b, c = (d * o).sum(1), far**2 - (self.dome_radius + xp.maximum(0, far - self.dome_radius + 0.3)) ** 2
+        dome = -b + xp.sqrt(xp.maximum(b * b - c, 0))
+        sky = (best > dome) & (self.kind == "ground")
+        best = xp.where(sky, dome, best)
         p = o + best[:, None] * d
-        colors, normals = np.zeros(d.shape, np.float32), np.zeros(d.shape)
+        colors, normals = xp.zeros(d.shape, np.float32), xp.zeros(d.shape)
         for number in range(6):
             chosen = (face == number) & ~sky
             picture, scale, offset = self.wall_looks[number]
             axes = [0, 2] if number < 2 else ([2, 1] if number < 4 else [0, 1])
-            u, v = (p[chosen][:, axes] * scale + offset).T
+            u, v = (p[chosen][:, axes] * scale + xp.asarray(offset)).T
             colors[chosen] = look_up(self.pictures, picture, u, v)
             normals[chosen, [1, 1, 0, 0, 2, 2][number]] = [1, -1, 1, -1, 1, -1][number]
-        world = p @ self.turn
-        colors[~sky] *= self.brightness(world[~sky], (normals @ self.turn)[~sky])
-        q = p[sky] / np.linalg.norm(p[sky], axis=1, keepdims=True)
-        picture, scale, offset = self.wall_looks[6]
-        colors[sky] = look_up(
-            self.pictures,
-            picture,
-            np.arctan2(q[:, 0], q[:, 2]) * scale + offset[0],
-            np.arcsin(np.clip(q[:, 1], -1, 1)) * scale + offset[1],
-        )
+        colors[~sky] *= self.brightness((p @ turn)[~sky], (normals @ turn)[~sky])
+        q = p[sky] / xp.linalg.norm(p[sky], axis=1, keepdims=True)
+        picture, scale, (across, up) = self.wall_looks[6]
+        u, v = xp.arctan2(q[:, 0], q[:, 2]), xp.arcsin(xp.clip(q[:, 1], -1, 1))
+        colors[sky] = look_up(self.pictures, picture, u * scale + across, v * scale + up)
         return colors
+
+
+def _on_host(array):
+    return array if xp is np else xp.asnumpy(array)
 
 
 def write_scene(job):
     """Write one capture: images, masks, `transforms.json` and points of the surface."""
     out, seed, index = job
     rng = np.random.default_rng([seed, index])
+    if isinstance(PICTURES_OF[0], np.ndarray):
+        PICTURES_OF[0] = xp.asarray(PICTURES_OF[0])
     scene = Scene(rng, PICTURES_OF[0])
     folder = Path(out) / f"{index:05d}"
     for name in ("images", "masks"):
@@ -299,7 +306,7 @@ def write_scene(job):
     grid = (np.arange(SIZE * SAMPLES) + 0.5) / SAMPLES - SIZE / 2
     x, y = np.meshgrid(grid / focal, grid / focal)
     axes_rays = np.stack([x, -y, -np.ones_like(x)], -1).reshape(-1, 3)  # OpenGL's axes
-    frames = []
+    frames, poses = [], []
     for frame in range(FRAMES):
         azimuth = start + (
             rng.uniform(-40, 40) if frame % 8 in (1, 3, 5) else 360 * (frame + rng.uniform(-0.3, 0.3)) / FRAMES
@@ -313,23 +320,22 @@ def write_scene(job):
         back = (eye - target) / np.linalg.norm(eye - target)
         right = np.cross([0, 1, 0], back)
         right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(back, right), back, eye], 1)
-        rays = axes_rays @ pose[:3, :3].T
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        colors, hit = scene.colors(eye, rays)
-        shape = SIZE, SAMPLES, SIZE, SAMPLES
-        image = colors.reshape(*shape, 3).mean((1, 3))
-        mask = hit.reshape(shape).mean((1, 3))
-        Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(folder / f"images/{frame:02d}.jpg", quality=95)
-        Image.fromarray((255 * mask + 0.5).astype(np.uint8)).save(folder / f"masks/{frame:02d}.png")
-        frames.append(
-            {
-                "file_path": f"images/{frame:02d}.jpg",
-                "mask_path": f"masks/{frame:02d}.png",
-                "transform_matrix": pose.tolist(),
-            }
-        )
+        poses.append(np.eye(4))
+        poses[-1][:3] = np.stack([right, np.cross(back, right), back, eye], 1)
+        names = {"file_path": f"images/{frame:02d}.jpg", "mask_path": f"masks/{frame:02d}.png"}
+        frames.append(names | {"transform_matrix": poses[-1].tolist()})
+    together = 1 if xp is np else FRAMES  # on a processor, a few rays stay in its cache
+    for first in range(0, FRAMES, together):
+        pose = xp.asarray(np.stack(poses[first : first + together]))
+        rays = (pose[:, None, :3, :3] @ xp.asarray(axes_rays)[..., None])[..., 0].reshape(-1, 3)
+        rays /= xp.linalg.norm(rays, axis=1, keepdims=True)
+        colors, hit = scene.colors(xp.repeat(pose[:, :3, 3], len(axes_rays), 0), rays)
+        shape = together, SIZE, SAMPLES, SIZE, SAMPLES
+        images = (255 * colors.reshape(*shape, 3).mean((2, 4)) + 0.5).astype(np.uint8)
+        masks = (255 * hit.reshape(shape).mean((2, 4)) + 0.5).astype(np.uint8)
+        for frame, image, mask in zip(frames[first:], _on_host(images), _on_host(masks), strict=False):
+            Image.fromarray(image).save(folder / frame["file_path"], quality=95)
+            Image.fromarray(mask).save(folder / frame["mask_path"])
     header = (
         "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
     )
@@ -346,7 +352,7 @@ if __name__ == "__main__":
     out, scenes, seed = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     rng = np.random.default_rng(seed)
     PICTURES_OF.append(np.stack([draw_picture(rng) for _ in range(PICTURES)]))
-    with Pool(2) as pool:
+    with Pool(os.cpu_count()) as pool:
         for done, _ in enumerate(pool.imap_unordered(write_scene, [(out, seed, i) for i in range(scenes)], 4)):
             if done % 100 == 0:
                 print(done, flush=True)
