@@ -68,14 +68,15 @@ def _checked_pickle(path: Path, sums: bool) -> bytes:
         file.seek(0)
         if file.read(len(ZIP)) != ZIP:
             raise TensorFileError("not an archive of torch.save")
-        # torch and zipfile may find different lists of records in a file.
-        archive = torch._C.PyTorchFileReader(str(path))
-        sizes = [archive.get_record_size(name) for name in archive.get_all_records()]
-        size = path.stat().st_size
-        if sum(sizes) > size or sum(record.file_size for record in records.infolist()) > size:
+        archive, listed = torch._C.PyTorchFileReader(str(path)), records.infolist()
+        if sum(record.file_size for record in listed) > path.stat().st_size:
             raise TensorFileError("its parts are larger than the file")
+        # torch and zipfile may find different lists of records in a file.
+        names = archive.get_all_records()
+        if [archive.get_record_header_offset(name) for name in names] != [record.header_offset for record in listed]:
+            raise TensorFileError("damaged: it has two lists of its parts")
         # Of a directory, torch returns memory that nobody has written to.
-        if any(record.external_attr & DIRECTORY for record in records.infolist()):
+        if any(record.external_attr & DIRECTORY for record in listed):
             raise TensorFileError("damaged: a record that is a directory")
         if sums and records.testzip() is not None:
             raise TensorFileError("damaged: its checksum is another")
