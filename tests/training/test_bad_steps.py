@@ -6,6 +6,7 @@ import sys
 import pytest
 import torch
 from lightning.pytorch.demos.boring_classes import BoringModel
+from lightning.pytorch.strategies import SingleDeviceStrategy
 from scenes_for_training import quiet_trainer
 from small_runs import Batches
 from support import LIMIT, SMALL, strict_json
@@ -90,6 +91,41 @@ def test_a_bad_step_changes_nothing_and_the_next_goes_on(fault, fused):
     for weights, averaged in zip(module.seen[1:], module.averages[1:], strict=True):
         average = [x.lerp(y, 0.1) for x, y in zip(average, weights[:2], strict=True)]
         torch.testing.assert_close(averaged, average)
+
+
+class OnGpu(torch.Tensor):
+    """Says that it is on a GPU, which nothing may read before it has arrived."""
+
+    is_cuda = True
+    arrived = True
+
+    def __bool__(self) -> bool:
+        assert OnGpu.arrived
+        return self.item() != 0
+
+
+class Arrival:
+    def record(self) -> None:
+        OnGpu.arrived = False
+
+    def synchronize(self) -> None:
+        OnGpu.arrived = True
+
+
+def test_on_a_gpu_a_step_is_looked_at_in_the_next_until_one_was_bad(monkeypatch):
+    looks, reduce = [], SingleDeviceStrategy.reduce
+    monkeypatch.setattr(SingleDeviceStrategy, "reduce", lambda *args, **kw: reduce(*args, **kw).as_subclass(OnGpu))
+    monkeypatch.setattr("torch.cuda.Event", Arrival)
+    monkeypatch.setattr(
+        BadSteps, "_count", lambda bad, value, count=BadSteps._count: looks.append(value) or count(bad, value)
+    )
+    late, at_once = (Faulty(FAULTS["a loss that is NaN"], (4, 5, 8), fused=True) for _ in range(2))
+    bad = train(late, ExponentialMovingAverage(0.9), steps=12)
+    assert bad.total == 3
+    assert looks == [False] * 4 + [True, True] + [False] * 2 + [True] + [False] * 3
+    monkeypatch.undo()
+    train(at_once, ExponentialMovingAverage(0.9), steps=12)
+    assert all(equal(one, other) for one, other in zip(late.seen, at_once.seen, strict=True))
 
 
 def test_a_run_without_bad_steps_is_as_it_would_be_without_the_callback(monkeypatch):

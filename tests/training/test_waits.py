@@ -136,9 +136,11 @@ def train(stage: str, folder: Path, precision: str, *settings: str) -> Path:
     )
     folder.mkdir()
     data, module = fit.instantiate(config)
-    trainer = instantiate(config.trainer, callbacks=[*fit._parts(config, "callbacks"), Watched()], _convert_="all", **{
-        "logger": False, "enable_progress_bar": False, "precision": precision, "max_steps": 7, "limit_val_batches": 0, "log_every_n_steps": 1000,
-    })  # fmt: skip
+    quiet = {"logger": False, "enable_progress_bar": False, "limit_val_batches": 0, "log_every_n_steps": 1000}
+    callbacks = [*fit._parts(config, "callbacks"), Watched()]
+    trainer = instantiate(
+        config.trainer, callbacks=callbacks, precision=precision, max_steps=7, **quiet, _convert_="all"
+    )
     trainer.fit(module, datamodule=data)
     return folder / "checkpoints/last.ckpt"
 
