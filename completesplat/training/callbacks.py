@@ -54,8 +54,7 @@ class BadSteps(Callback):
     averages and the order of the data continue. All processes skip the same steps. Progress bar and loggers get the
     number of skipped steps as `train/bad_steps`. With 16-mixed, it includes the first ones, which find the loss scale.
 
-    Fused optimizers skip steps themselves, on the device. On a GPU, nothing then waits for it: whether a step was bad
-    is read in the next one, until one was.
+    Fused optimizers skip steps on the device. On a GPU, whether a step was bad is then read in the next one.
 
     Args:
         most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row, or if it skips all steps.
@@ -91,8 +90,7 @@ class BadSteps(Callback):
         if fused := bool(optimizer.defaults.get("fused")):
             optimizer.found_inf = bad  # type: ignore[attr-defined]  # the protocol of `torch.amp.GradScaler`
         if fused and bad.is_cuda and not self.in_a_row and self.most_bad_steps > 1:
-            self.last = bad.to("cpu", non_blocking=True), torch.cuda.Event()
-            self.last[1].record()
+            self.last = bad.to("cpu", non_blocking=True), torch.cuda.current_stream().record_event()
         elif self._count(bool(bad)):
             self.divergence = _divergence(trainer, pl_module, self.in_a_row)
             if self.in_a_row >= self.most_bad_steps:
@@ -165,10 +163,11 @@ class ExponentialMovingAverage(WeightAveraging):
         """Update the average after an optimizer step; torch's own way waits for the GPU twice."""
         if (step := trainer.global_step) == self._latest_update_step:
             return
-        average, share = self._average_model, 1 - self.decay if self._latest_update_step else 1.0
+        average = self._average_model
         assert average is not None
         parts = [[*x.parameters(), *x.buffers()] for x in (average.module, pl_module)]
-        torch._foreach_lerp_(*([x for x in part if x.is_floating_point()] for part in parts), share)
+        floats, others = ([x for x in part if x.is_floating_point()] for part in parts)
+        torch._foreach_lerp_(floats, others, 1 - self.decay if self._latest_update_step else 1.0)
         average.n_averaged += 1
         self._latest_update_step = step
 

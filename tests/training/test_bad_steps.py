@@ -105,8 +105,11 @@ class OnGpu(torch.Tensor):
 
 
 class Arrival:
-    def record(self) -> None:
+    """A stream, and an event on it."""
+
+    def record_event(self) -> "Arrival":
         OnGpu.arrived = False
+        return self
 
     def synchronize(self) -> None:
         OnGpu.arrived = True
@@ -115,7 +118,7 @@ class Arrival:
 def test_on_a_gpu_a_step_is_looked_at_in_the_next_until_one_was_bad(monkeypatch):
     looks, reduce = [], SingleDeviceStrategy.reduce
     monkeypatch.setattr(SingleDeviceStrategy, "reduce", lambda *args, **kw: reduce(*args, **kw).as_subclass(OnGpu))
-    monkeypatch.setattr("torch.cuda.Event", Arrival)
+    monkeypatch.setattr("torch.cuda.current_stream", Arrival)
     monkeypatch.setattr(
         BadSteps, "_count", lambda bad, value, count=BadSteps._count: looks.append(value) or count(bad, value)
     )
