@@ -90,6 +90,9 @@ def test_nothing_in_a_step_waits(stage: str, precision: str, pretended_gpu: None
         with WithoutInitialWeights(), torch.device("cuda"):
             training = Training(instantiate(config.model, _convert_="all"), precision)
         training.module.draw_others = lambda targets: targets - 1
+        if stage == "stage 2 by diffusion":  # diffusers' schedulers are no modules, so they stay on the CPU
+            scheduler = training.module.completesplat.sampler.scheduler
+            scheduler.alphas_cumprod = scheduler.alphas_cumprod.cpu()
         scenes = synthetic_batch(32, 2, 3).to("cuda")
         for _ in range(2):  # what is kept from the first step on is made in it
             with Waits() as waits:
