@@ -45,7 +45,7 @@ def steps(out: Path, small: bool) -> Iterator[Step]:
     def if_small(settings: list[str], otherwise: list[str] | None = None) -> list[str]:
         return settings if small else otherwise or []
 
-    yield Step("tests", ["-m", "pytest", "-q", "-rs", "-m", "gpu", "tests/rasterizers"])
+    yield Step("tests", ["-m", "pytest", "-q", "-rs", "-m", "gpu", "tests/rasterizers", "tests/training/test_waits.py"])
     yield verb("rasterizers", "bench", "rasterizers", *if_small(RASTERIZERS), out=out)
     yield verb("paper", "bench", "paper", *if_small(PAPER), out=out)
     for stage in ("var_stage1", "diffusion"):

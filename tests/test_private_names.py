@@ -37,6 +37,8 @@ REASONS = {
     "tensors.py _C _nn _parse_to": ONE_OF_TORCH,
     "weights/checkpoint_reading.py _Unpickler": "Python's unpickler in Python, whose calls a dry run replaces",
     "training/callbacks.py _get_train_description _update": "the progress bar covers the run, not an epoch",
+    "training/callbacks.py _average_model _foreach_lerp_": "Lightning's average lies on the CPU; torch's update waits",
+    "training/callbacks.py _update_metrics": "figures are shown once a second, because reading them waits for a GPU",
     "training/callbacks.py _swap_models": "images of fixed scenes are drawn with the averaged weights",
     "training/loggers.py _check_log_dir_exists": "Lightning's logger would delete the rows of the run that goes on",
     "training/loggers.py _wandb_init": "W&B's run begins with Lightning's options and ours",

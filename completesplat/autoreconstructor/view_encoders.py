@@ -76,7 +76,8 @@ def sweep(views: Views, depth_range: DepthRange, planes: int) -> Float[Tensor, "
     rays = rays_through(reference.cameras.intrinsics, corners)
     flat = (depth[:, :, None, None] * rays[:, None]).flatten(1, 2)[:, None]
     pixels, ahead = project(others.cameras, flat)
-    grid = (pixels / pixels.new_tensor([width, height]) * 2 - 1).clamp(-2, 2).nan_to_num(2)
+    size = torch.tensor([width, height]).to(pixels, non_blocking=True)
+    grid = (pixels / size * 2 - 1).clamp(-2, 2).nan_to_num(2)
     sampled = nn.functional.grid_sample(others.images.flatten(0, 1), grid.flatten(0, 1)[:, None], align_corners=False)
     colors = sampled.view(batch, count, 3, -1).mT * 2 - 1
     toward = nn.functional.normalize(flat - others.cameras.centers[:, :, None], dim=-1)

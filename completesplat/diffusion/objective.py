@@ -30,7 +30,7 @@ def signal_and_noise(
     if is_flow(scheduler):
         time = timestep.to(like)[..., None, None, None] / scheduler.config.num_train_timesteps
         return 1 - time, time
-    alpha_bar: Tensor = scheduler.alphas_cumprod.to(like)[timestep][..., None, None, None]
+    alpha_bar: Tensor = scheduler.alphas_cumprod.to(like, non_blocking=True)[timestep][..., None, None, None]
     return alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
 
 

@@ -16,7 +16,6 @@ from rich import get_console
 from rich.progress import TaskID
 from torch import Tensor
 from torch.optim import Optimizer
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.data.loading.distributed import gather_values, mean_of_processes
 from completesplat.errors import DivergenceError
@@ -51,9 +50,11 @@ def step_seed(*place: int) -> int:
 class BadSteps(Callback):
     """Callback that skips optimizer steps whose loss, or norm of all gradients, is not finite.
 
-    A skipped step does not change weights, their averages or the optimizer's state. It counts as a step of the run, so
-    the schedule and the order of the data continue. All processes skip the same steps. Progress bar and loggers get the
+    A skipped step does not change weights or the optimizer's state. It counts as a step of the run, so the schedule,
+    averages and the order of the data continue. All processes skip the same steps. Progress bar and loggers get the
     number of skipped steps as `train/bad_steps`. With 16-mixed, it includes the first ones, which find the loss scale.
+
+    Fused optimizers skip steps on the device. On a GPU, whether a step was bad is then read in the next one.
 
     Args:
         most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row, or if it skips all steps.
@@ -63,9 +64,11 @@ class BadSteps(Callback):
         self.most_bad_steps = most_bad_steps
         self.total = self.in_a_row = 0
         self.losses: list[Tensor] = []
+        self.last: tuple[Tensor, torch.cuda.Event] | None = None  # whether the last step was bad, on its way here
         self.divergence = "all steps had a loss or gradients that are not finite"
 
     def state_dict(self) -> dict[str, int]:
+        self._count_last()
         return {"total": self.total, "in_a_row": self.in_a_row}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
@@ -82,19 +85,33 @@ class BadSteps(Callback):
         finite = torch.stack([*self.losses, norm]).isfinite().all()
         self.losses = []
         # Processes have different losses, but the same gradients.
-        if trainer.strategy.reduce((~finite).float(), reduce_op="sum") == 0:
-            self.in_a_row = 0
-        else:
-            self.total, self.in_a_row = self.total + 1, self.in_a_row + 1
+        bad = trainer.strategy.reduce((~finite).float(), reduce_op="sum").clamp(max=1)
+        self._count_last()
+        if fused := bool(optimizer.defaults.get("fused")):
+            optimizer.found_inf = bad  # type: ignore[attr-defined]  # the protocol of `torch.amp.GradScaler`
+        if fused and bad.is_cuda and not self.in_a_row and self.most_bad_steps > 1:
+            self.last = bad.to("cpu", non_blocking=True), torch.cuda.current_stream().record_event()
+        elif self._count(bool(bad)):
             self.divergence = _divergence(trainer, pl_module, self.in_a_row)
-            if self.in_a_row == self.most_bad_steps:
+            if self.in_a_row >= self.most_bad_steps:
                 raise DivergenceError(self.divergence)
             for parameter in pl_module.parameters():
                 parameter.grad = None  # optimizers skip these parameters
-        pl_module.log(BAD_STEPS, float(self.total), prog_bar=True, batch_size=1)
+        pl_module.log(BAD_STEPS, torch.tensor(float(self.total)), prog_bar=True, batch_size=1)
+
+    def _count(self, bad: bool) -> bool:
+        self.total, self.in_a_row = self.total + bad, (self.in_a_row + 1) * bad
+        return bad
+
+    def _count_last(self) -> None:
+        if self.last is not None:
+            (bad, computed), self.last = self.last, None
+            computed.synchronize()
+            self._count(bool(bad))
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Raise DivergenceError if no step changed the weights, before a checkpoint of them is written."""
+        self._count_last()
         if 0 < self.total == trainer.global_step:
             raise DivergenceError(self.divergence)
 
@@ -119,10 +136,16 @@ class ExponentialMovingAverage(WeightAveraging):
 
     Lightning's own `EMAWeightAveraging` computes decay * a + (1 - decay) * b, which lets frozen weights and measured
     buffers drift by rounding; linear interpolation leaves them exactly as they are. The paper states no `decay`.
+    Lightning also keeps the average on the CPU, because it makes it before the model moves to a GPU.
     """
 
     def __init__(self, decay: Share) -> None:
-        super().__init__(multi_avg_fn=get_ema_multi_avg_fn(decay))  # type: ignore[no-untyped-call]
+        super().__init__()
+        self.decay = decay
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert self._average_model is not None
+        self._average_model.to(pl_module.device)
 
     @contextmanager
     def in_place(self, module: LightningModule) -> Iterator[None]:
@@ -133,13 +156,20 @@ class ExponentialMovingAverage(WeightAveraging):
         finally:
             self._swap_models(module)
 
+    @torch.no_grad()
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: STEP_OUTPUT, batch: object, batch_idx: int
     ) -> None:
-        """Update the average, except after a skipped step."""
-        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-        if not any(isinstance(callback, BadSteps) and callback.in_a_row for callback in callbacks):
-            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        """Update the average after an optimizer step; torch's own way waits for the GPU twice."""
+        if (step := trainer.global_step) == self._latest_update_step:
+            return
+        average = self._average_model
+        assert average is not None
+        parts = [[*x.parameters(), *x.buffers()] for x in (average.module, pl_module)]
+        floats, others = ([x for x in part if x.is_floating_point()] for part in parts)
+        torch._foreach_lerp_(floats, others, 1 - self.decay if self._latest_update_step else 1.0)
+        average.n_averaged += 1
+        self._latest_update_step = step
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Wait for `on_fit_end`, because the checkpoint that is written now must also hold the weights themselves."""
@@ -153,6 +183,8 @@ class Progress(RichProgressBar):
 
     Without a terminal, it logs a line after every validation.
     """
+
+    shown = 0.0
 
     @property
     def total_train_batches(self) -> int | float:
@@ -169,6 +201,12 @@ class Progress(RichProgressBar):
         if whole_run and self.trainer.max_steps > 0:
             current = self.trainer.global_step
         super()._update(progress_bar_id, current, visible, hard)
+
+    def _update_metrics(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Show figures at most once a second, because reading them waits for the GPU."""
+        if (now := time.perf_counter()) - self.shown >= 1:
+            self.shown = now
+            super()._update_metrics(trainer, pl_module)
 
     def get_metrics(
         self, trainer: Trainer, pl_module: LightningModule

@@ -152,6 +152,8 @@ class _Observer(threading.Thread):
 
 def agreed_signal(trainer: Trainer) -> int | None:
     """Return the signal that a process of the run received, if any did; all processes have to call this."""
+    if trainer.world_size == 1:
+        return signals.received()  # without a wait for the GPU
     local = torch.tensor(signals.received() or 0, device=trainer.strategy.root_device)
     return int(trainer.strategy.reduce(local, reduce_op="max")) or None
 

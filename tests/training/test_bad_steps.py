@@ -6,6 +6,7 @@ import sys
 import pytest
 import torch
 from lightning.pytorch.demos.boring_classes import BoringModel
+from lightning.pytorch.strategies import SingleDeviceStrategy
 from scenes_for_training import quiet_trainer
 from small_runs import Batches
 from support import LIMIT, SMALL, strict_json
@@ -14,6 +15,7 @@ from completesplat.errors import DivergenceError
 from completesplat.training.callbacks import BadSteps, ExponentialMovingAverage
 from completesplat.training.checkpoints import CheckpointFiles, Checkpoints
 from completesplat.training.reconstruction import ReconstructionModule
+from completesplat.training.stage import Stage
 
 NAN, INFINITE = float("nan"), float("inf")
 FAULTS = {
@@ -35,12 +37,15 @@ def spoilt(weight: torch.Tensor, value: float) -> torch.Tensor:
 class Faulty(BoringModel):
     """A module that has a fault in the given batches and stores its weights after every batch."""
 
-    def __init__(self, fault=None, batches=()) -> None:
+    def __init__(self, fault=None, batches=(), fused=False) -> None:
         super().__init__()
-        self.fault, self.batches, self.seen = fault, batches, []
+        self.fault, self.batches, self.fused, self.seen, self.averages = fault, batches, fused, [], []
+
+    configure_gradient_clipping = Stage.configure_gradient_clipping  # Lightning's takes no fused optimizer
+    gradient_norm = None
 
     def configure_optimizers(self):
-        optimizer = torch.optim.AdamW(self.parameters(), lr=0.1)
+        optimizer = torch.optim.AdamW(self.parameters(), lr=0.1, fused=self.fused)
         return [optimizer], [{"scheduler": torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.9), "interval": "step"}]
 
     def training_step(self, batch, index):
@@ -50,9 +55,9 @@ class Faulty(BoringModel):
 
     def on_train_batch_end(self, *_):
         state = self.optimizers().state.get(self.layer.weight, {})
-        average = next((c for c in self.trainer.callbacks if isinstance(c, ExponentialMovingAverage)), None)
-        averaged = [] if average is None else average._average_model.module.parameters()
-        self.seen.append([x.detach().clone() for x in (*self.parameters(), *state.values(), *averaged)])
+        self.seen.append([x.detach().clone() for x in (*self.parameters(), *state.values())])
+        for average in (c for c in self.trainer.callbacks if isinstance(c, ExponentialMovingAverage)):
+            self.averages.append([x.detach().clone() for x in average._average_model.module.parameters()])
 
 
 def train(module, *callbacks, steps=12, accumulated=1, most=3, ckpt_path=None, **settings) -> BadSteps:
@@ -70,9 +75,10 @@ def equal(one, other) -> bool:
     return len(one) == len(other) and all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
+@pytest.mark.parametrize("fused", [False, True])
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_bad_step_changes_nothing_and_the_next_goes_on(fault):
-    module = Faulty(FAULTS[fault], batches=(4, 5, 8))
+def test_a_bad_step_changes_nothing_and_the_next_goes_on(fault, fused):
+    module = Faulty(FAULTS[fault], (4, 5, 8), fused)
     bad = train(module, ExponentialMovingAverage(0.9), steps=12)
     assert (bad.total, bad.in_a_row) == (3, 0)
     changed = [not equal(one, other) for one, other in zip(module.seen[:-1], module.seen[1:], strict=True)]
@@ -80,6 +86,49 @@ def test_a_bad_step_changes_nothing_and_the_next_goes_on(fault):
     assert all(x.isfinite().all() for x in module.seen[-1])
     assert module.trainer.global_step == 12
     assert module.lr_schedulers().last_epoch == 12
+    average = module.averages[0]
+    assert equal(average, module.seen[0][:2])
+    for weights, averaged in zip(module.seen[1:], module.averages[1:], strict=True):
+        average = [x.lerp(y, 0.1) for x, y in zip(average, weights[:2], strict=True)]
+        torch.testing.assert_close(averaged, average)
+
+
+class OnGpu(torch.Tensor):
+    """Says that it is on a GPU, which nothing may read before it has arrived."""
+
+    is_cuda = True
+    arrived = True
+
+    def __bool__(self) -> bool:
+        assert OnGpu.arrived
+        return self.item() != 0
+
+
+class Arrival:
+    """A stream, and an event on it."""
+
+    def record_event(self) -> "Arrival":
+        OnGpu.arrived = False
+        return self
+
+    def synchronize(self) -> None:
+        OnGpu.arrived = True
+
+
+def test_on_a_gpu_a_step_is_looked_at_in_the_next_until_one_was_bad(monkeypatch):
+    looks, reduce = [], SingleDeviceStrategy.reduce
+    monkeypatch.setattr(SingleDeviceStrategy, "reduce", lambda *args, **kw: reduce(*args, **kw).as_subclass(OnGpu))
+    monkeypatch.setattr("torch.cuda.current_stream", Arrival)
+    monkeypatch.setattr(
+        BadSteps, "_count", lambda bad, value, count=BadSteps._count: looks.append(value) or count(bad, value)
+    )
+    late, at_once = (Faulty(FAULTS["a loss that is NaN"], (4, 5, 8), fused=True) for _ in range(2))
+    bad = train(late, ExponentialMovingAverage(0.9), steps=12)
+    assert bad.total == 3
+    assert looks == [False] * 4 + [True, True] + [False] * 2 + [True] + [False] * 3
+    monkeypatch.undo()
+    train(at_once, ExponentialMovingAverage(0.9), steps=12)
+    assert all(equal(one, other) for one, other in zip(late.seen, at_once.seen, strict=True))
 
 
 def test_a_run_without_bad_steps_is_as_it_would_be_without_the_callback(monkeypatch):

@@ -14,7 +14,14 @@ from scenes_for_training import quiet_trainer, scene_batch
 from torch.utils.data import DataLoader
 
 from completesplat.training import callbacks
-from completesplat.training.callbacks import Progress, StepSeeds, Throughput, memory, step_seed
+from completesplat.training.callbacks import (
+    ExponentialMovingAverage,
+    Progress,
+    StepSeeds,
+    Throughput,
+    memory,
+    step_seed,
+)
 
 
 class Clock:
@@ -159,3 +166,20 @@ def test_the_bar_is_the_whole_runs_and_shows_the_first_steps_loss():
     trainer.fit(Telling(), DataLoader(torch.zeros(4, 32)), DataLoader(torch.zeros(4, 32)))
     steps = [0, 1, 1, 2, 2, 3, 3, 4, 4, 5]  # of two batches each, two in an epoch
     assert watched.shown == [("Training", s, 5, f"{s}/5", 0.5 * (i % 4)) for i, s in enumerate(steps)]
+
+
+def test_figures_are_read_once_a_second_because_that_waits_for_a_gpu(clock, monkeypatch):
+    read = []
+    monkeypatch.setattr(Progress, "get_metrics", lambda *_: read.append(clock()) or {})
+    trainer = quiet_trainer(max_epochs=1, callbacks=[Progress()], enable_progress_bar=True, limit_val_batches=0)
+    trainer.fit(Sleeper(clock, training=0.4), DataLoader(range(8)))
+    assert read == pytest.approx([100.4, 101.6, 102.8])
+
+
+def test_averages_move_to_the_gpu_with_the_module():
+    """Lightning makes them before, on the CPU."""
+    average = ExponentialMovingAverage(0.9)
+    trainer = quiet_trainer()
+    average.setup(trainer, BoringModel(), "fit")
+    average.on_fit_start(trainer, BoringModel().to("meta"))
+    assert {x.device.type for x in average._average_model.state_dict().values()} == {"meta"}

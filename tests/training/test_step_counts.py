@@ -1,9 +1,5 @@
 """Counts of a step against a hand count, and steps of the paper's size on fake tensors, of the CPU and of a GPU."""
 
-import ctypes
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 import torch
 from hydra.utils import instantiate
@@ -28,7 +24,6 @@ from completesplat.training.steps import Training, synthetic_batch
 SIZE, BATCH = 16, 3
 PAPER = ("paper_var_stage1", "paper_var_stage2", "paper_diffusion", "paper_diffusion_masked")
 SLOW = [pytest.param(experiment, marks=pytest.mark.slow) for experiment in PAPER if experiment != "paper_var_stage2"]
-REGISTRY, CUDA, META = "_ZN3c104impl26device_guard_impl_registryE", 1, 14
 
 
 class TwoLayers(Stage):
@@ -82,23 +77,6 @@ def test_a_step_of_the_papers_size_runs_and_takes_no_memory(experiment: str) -> 
     assert counts.peak > 15e9
     assert counts.memory["optimizer"] == pytest.approx(2 * 4 * counts.trained, rel=1e-3)  # fused Adam
     assert counts.flops > 6 * 32 * 0.2e9
-
-
-@pytest.fixture
-def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let torch without CUDA dispatch fake tensors of a GPU: its guard becomes that of the device "meta".
-
-    The backward pass would need a real GPU.
-    """
-    if not torch.backends.cuda.is_built():
-        library = ctypes.CDLL(str(Path(torch.__file__).parent / "lib/libc10.so"))
-        guards = (ctypes.c_void_p * (META + 1)).in_dll(library, REGISTRY)
-        guards[CUDA] = guards[META]
-    monkeypatch.setattr("torch.cuda.amp.common.amp_definitely_not_available", lambda: False)
-    monkeypatch.setattr("torch.cuda.is_bf16_supported", lambda *_, **__: True)
-    yield
-    if not torch.backends.cuda.is_built():
-        guards[CUDA] = None
 
 
 def on_gpu(config: DictConfig) -> Training:
