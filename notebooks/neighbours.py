@@ -20,7 +20,7 @@ from completesplat.data.captures.capture_set import CaptureSetDataModule
 from completesplat.data.placement import OBJECT_HALF_SIZE
 from completesplat.errors import DataError
 from completesplat.export.images import to_pixels
-from completesplat.geometry.cameras import invert_rigid, nearest_to_axes, transform_points
+from completesplat.geometry.cameras import crop_resize, invert_rigid, nearest_to_axes, transform_points
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.selection import auto
 
@@ -64,9 +64,13 @@ def near_views(sequence):
     return images, replace(chosen, world_to_camera=poses, intrinsics=chosen.intrinsics.float()), depth * scale
 
 
+def resized(images, size):
+    return functional.interpolate(images, (size, size), mode="area")
+
+
 words = dict(word.split("=") for word in sys.argv[2:] if "=" in word)
 models = {name: completesplat.CompleteSplat.from_pretrained(name) for name in sys.argv[2:] if "=" not in name}
-size = min(model.image_size for model in models.values())
+least, size = (of(model.image_size for model in models.values()) for of in (min, max))
 data = CaptureSetDataModule(sys.argv[1], test_fraction=1, val_fraction=0, image_size=size, batch_size=1)
 data.setup("test")
 source, scores, sheet = data.source("test"), {}, []
@@ -84,9 +88,12 @@ for name in source.names:
         depth_range = torch.tensor([[max(0.1, depth - before), depth + after]])
         for rounds in ROUNDS:
             with torch.no_grad():
-                scene = model.generate(images[:1], cameras[:1], depth_range, seed=0, color_fits=rounds)
+                seen, views = resized(images, model.image_size), crop_resize(cameras, 0, 0, size, model.image_size)
+                scene = model.generate(seen[:1], views[:1], depth_range, seed=0, color_fits=rounds)
                 background = 0.5 if model.background is None else model.background
-                drawn[f"{weights}, {rounds} rounds"] = rasterizer(scene, cameras[None]).over(background)[0]
+                drawn[f"{weights}, {rounds} rounds"] = rasterizer(scene, views[None]).over(background)[0]
+    images = resized(images, least)
+    drawn = {method: resized(views, least) for method, views in drawn.items()}
     for method, views in drawn.items():
         front, novel = psnr(views[:1], images[:1]).item(), psnr(views[1:], images[1:]).mean().item()
         scores.setdefault(method, []).append((front, novel))
