@@ -2,8 +2,9 @@
 
 python notebooks/shapes.py OUT SCENES SEED [SIZE]
 
-With CuPy, rays are traced on a GPU. Solids are composed as in LRM-Zero (arXiv 2406.09371), pictures are dead leaves (Lee, Mumford and Huang, IJCV 2001) with
-noise. Behind the solids there is one colour, a ground below a dome, or a room. Nothing here is a photograph.
+With CuPy, rays are traced on a GPU. Solids are composed as in LRM-Zero (arXiv 2406.09371), pictures are dead leaves
+(Lee, Mumford and Huang, IJCV 2001) with noise. Behind the solids there is one colour, a ground below a dome, or a room.
+Nothing here is a photograph.
 """
 
 import json
