@@ -24,6 +24,7 @@ from completesplat.settings.schema import Positive, Share
 from completesplat.training.stage import Stage
 
 BAD_STEPS = "train/bad_steps"
+IN_PROGRESS_BAR = ("train/loss", "train/psnr", BAD_STEPS)
 STATUS = Path("/proc/self/status")
 
 logger = logging.getLogger(__name__)
@@ -97,7 +98,7 @@ class BadSteps(Callback):
                 raise DivergenceError(self.divergence)
             for parameter in pl_module.parameters():
                 parameter.grad = None  # optimizers skip these parameters
-        pl_module.log(BAD_STEPS, torch.tensor(float(self.total)), prog_bar=True, batch_size=1)
+        pl_module.log(BAD_STEPS, torch.tensor(float(self.total)), batch_size=1)
 
     def _count(self, bad: bool) -> bool:
         self.total, self.in_a_row = self.total + bad, (self.in_a_row + 1) * bad
@@ -211,8 +212,9 @@ class Progress(RichProgressBar):
     def get_metrics(
         self, trainer: Trainer, pl_module: LightningModule
     ) -> dict[str, int | str | float | dict[str, float]]:
-        metrics = super().get_metrics(trainer, pl_module)
-        hidden = {"v_num"} if metrics.get(BAD_STEPS) else {"v_num", BAD_STEPS}
+        logged = {name: x.item() for name, x in trainer.callback_metrics.items() if name in IN_PROGRESS_BAR}
+        hidden = {"v_num"} if logged.get(BAD_STEPS) else {"v_num", BAD_STEPS}
+        metrics = super().get_metrics(trainer, pl_module) | logged
         return {"step": _steps(trainer), **{name: value for name, value in metrics.items() if name not in hidden}}
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

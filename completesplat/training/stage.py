@@ -27,8 +27,6 @@ from completesplat.settings.schema import Share
 from completesplat.training.scoring import Scorer
 from completesplat.weights.checkpoint_reading import load_part, read_checkpoint
 
-IN_PROGRESS_BAR = ("train/loss", "train/psnr")
-
 
 def prepare_network(network: nn.Module, channels_last: bool, compile: bool) -> torch.memory_format:
     """Order convolution weights in NHWC, or compile on the first call; return the order that images should have."""
@@ -117,10 +115,10 @@ class Stage(Scorer):
     def log_step(self, values: dict[str, Tensor], batch_size: int) -> None:
         """Log figures of a training step: their means over all processes.
 
-        They are sent in one message, because with Lightning's `sync_dist` processes would wait for each figure.
+        They are sent in one message, because with Lightning's `sync_dist` processes would wait for each figure. With
+        `prog_bar=True`, Lightning would wait for the GPU in every step; `Progress` shows them without.
         """
-        for name, value in mean_of_processes(values).items():
-            self.log(name, value, prog_bar=name in IN_PROGRESS_BAR, batch_size=batch_size)
+        self.log_dict(mean_of_processes(values), batch_size=batch_size)
 
     def novel_psnr(self, gaussians: Gaussians, scenes: SceneBatch) -> Float[Tensor, "batch target"]:
         images, truth = self.render(gaussians, scenes.targets.cameras).clamp(0, 1), scenes.targets.images

@@ -148,12 +148,12 @@ class Watched(Callback):
     def on_train_batch_end(self, trainer, pl_module, *_) -> None:
         task = self.bar.train_progress_bar
         figures = self.bar.get_metrics(trainer, pl_module)
-        self.shown.append((task.description, task.completed, task.total, figures["step"], round(figures["loss"], 4)))
+        self.shown.append((task.description, task.completed, task.total, figures["step"], round(figures["train/loss"], 4)))
 
 
 class Telling(BoringModel):
     def training_step(self, batch, index):
-        self.log("loss", 0.5 * index, prog_bar=True)
+        self.log("train/loss", 0.5 * index)
         return super().training_step(batch, index)
 
 
