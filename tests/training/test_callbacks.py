@@ -148,7 +148,9 @@ class Watched(Callback):
     def on_train_batch_end(self, trainer, pl_module, *_) -> None:
         task = self.bar.train_progress_bar
         figures = self.bar.get_metrics(trainer, pl_module)
-        self.shown.append((task.description, task.completed, task.total, figures["step"], round(figures["train/loss"], 4)))
+        self.shown.append(
+            (task.description, task.completed, task.total, figures["step"], round(figures["train/loss"], 4))
+        )
 
 
 class Telling(BoringModel):
