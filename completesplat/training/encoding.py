@@ -5,8 +5,8 @@ import logging
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from jaxtyping import Float
 from rich.filesize import decimal
 from rich.progress import track
 from torch import nn
+from torch.utils.data import DataLoader, Dataset
 
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.loading.data_module import SceneDataModule
@@ -36,18 +37,17 @@ from completesplat.data.loading.view_selection import spread_around
 from completesplat.data.packed.manifest import MANIFEST
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import UNFINISHED
-from completesplat.data.sequences import PosedSequence, spread_places
+from completesplat.data.sequences import spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import atomic_path
 from completesplat.scene import SceneBatch
+from completesplat.signals import leave_to_parent
 from completesplat.tensors import stack
 from completesplat.version import __version__
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 Moments = Float[np.ndarray, "row channel _ _"]
 Sums = Float[np.ndarray, "3 channel"]
-Reference = tuple[PosedSequence, int]
-"""A sequence, and the index of its frame to encode."""
 
 logger = logging.getLogger(__name__)
 
@@ -133,7 +133,8 @@ def encode_training_set(
 ) -> LatentCache:
     """Encode every frame of every sequence of a packed training set, without augmentation.
 
-    A finished cache stays unchanged; that of an interrupted run is unreadable. Several processes share the batches.
+    A finished cache stays unchanged; that of an interrupted run is unreadable. Several processes share the batches, and
+    `data.workers` processes of each read them.
 
     Args:
         frames: at most this many frames of a sequence, evenly spaced; None: all.
@@ -158,11 +159,15 @@ def encode_training_set(
     encode = partial(
         encode_scenes, autoreconstructor=frozen, conditioning=features, precision=PRECISIONS[precision], device=device
     )
-    load = partial(_loaded, SceneStore(source), views)
-    blank = encode(stack([load(next(_references(source, 1, [], False)))]))
-    _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
-    sequences: list[CachedSequence] = []
-    batches = _encoded_batches(_references(source, frames, sequences, progress), load, encode, batch_size)
+    counts = {name: len(source.read(name).frames) for name in source.names}
+    sequences = [CachedSequence(name, count, tuple(spread_places(count, frames))) for name, count in counts.items()]
+    places = [(sequence.name, place) for sequence in sequences for place in sequence.stored]
+    references = References(SceneStore(source), views, places)
+    if isinstance(first := references[0], DataError):
+        raise first
+    blank = encode(stack([first]))
+    _check_space(len(places), len(sequences), sum(rows.nbytes for rows in blank.values()), out)
+    batches = _encoded_batches(references, encode, batch_size, data.workers, progress)
     if processes()[0] == 0:
         _write_store(out, origin, blank, batches, sequences)
     else:
@@ -179,39 +184,60 @@ def _packed(data: SceneDataModule) -> PackedSource:
     return source
 
 
-def _references(
-    source: PackedSource, frames: int | None, sequences: list[CachedSequence], progress: bool
-) -> Iterator[Reference]:
-    """Yield all references in the order of frames; append each sequence to `sequences` before its references."""
-    for name in track(source.names, "encoding sequences", disable=not progress or processes()[0] > 0):
-        sequence = source.read(name)
-        places = spread_places(len(sequence.frames), frames)
-        sequences.append(CachedSequence(name, len(sequence.frames), tuple(places)))
-        yield from ((sequence, place) for place in places)
+@dataclass(frozen=True)
+class References(Dataset[SceneBatch | DataError]):
+    """Dataset of the frames to encode with the views around them, or of the error of a frame that cannot be read.
+
+    Args:
+        views: number of other views, evenly spread over the sequence.
+        places: the sequence's name and the frame's index.
+    """
+
+    store: SceneStore
+    views: int
+    places: Sequence[tuple[str, int]]
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __getitem__(self, index: int) -> SceneBatch | DataError:
+        name, place = self.places[index]
+        try:
+            sequence = self.store.source.read(name)
+            return self.store.scene(sequence, place, spread_around(len(sequence.frames), place, self.views))
+        except DataError as error:  # as it is: a worker process would send another class with another message
+            return error
 
 
-def _loaded(store: SceneStore, views: int, reference: Reference) -> SceneBatch:
-    sequence, place = reference
-    return store.scene(sequence, place, spread_around(len(sequence.frames), place, views))
+def _stacked(scenes: Sequence[SceneBatch | DataError]) -> SceneBatch | DataError:
+    errors = [scene for scene in scenes if isinstance(scene, DataError)]
+    return errors[0] if errors else stack([scene for scene in scenes if not isinstance(scene, DataError)])
 
 
 def _encoded_batches(
-    references: Iterator[Reference],
-    load: Callable[[Reference], SceneBatch],
-    encode: Callable[[SceneBatch], Rows],
-    batch_size: int,
+    references: References, encode: Callable[[SceneBatch], Rows], batch_size: int, workers: int, progress: bool
 ) -> Iterator[tuple[Rows, Sums]]:
     """Yield rows and moment sums of all batches in order. Each process encodes a share, so all must iterate.
 
     Sums are computed before rows are sent, because sending changes the rows' memory order and so the rounding.
     """
     rank, count = processes()
-    while group := list(islice(references, count * batch_size)):
+    everything = list(range(len(references)))
+    batches = [everything[first : first + batch_size] for first in everything[::batch_size]]
+    local = batches[rank::count]
+    loaded = iter(
+        DataLoader(
+            references, batch_sampler=local, num_workers=workers, collate_fn=_stacked, worker_init_fn=leave_to_parent
+        )
+    )
+    for first in track(range(0, len(batches), count), "encoding", disable=not progress or rank > 0):
         result: tuple[Rows, Sums] | DataError | None = None
-        if local := group[rank * batch_size : (rank + 1) * batch_size]:
+        if first + rank < len(batches):
             try:
-                rows = encode(stack(list(map(load, local))))
-                _refuse_not_finite(rows, local)
+                if isinstance(scenes := next(loaded), DataError):
+                    raise scenes
+                rows = encode(scenes)
+                _refuse_not_finite(rows, references, batches[first + rank])
                 result = rows, moment_sums(rows["mean"], rows["log_variance"])
             except DataError as error:  # all processes raise it below
                 result = error
@@ -222,12 +248,10 @@ def _encoded_batches(
                 yield rank_result
 
 
-def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int, out: Path) -> None:
+def _check_space(frames: int, sequences: int, bytes_per_frame: int, out: Path) -> None:
     """Log the size of the future store; raise DataError if the disk has less space."""
-    most = [len(shard.sequences) * (frames or shard.frames) for shard in source.shards]
-    total = sum(min(shard.frames, limit) for shard, limit in zip(source.shards, most, strict=True))
-    contents = f"{total:,} frames of {len(source.names):,} sequences"
-    size, free = total * bytes_per_frame, shutil.disk_usage(out).free
+    size, free = frames * bytes_per_frame, shutil.disk_usage(out).free
+    contents = f"{frames:,} frames of {sequences:,} sequences"
     needed = f"about {decimal(size)} for {contents}; {decimal(free)} are free"
     if size > free:
         raise DataError(f"not enough space: {needed}; frames=N takes fewer frames of a sequence", str(out))
@@ -237,7 +261,7 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
 def _write_store(
     out: Path, origin: Origin, blank: Rows, batches: Iterator[tuple[Rows, Sums]], sequences: Sequence[CachedSequence]
 ) -> None:
-    """Write all sequences, with the shapes of `blank`, then the manifest. Reading `batches` fills `sequences`."""
+    """Write all sequences, with the shapes of `blank`, then the manifest."""
     total, written, schema = np.zeros(()), 0, latent_schema(origin)
     waiting = {name: rows[:0] for name, rows in blank.items()}  # of sequences that are not complete
     with (
@@ -276,10 +300,11 @@ def _origin(
     return Origin(encoder, features, fingerprint, settings, data.image_size, frames, views, precision)
 
 
-def _refuse_not_finite(rows: Rows, references: Sequence[Reference]) -> None:
+def _refuse_not_finite(rows: Rows, references: References, batch: Sequence[int]) -> None:
     for name, values in rows.items():
         finite = np.isfinite(values).all(axis=(1, 2, 3))
         if not finite.all():
-            sequence, place = references[int(finite.argmin())]
+            sequence, place = references.places[batch[int(finite.argmin())]]
             limits = " in float16: try precision=float32" if values.dtype == np.float16 else ""
-            raise DataError(f"its {name} is not finite{limits}", None, sequence.name, sequence.frames[place])
+            frame = references.store.source.read(sequence).frames[place]
+            raise DataError(f"its {name} is not finite{limits}", None, sequence, frame)

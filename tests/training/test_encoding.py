@@ -28,7 +28,8 @@ def root(tmp_path_factory) -> Path:
 
 def encode(root: Path, out: Path, model: nn.Module | None = None, **options) -> LatentCache:
     settings = {"progress": False, **options}
-    return encode_training_set(model or small_autoreconstructor(), rooms(root), out, **settings)
+    data = rooms(root, workers=settings.pop("workers", 0))
+    return encode_training_set(model or small_autoreconstructor(), data, out, **settings)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,7 @@ class Means(nn.Module):
 
 
 def test_every_frame_has_the_encoders_posterior(root, tmp_path):
-    store = encode(root, tmp_path / "cache", batch_size=7)
+    store = encode(root, tmp_path / "cache", batch_size=7, workers=2)
     encoder, source = small_autoreconstructor().encoder, rooms(root).source("train")
     assert list(store.sequences) == source.names
     for name, frame in itertools.product(source.names, range(FRAMES)):
