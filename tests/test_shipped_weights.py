@@ -22,7 +22,7 @@ NAME, COUCHES, FRUITS, GENERAL = "toy_objects", "rendered_couches", "fruits", "g
 
 def test_they_are_small_and_complete():
     assert list(shipped()) == [FRUITS, GENERAL, COUCHES, NAME]
-    assert sum(path.stat().st_size for path in SHIPPED.rglob("*") if path.is_file()) < 60e6
+    assert sum(path.stat().st_size for path in SHIPPED.rglob("*") if path.is_file()) < 75e6
     for name in shipped():
         assert (SHIPPED / name / SUMS_FILE).is_file()
         assert locate(name).parent == SHIPPED / name
@@ -45,14 +45,14 @@ def test_samples_agree_with_the_photo_in_front_and_differ_behind(name, backgroun
 
 
 def test_a_photo_of_anything_keeps_its_front_and_gets_depth():
-    """A cup, and no photograph in training: the input view, without fitting, and a relief."""
+    """A cup, and none in training: the input view, without fitting, and a relief."""
     model = CompleteSplat.from_pretrained(GENERAL)
     photo = model.read(Path(skimage.__file__).parent / "data/coffee.png")
     (scene,) = model(photo)
     rendering = TiledRasterizer()(scene[None], model.camera(photo)[None, None])
-    assert psnr(rendering.over(0.5)[0], photo.image[None]).item() > 20
+    assert psnr(rendering.over(0.5)[0], photo.image[None]).item() > 24
     depth = rendering.depth[0, 0, 0]
-    assert depth[24:40, 24:40].mean() < depth[:6].mean() - 0.3
+    assert depth[48:80, 48:80].mean() < depth[:12].mean() - 0.3
 
 
 def test_samples_fit_the_image_they_are_drawn_for(tmp_path, monkeypatch):
