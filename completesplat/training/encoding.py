@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -32,7 +33,7 @@ from completesplat.data.loading.latent_cache import (
     latent_schema,
     write_manifest,
 )
-from completesplat.data.loading.scenes import SceneStore
+from completesplat.data.loading.scenes import LoadedScenes, SceneStore, collate
 from completesplat.data.loading.view_selection import spread_around
 from completesplat.data.packed.manifest import MANIFEST
 from completesplat.data.packed.source import PackedSource
@@ -42,7 +43,6 @@ from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import atomic_path
 from completesplat.scene import SceneBatch
 from completesplat.signals import leave_to_parent
-from completesplat.tensors import stack
 from completesplat.version import __version__
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
@@ -163,9 +163,7 @@ def encode_training_set(
     sequences = [CachedSequence(name, count, tuple(spread_places(count, frames))) for name, count in counts.items()]
     places = [(sequence.name, place) for sequence in sequences for place in sequence.stored]
     references = References(SceneStore(source), views, places)
-    if isinstance(first := references[0], DataError):
-        raise first
-    blank = encode(stack([first]))
+    blank = encode(_scenes(collate([references[0]])))
     _check_space(len(places), len(sequences), sum(rows.nbytes for rows in blank.values()), out)
     batches = _encoded_batches(references, encode, batch_size, data.workers, progress)
     if processes()[0] == 0:
@@ -185,8 +183,8 @@ def _packed(data: SceneDataModule) -> PackedSource:
 
 
 @dataclass(frozen=True)
-class References(Dataset[SceneBatch | DataError]):
-    """Dataset of the frames to encode with the views around them, or of the error of a frame that cannot be read.
+class References(Dataset[LoadedScenes]):
+    """Dataset of the frames to encode, with the views around them.
 
     Args:
         views: number of other views, evenly spread over the sequence.
@@ -200,18 +198,21 @@ class References(Dataset[SceneBatch | DataError]):
     def __len__(self) -> int:
         return len(self.places)
 
-    def __getitem__(self, index: int) -> SceneBatch | DataError:
+    def __getitem__(self, index: int) -> LoadedScenes:
         name, place = self.places[index]
         try:
             sequence = self.store.source.read(name)
-            return self.store.scene(sequence, place, spread_around(len(sequence.frames), place, self.views))
-        except DataError as error:  # as it is: a worker process would send another class with another message
-            return error
+            views = spread_around(len(sequence.frames), place, self.views)
+            return LoadedScenes(self.store.scene(sequence, place, views), ())
+        except DataError as error:
+            return LoadedScenes(None, (error,))
 
 
-def _stacked(scenes: Sequence[SceneBatch | DataError]) -> SceneBatch | DataError:
-    errors = [scene for scene in scenes if isinstance(scene, DataError)]
-    return errors[0] if errors else stack([scene for scene in scenes if not isinstance(scene, DataError)])
+def _scenes(loaded: LoadedScenes) -> SceneBatch:
+    if loaded.refused:
+        raise loaded.refused[0]
+    assert isinstance(loaded.scenes, SceneBatch)
+    return loaded.scenes
 
 
 def _encoded_batches(
@@ -224,19 +225,13 @@ def _encoded_batches(
     rank, count = processes()
     everything = list(range(len(references)))
     batches = [everything[first : first + batch_size] for first in everything[::batch_size]]
-    local = batches[rank::count]
-    loaded = iter(
-        DataLoader(
-            references, batch_sampler=local, num_workers=workers, collate_fn=_stacked, worker_init_fn=leave_to_parent
-        )
-    )
+    settings: dict[str, Any] = {"num_workers": workers, "collate_fn": collate, "worker_init_fn": leave_to_parent}
+    loaded = iter(DataLoader(references, batch_sampler=batches[rank::count], **settings))
     for first in track(range(0, len(batches), count), "encoding", disable=not progress or rank > 0):
         result: tuple[Rows, Sums] | DataError | None = None
         if first + rank < len(batches):
             try:
-                if isinstance(scenes := next(loaded), DataError):
-                    raise scenes
-                rows = encode(scenes)
+                rows = encode(_scenes(next(loaded)))
                 _refuse_not_finite(rows, references, batches[first + rank])
                 result = rows, moment_sums(rows["mean"], rows["log_variance"])
             except DataError as error:  # all processes raise it below
