@@ -89,6 +89,8 @@ class Parameterization:
             (the paper states none). The clamp has no gradient outside and the full gradient inside.
         harmonics: largest degree of the spherical harmonics of colours. 0 is the paper's: one colour for all
             directions. Light that stands still while an object turns needs 1 or 2.
+        within_range: leave out Gaussians that their offset moves in front of the depth range (opacity 0). The paper
+            does not. From the side, they can lie before the object as a fog.
     """
 
     layers: Few = 2
@@ -99,6 +101,7 @@ class Parameterization:
     smallest_scale: Length = 1e-4
     largest_scale: Length = 2.0
     harmonics: Degree = 0
+    within_range: bool = False
 
     @property
     def groups(self) -> dict[str, Group]:
@@ -140,6 +143,9 @@ class SplatterImage(TensorDataclass):
         near, far = (x[..., None, None, None] for x in depth_range.unbind(-1))
         depth = LAYER_DEPTHS[settings.layer_depths](parts["depth"].squeeze(-3), near, far)
         rays = rearrange(pixel_rays(cameras), "... height width xyz -> ... 1 xyz height width")
+        opacity = parts["opacity"].sigmoid()
+        if settings.within_range:
+            opacity = opacity * (depth + parts["offset"].select(-3, 2) >= near).unsqueeze(-3)
         log_scale = parts["scale"].clamp(math.log(settings.smallest_scale), math.log(settings.largest_scale))
 
         def flat(values: Tensor) -> Tensor:
@@ -150,7 +156,7 @@ class SplatterImage(TensorDataclass):
             means=flat(rays * depth.unsqueeze(-3) + parts["offset"]),
             quaternions=normalize_quaternion(flat(parts["rotation"])),
             scales=flat(log_scale.exp()),
-            opacities=flat(parts["opacity"].sigmoid()).squeeze(-1),
+            opacities=flat(opacity).squeeze(-1),
             colors=colors if settings.harmonics else colors.clamp(min=0),
         )
         if not settings.harmonics:

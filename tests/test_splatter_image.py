@@ -136,6 +136,15 @@ def test_gaussians_start_with_the_scale_of_the_parameterization():
     torch.testing.assert_close(scales, torch.full_like(scales, 0.06), rtol=0.02, atol=0)
 
 
+@pytest.mark.parametrize(("back", "drawn"), [(1.9, True), (2.1, False)])
+def test_gaussians_in_front_of_the_depth_range_can_be_left_out(back, drawn):
+    """At a depth of 3 of 1 to 5, an offset of more than 2 towards the camera leaves the range."""
+    image = image_of(offset=torch.tensor([0.0, 0.0, -back]).view(3, 1, 1))
+    kept = image.gaussians(CAMERA, RANGE).opacities
+    within = SplatterImage(image.raw, Parameterization(within_range=True)).gaussians(CAMERA, RANGE)
+    assert torch.equal(within.opacities, kept if drawn else torch.zeros_like(kept))
+
+
 @pytest.mark.parametrize("degree", [1, 2])
 def test_harmonics_add_raw_values_at_the_end_of_a_layer_and_hardly_matter_at_first(degree):
     plain, further = Parameterization(), Parameterization(harmonics=degree)
