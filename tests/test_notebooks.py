@@ -4,14 +4,19 @@ import base64
 import io
 import json
 import re
+import runpy
 from copy import deepcopy
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from hydra.utils import instantiate
 from PIL import Image
+from safetensors.torch import save_file
 from stored_notebooks import HASH, NOTEBOOKS, ROOT, WIDEST, code_cells, hash_of, slimmed
+from support import compose_config
 
 MOST_BYTES = 1_000_000
 IMPORT = re.compile(r"^from (completesplat[\w.]*) import ([\w, ]+)", re.MULTILINE)
@@ -63,3 +68,24 @@ def test_outputs_are_made_small_and_a_change_of_the_code_is_noticed():
     changed = deepcopy(notebook)
     code_cells(changed)[0]["source"] = ["1 + 1"]
     assert hash_of(changed) != hash_of(notebook)
+
+
+def test_an_autoreconstructor_of_twice_the_channels_computes_the_same(tmp_path):
+    """Posterior and Splatter Image, with a skip that passes something on."""
+
+    def network(channels: str):
+        torch.manual_seed(0)
+        sizes = [f"autoreconstructor.encoder.channels={channels}", "autoreconstructor.encoder.norm_groups=8"]
+        return instantiate(compose_config("fit", *sizes).autoreconstructor, _convert_="all").eval()
+
+    narrow, wide = network("[8,8,16]"), network("[16,16,32]")
+    torch.nn.init.normal_(narrow.reconstructor.skips["0"].weight)
+    save_file({f"autoreconstructor.{k}": v for k, v in narrow.state_dict().items()}, tmp_path / "model.safetensors")
+    runpy.run_path(str(ROOT / "notebooks/starts.py"))["main"](str(tmp_path), tmp_path / "start.ckpt", "wider")
+    state = torch.load(tmp_path / "start.ckpt", weights_only=True)["state_dict"]
+    wide.load_state_dict({name.removeprefix("model."): value for name, value in state.items()})
+    with torch.no_grad():
+        images = torch.rand(2, 3, 32, 32)
+        before, after = narrow(images), wide(images)
+    torch.testing.assert_close(after.posterior.mean, before.posterior.mean, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(after.splatter_image.raw, before.splatter_image.raw, rtol=1e-4, atol=1e-4)
