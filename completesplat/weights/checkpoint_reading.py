@@ -71,9 +71,9 @@ def _checked_pickle(path: Path, sums: bool) -> bytes:
         archive, listed = torch._C.PyTorchFileReader(str(path)), records.infolist()
         if sum(record.file_size for record in listed) > path.stat().st_size:
             raise TensorFileError("its parts are larger than the file")
-        # torch and zipfile may find different lists of records in a file.
+        # torch and zipfile may find different lists of records in a file; not if both have the first byte's record.
         places = [archive.get_record_header_offset(name) for name in archive.get_all_records()]  # type: ignore[attr-defined]
-        if places != [record.header_offset for record in listed]:
+        if places != [record.header_offset for record in listed] or 0 not in places:
             raise TensorFileError("damaged: it has two lists of its parts")
         # Of a directory, torch returns memory that nobody has written to.
         if any(record.external_attr & DIRECTORY for record in listed):

@@ -2,6 +2,9 @@
 
 import random
 import shutil
+import struct
+import zipfile
+import zlib
 from contextlib import suppress
 from functools import partial
 
@@ -59,6 +62,36 @@ def test_every_flipped_bit_and_every_cut_is_noticed_unless_it_changes_nothing(ch
         checkpoint.write_bytes(whole[:size])
         with pytest.raises(WeightsError, match=r"last\.ckpt: not a readable checkpoint"):
             check_whole(checkpoint)
+
+
+def two_lists(path, order: int) -> None:
+    """Give a checkpoint a second list of its parts, with the same places, in this order; zipfile reads it, torch not.
+
+    The end of an archive says where the list begins, and how long it is. torch goes by the one, zipfile by the other.
+    The parts begin at 65,536, because what zipfile reads as a place is larger than what stands there.
+    """
+    with zipfile.ZipFile(path) as records:
+        parts = [(record.filename, records.read(record)) for record in records.infolist()]
+    body, first, second = bytearray(b"PK\3\4".ljust(1 << 16, b"\0")), bytearray(), []
+    for name, content in parts:
+        sizes = struct.pack("<LLLHH", zlib.crc32(content), len(content), len(content), len(name), 0)
+        row = b"PK\1\2" + struct.pack("<6H", 20, 20, 0, 0, 0, 33) + sizes + struct.pack("<HHHL", 0, 0, 0, 0)
+        first += row + struct.pack("<L", len(body)) + name.encode()
+        second.append((row, len(body), name.encode()))
+        body += b"PK\3\4" + struct.pack("<5H", 20, 0, 0, 0, 33) + sizes + name.encode() + content
+    rows = [row + struct.pack("<L", place - len(first)) + name for row, place, name in second[::order]]
+    end = b"PK\5\6" + struct.pack("<4HLLH", 0, 0, len(parts), len(parts), len(first), len(body), 0)
+    path.write_bytes(body + first + b"".join(rows) + end)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_file_with_two_lists_of_its_parts_is_refused(checkpoint, order):
+    """Sizes in the list that is not checked could be any."""
+    two_lists(checkpoint, order)
+    with zipfile.ZipFile(checkpoint) as records:
+        assert records.testzip() is None
+    assert torch.load(checkpoint, weights_only=True)["state_dict"].keys() == {"weight", "bias"}
+    assert "two lists of its parts" in refusal(checkpoint)
 
 
 def test_a_damaged_checkpoint_is_refused_where_weights_are_loaded(checkpoint):
