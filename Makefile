@@ -43,7 +43,7 @@ demo: $(READY) ## Complete four images with the weights in the package, and scor
 	@echo "                sample_0*.ply open in any splat viewer, orbit_0*.mp4 in any player"
 	@echo "  couch/        the same for a rendered couch that training never saw"
 	@echo "  toy/          the same for a toy scene that training never saw"
-	@echo "  photograph/   the same for a photograph of a cup, by weights that have seen no photograph: it keeps its front"
+	@echo "  photograph/   the same for a photograph of a cup, by weights for photographs of anything: it keeps its front"
 	@echo "  test/         metrics.json: scores of one sample for each held-out toy scene, beside naive predictors"
 	@echo "Next: $(BIN)/completesplat predict image=FILE, and make demo-train for both stages of training"
 
