@@ -223,8 +223,7 @@ def _encoded_batches(
     Sums are computed before rows are sent, because sending changes the rows' memory order and so the rounding.
     """
     rank, count = processes()
-    everything = list(range(len(references)))
-    batches = [everything[first : first + batch_size] for first in everything[::batch_size]]
+    batches = [batch.tolist() for batch in torch.split(torch.arange(len(references)), batch_size)]
     settings: dict[str, Any] = {"num_workers": workers, "collate_fn": collate, "worker_init_fn": leave_to_parent}
     loaded = iter(DataLoader(references, batch_sampler=batches[rank::count], **settings))
     for first in track(range(0, len(batches), count), "encoding", disable=not progress or rank > 0):
