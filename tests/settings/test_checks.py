@@ -128,7 +128,7 @@ def test_a_wrong_value_is_reported_under_the_setting_that_the_user_gave():
         ("fit data.foo=3", r"no setting 'data.foo' of completesplat fit; completesplat fit --help shows .* them$"),
         ("fit trainer.max_epochs=3", r"no setting .*; \+trainer.max_epochs=VALUE adds it$"),
         ("fit loss.terms.mine=null", r"no setting .*; \+loss.terms.mine=VALUE adds it$"),
-        ("fit experiment=toy_vr", r"no experiment 'toy_vr': there are capture, .*; did you mean toy_var"),
+        ("fit experiment=toy_vr", r"no experiment 'toy_vr': there are anything_diffusion, .*; did you mean toy_var"),
         ("fit ablation=no_skip", r"no ablation 'no_skip': there are full, .*; did you mean no_skips"),
         ("fit -m loss=stge1,stage2", r"no loss 'stge1': .* perceptual, splats, stage1, stage2; did you mean stage1"),
         ("fit data=null", r"data=null: choose one of capture, captures, co3d_category, "),
