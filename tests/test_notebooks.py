@@ -18,6 +18,10 @@ from safetensors.torch import save_file
 from stored_notebooks import HASH, NOTEBOOKS, ROOT, WIDEST, code_cells, hash_of, slimmed
 from support import compose_config
 
+from completesplat import compose
+from completesplat.commands import fit
+from completesplat.data.toy import write_objects
+
 MOST_BYTES = 1_000_000
 IMPORT = re.compile(r"^from (completesplat[\w.]*) import ([\w, ]+)", re.MULTILINE)
 
@@ -89,3 +93,21 @@ def test_an_autoreconstructor_of_twice_the_channels_computes_the_same(tmp_path):
         before, after = narrow(images), wide(images)
     torch.testing.assert_close(after.posterior.mean, before.posterior.mean, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(after.splatter_image.raw, before.splatter_image.raw, rtol=1e-4, atol=1e-4)
+
+
+def test_a_data_set_written_as_captures_has_the_same_views(tmp_path):
+    """Six of eight frames: images up to JPEG, cameras, and the place of the object in the depth range."""
+    write_objects(tmp_path / "toys", scenes=6, frames=8, size=32, seed=0, workers=1, progress=False)
+    depths = ["data.image_size=32", "data.depth_before=1", "data.depth_after=3"]
+    toys, out = ["data=toy_objects", f"data.root={tmp_path / 'toys'}", *depths], tmp_path / "captures"
+    runpy.run_path(str(ROOT / "notebooks/as_captures.py"))["main"](str(out), "toy_", "6", "train", *toys)
+    settings = ["data=captures", f"data.root={out}", "data.test_fraction=0", "data.val_fraction=0", *depths]
+    source, written = (fit.instantiate(compose("fit", *given))[0].source("train") for given in (toys, settings))
+    (name, *_) = written.names
+    first, again = source.read(name.removeprefix("toy_")), written.read(name)
+    kept = [0, 1, 2, 4, 5, 6]
+    poses = [cameras.relative_to(cameras[0]).world_to_camera for cameras in (first.cameras[kept], again.cameras)]
+    torch.testing.assert_close(poses[1], poses[0], atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(again.depth_ranges, first.depth_ranges[kept], atol=1e-3, rtol=1e-3)
+    for place, frame in enumerate(kept):
+        assert (again.read(place).image.float() - first.read(frame).image.float()).abs().mean() < 6
