@@ -1,4 +1,4 @@
-"""Checkpoints that a training can start from, made of shipped weights (experiments.md, "Anything").
+"""Checkpoints that a training can start from, made of other weights (experiments.md, "Anything").
 
 python notebooks/starts.py WEIGHTS START1 [wider]   # stage 1's: model.checkpoint=START1
 python notebooks/starts.py WEIGHTS START2 RUN1      # stage 2's: RUN1's autoreconstructor, the other networks of WEIGHTS

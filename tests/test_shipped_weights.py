@@ -45,7 +45,7 @@ def test_samples_agree_with_the_photo_in_front_and_differ_behind(name, backgroun
 
 
 def test_a_photo_of_anything_keeps_its_front_and_gets_depth():
-    """A cup, and none in training: the input view, without fitting, and a relief."""
+    """A cup in a photo that training never saw: the input view, without fitting, and a relief."""
     model = CompleteSplat.from_pretrained(GENERAL)
     photo = model.read(Path(skimage.__file__).parent / "data/coffee.png")
     (scene,) = model(photo)
