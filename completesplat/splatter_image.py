@@ -89,8 +89,8 @@ class Parameterization:
             (the paper states none). The clamp has no gradient outside and the full gradient inside.
         harmonics: largest degree of the spherical harmonics of colours. 0 is the paper's: one colour for all
             directions. Light that stands still while an object turns needs 1 or 2.
-        within_range: leave out Gaussians that their offset moves in front of the depth range (opacity 0). The paper
-            does not. From the side, they can lie before the object as a fog.
+        within_range: give opacity 0 to Gaussians that their offset moves nearer than the depth range, because they
+            can hide the object like a fog from other sides. The paper keeps them.
     """
 
     layers: Few = 2

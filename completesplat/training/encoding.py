@@ -188,7 +188,7 @@ class References(Dataset[LoadedScenes]):
 
     Args:
         views: number of other views, evenly spread over the sequence.
-        places: the sequence's name and the frame's index.
+        places: the sequence's name and the frame's index, of each item.
     """
 
     store: SceneStore
