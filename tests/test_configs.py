@@ -39,7 +39,7 @@ DELTAS = ["experiment", "ablation", "posterior", "objective"]
 def needed(group: str, option: str) -> list[str]:
     """Return the settings that an option needs besides, so that nothing is missing in its config."""
     given = ["data.category=y"] if option == "co3d_category" else []
-    rooted = ("capture", "co3d_", "paper_", "realestate10k", "rendered", "turntable")
+    rooted = ("anything_", "capture", "co3d_", "paper_", "realestate10k", "rendered", "turntable")
     given += ["data.root=x"] if option.startswith(rooted) else []
     given += ["autoreconstructor.pretrained=null"] if option.endswith(("_var_stage1", "stable_diffusion")) else []
     given += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked")) else []
