@@ -5,11 +5,13 @@ import json
 import math
 import os
 import statistics
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from hydra.experimental.callback import Callback
@@ -18,9 +20,13 @@ from hydra.utils import instantiate as build
 from lightning.pytorch.callbacks import WeightAveraging
 from omegaconf import DictConfig, OmegaConf
 
+from completesplat.data.loading.data_module import MOST_WORKERS
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
 from completesplat.files import write_json
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras
+from completesplat.rasterizers import Rendering
 from completesplat.results.tables import Table, records_table, show
 from completesplat.scene import Batch, SceneBatch
 from completesplat.settings.checks import check_image_size, check_optimizer, each_part, remove_start_weights
@@ -28,21 +34,37 @@ from completesplat.settings.options import did_you_mean
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.scoring import synchronized_time
 from completesplat.training.stage import Stage
-from completesplat.training.step_counts import StepCounts, count_step, with_latents
-from completesplat.training.steps import MEBIBYTE, Training, peak_megabytes, synthetic_batch
+from completesplat.training.step_counts import Operation, StepCounts, count_step, with_latents
+from completesplat.training.steps import MEBIBYTE, Training, autocast, peak_megabytes, synthetic_batch
 
 HERE = "this"
 MOST_TIMED = 1e9  # bytes that a timed step may take on a CPU
-UNTIMED_STEPS, TIMED_STEPS = 2, 5
+UNTIMED_STEPS, TIMED_STEPS, TIMED_BATCHES = 2, 5, 5
 BYTES, DAY = 1e9, 24 * 3600
+GAUSSIANS = 2  # of a pixel
 REMARKS = (
-    "FLOPs are those of both passes and the optimizer, without the rasterizer and elementwise operations.",
-    "Not counted: exchange of gradients between GPUs, validation, tests, checkpoints, waiting for data.",
-    "The paper, on one A100: 15.7 ms to reconstruct an image, 2.7 s a sample, 29.1 ms to render; stage 1 took 6 days, "
-    "stage 2 2 days, which is 157 ms a step.",
+    "An operation takes the longest of its FLOPs, its reads and writes, and its start; the rasterizer a time for each "
+    "Gaussian and view. Not counted: exchange of gradients between GPUs, images drawn during training, the test.",
 )
-ASSUMED = ("gpu", "devices", "share", "operation_us", "price", "usable", "pixel_bytes", "loading_rate")
+PAPER = (
+    "The paper's step (6 and 2 days for its stages, on one A100) took {:.2g} times as long. What is left may be views "
+    "that are rendered one after the other, images decoded at full size in every step, float32, or more views of a "
+    "scene: the paper states none of them, nor whether its days include validation."
+)
+ASSUMED = (
+    *("gpu", "devices", "share", "bandwidth_share", "operation_us", "gaussian_ns", "checkpoint_rate"),
+    *("price", "currency", "usable", "pixel_bytes", "loading_rate"),
+)
 ADDED = ("steps", "days", "gpu_hours", "price")
+
+
+class Speeds(NamedTuple):
+    """FLOPs and bytes of a second; seconds of the shortest operation, and of a Gaussian in a view, in both passes."""
+
+    flops: float
+    bandwidth: float
+    start: float
+    drawing: float
 
 
 def run(config: DictConfig, out: Path) -> None:
@@ -70,11 +92,23 @@ class Total(Callback):
 def plan_table(plans: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return a table with a column for each plan; several have a total, as for the stages of one recipe."""
     rows: list[dict[str, object]] = []
-    for key in [key for key in next(iter(plans.values())) if key not in ("assumptions", "remarks")]:
-        rows.append({"": key.replace("_", " "), **{name.replace("_", " "): plan[key] for name, plan in plans.items()}})
+    plans = {name: {**plan, **written_parts(plan)} for name, plan in plans.items()}
+    for key in [key for key in next(iter(plans.values())) if key not in ("assumptions", "remarks", "parts")]:
+        label = f"price, {next(iter(plans.values()))['assumptions']['currency']}" if key == "price" else key
+        rows.append(
+            {"": label.replace("_", " "), **{name.replace("_", " "): plan[key] for name, plan in plans.items()}}
+        )
         if len(plans) > 1:
             rows[-1]["total"] = sum(plan[key] for plan in plans.values()) if key in ADDED else None
     return records_table("completesplat plan", rows)
+
+
+def written_parts(plan: Mapping[str, Any]) -> dict[str, str]:
+    """Return the parts of a plan's time as text: ms a step, and the share."""
+    parts = plan.get("parts", {})
+    texts = {name: "not counted" if x is None else f"{x * 1e3:.3g}" for name, x in parts.items()}
+    total = sum(filter(None, parts.values()))
+    return {f"{name}, ms a step": f"{texts[name]} ({(x or 0) / total:.0%})" for name, x in parts.items()}
 
 
 def plan_of(config: DictConfig) -> dict[str, Any]:
@@ -92,44 +126,108 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
     steps, counts, limit = steps_of(config, sequences), count_work(config, batch), memory_limit(config)
     flops, measured, fits = counts.flops * config.devices, None, counts.peak <= limit
     if config.gpu == HERE:
-        seconds, measured = measure_steps(config, counts, batch)
-        seconds *= accumulated
-        speed = f"measured here, {flops / seconds / 1e12:.3g} TFLOP/s"
+        seconds, measured, speeds = measure_steps(config, counts, batch)
+        parts = parts_of_step(counts, speeds)
+        parts["measured, not counted"] = seconds * accumulated - sum(parts.values())
     else:
-        seconds, speed = seconds_on(config, counts)
-    rate = data.batch_size * (1 if data.latent_cache is not None else 1 + data.targets) / seconds
-    hours, images = steps * seconds * config.devices / 3600, sequences * frames
+        speeds = speeds_of_gpu(config)
+        parts = parts_of_step(counts, speeds)
+    seconds = sum(parts.values())
+    views, loading = 1 if data.latent_cache is not None else 1 + data.targets, loading_seconds(config)
+    parts |= parts_beside_steps(config, counts, speeds, batch, seconds, loading)
+    rate, total = data.batch_size * views / seconds, sum(filter(None, parts.values()))
+    processes = math.ceil(rate / config.loading_rate if loading is None else data.batch_size / seconds * loading)
+    hours, images = steps * total * config.devices / 3600, sequences * frames
     stored = None if counts.latent_bytes is None else counts.latent_bytes * images / BYTES
+    paper = OmegaConf.select(config, f"paper.{config.evaluation.data_set}.seconds_a_step")
+    remarks = [*([] if fits else advice(config, counts, batch, limit)), *REMARKS]
     assumed = {key: config[key] for key in ASSUMED}
     return {
         **{"trained_parameters": counts.trained, "frozen_parameters": counts.frozen, "flops_of_a_step": flops},
-        **{"operations_of_a_step": counts.operations},
+        **{"operations_of_a_step": len(counts.operations)},
+        **{"bytes_of_a_step": sum(operation.bytes for operation in counts.operations)},
         **{f"{kind.replace(' ', '_')}_GB": size / BYTES for kind, size in counts.memory.items()},
         **{"memory_GB": counts.peak / BYTES, "memory_measured_GB": measured, "usable_GB": limit / BYTES, "fits": fits},
-        **{"seconds_a_step": seconds, "images_a_second": rate},
-        **{"loading_processes": math.ceil(rate / config.loading_rate)},
+        **{"seconds_a_step": seconds, "images_a_second": rate, "loading_processes": processes},
         **{"prepared_data_GB": images * data.image_size**2 * config.pixel_bytes / BYTES, "latents_GB": stored},
-        **{"steps": steps, "days": steps * seconds / DAY, "gpu_hours": hours, "price": hours * config.price},
+        **{"steps": steps, "days": steps * total / DAY, "gpu_hours": hours, "price": hours * config.price},
+        **{"paper_seconds_a_step": paper, "parts": parts},
         "assumptions": {**assumed, "sequences": sequences, "frames": frames, "precision": precision(config)},
-        "remarks": [f"Time of a step: {speed}.", *([] if fits else advice(config, counts, batch, limit)), *REMARKS],
+        "remarks": remarks if paper is None else [*remarks, PAPER.format(paper / total)],
     }
 
 
-def seconds_on(config: DictConfig, counts: StepCounts) -> tuple[float, str]:
-    """Return the seconds of a step on a GPU of the table, and in words what they are.
+def speeds_of_gpu(config: DictConfig) -> Speeds:
+    """Return the speeds of a GPU of the table; it draws Gaussians in proportion to its FLOPs in float32."""
+    gpu, table = config.gpus[config.gpu], config.gpus
+    flops = gpu["float32" if precision(config).startswith("32") else "bfloat16"] * 1e12 * config.share
+    drawing = config.gaussian_ns * 1e-9 * table.h200.float32 / gpu.float32
+    return Speeds(flops, gpu.bandwidth * 1e12 * config.bandwidth_share, config.operation_us * 1e-6, drawing)
 
-    A step takes the time of its FLOPs and that of changing the weights: weights, gradients (also to clip them), the
-    optimizer's state and averages are read and written as fast as the memory allows. It takes at least as long as
-    starting its operations one after the other.
+
+def seconds_of(operations: Iterable[Operation], speeds: Speeds) -> dict[str, float]:
+    """Return the seconds of operations one after the other, each counted where it takes the longest."""
+    parts = {"matrix products": 0.0, "reads and writes": 0.0, "starts of operations": 0.0}
+    for flops, size in operations:
+        times = dict(zip(parts, (flops / speeds.flops, size / speeds.bandwidth, speeds.start), strict=True))
+        longest = max(times, key=lambda name: times[name])
+        parts[longest] += times[longest]
+    return parts
+
+
+def parts_of_step(counts: StepCounts, speeds: Speeds) -> dict[str, float]:
+    """Return the seconds of a step by what takes them."""
+    drawing = counts.drawn * counts.accumulated * speeds.drawing
+    return {**seconds_of(counts.operations, speeds), "rasterizer": drawing}
+
+
+def parts_beside_steps(
+    config: DictConfig, counts: StepCounts, speeds: Speeds, batch: int, seconds: float, loading: float | None
+) -> dict[str, float | None]:
+    """Return the seconds of a step's share of waiting for data, of validation and of checkpoints; None: not counted.
+
+    A validation is taken to need a step's forward pass for the scenes, once for each step of the sampler, and to draw
+    in a third of the time of both passes. A checkpoint holds the weights, the optimizer's state and averages.
+
+    Args:
+        batch: scenes of a batch of this process.
+        seconds: of a step.
+        loading: seconds in which one process loads a scene; None: unknown.
     """
-    gpu, name = config.gpus[config.gpu], precision(config)
-    computing = counts.flops / (gpu["float32" if name.startswith("32") else "bfloat16"] * 1e12 * config.share)
-    changed = counts.memory["optimizer"] + counts.memory["averages"] + 3 * counts.memory["gradients"]
-    changing, starting = 2 * changed / (gpu.bandwidth * 1e12), counts.operations * config.operation_us * 1e-6
-    parts = f"{computing * 1e3:.3g} ms of FLOPs in {name} and {changing * 1e3:.3g} ms to change the weights"
-    if starting > computing + changing:
-        return starting, f"starting its operations, which hides {parts}; more or faster GPUs do not help"
-    return computing + changing, parts
+    data, trainer, checkpoint = config.data, config.trainer, config.callbacks.get("checkpoint") or {}
+    workers = min(MOST_WORKERS, os.cpu_count() or 1) if data.workers is None else data.workers
+    load = None if loading is None else loading * data.batch_size / config.devices / max(workers, 1)
+    waiting = load if load is None or workers == 0 else max(0.0, load - seconds)
+
+    scenes = trainer.limit_val_batches * data.evaluation_batch_size
+    part = data.evaluation_batch_size / batch
+    passes = trainer.limit_val_batches * (config.sampler.steps if "completesplat" in config.model else 1)
+    once = sum(seconds_of((Operation(flops * part, size * part) for flops, size in counts.forward), speeds).values())
+    views = data.get("evaluation_targets") or data.get("frames", config.frames) - 1
+    drawn = GAUSSIANS * data.image_size**2 * scenes * views * speeds.drawing / 3
+    validation = (passes * once + drawn) / trainer.val_check_interval
+
+    size = sum(counts.memory[kind] for kind in ("weights", "optimizer", "averages"))
+    by_steps, by_time = checkpoint.get("every_n_train_steps"), checkpoint.get("every_minutes")
+    often = (1 / by_steps if by_steps else 0.0) + (seconds / (60 * by_time) if by_time else 0.0)
+    writing = size / (config.checkpoint_rate * BYTES) * often
+    return {"waiting for data": waiting, "validation": validation, "checkpoints": writing}
+
+
+def loading_seconds(config: DictConfig) -> float | None:
+    """Return the seconds in which one process loads a scene on this machine, or None if there are no data."""
+    folders = [config.data[key] for key in ("root", "latent_cache") if not OmegaConf.is_missing(config.data, key)]
+    if not all(folder is None or Path(folder).is_dir() for folder in folders) or len(folders) < 2:
+        return None
+    data = build({**config.data, "workers": 0}, _convert_="all")
+    data.setup("fit")
+    seconds, batches = [], iter(data.train_dataloader())
+    next(batches)  # opens files and compiles
+    start = time.perf_counter()
+    for _ in islice(batches, TIMED_BATCHES):
+        seconds.append(time.perf_counter() - start)
+        start = time.perf_counter()
+    return statistics.median(seconds) / data.batch_size if seconds else None
 
 
 def precision(config: DictConfig) -> str:
@@ -178,9 +276,10 @@ def count_work(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
     data, make = config.data, partial(build, copied.model, _convert_="all")
     sizes = (data.image_size, batch, data.targets, precision(config), config.trainer.accumulate_grad_batches)
     counts = count_step(make, *sizes, data.latent_cache is not None, gpu)
-    more = {"averages": counts.memory["weights"] if averaged else 0}
-    more |= {"copies for ddp": counts.memory["gradients"] if config.devices > 1 else 0}
-    return replace(counts, memory={**counts.memory, **more})
+    weights = counts.memory["weights"] if averaged else 0
+    more = {"averages": weights, "copies for ddp": counts.memory["gradients"] if config.devices > 1 else 0}
+    update = [*counts.update, Operation(0, 3 * weights)]  # weights and averages are read, averages are written
+    return replace(counts, update=update, memory={**counts.memory, **more})
 
 
 def memory_limit(config: DictConfig) -> float:
@@ -217,8 +316,8 @@ def advice(config: DictConfig, counts: StepCounts, batch: int, limit: float) -> 
     return lines or [f"No setting here makes it fit: {reason}."]
 
 
-def measure_steps(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, float | None]:
-    """Return the median seconds of real steps on this machine with `batch` scenes, and their peak in GB, if known.
+def measure_steps(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, float | None, Speeds]:
+    """Return the median seconds of real steps here with `batch` scenes, their peak in GB, if known, and the speeds.
 
     On a CPU, steps with fewer scenes are timed, and their memory not measured, if a whole batch takes more than 1 GB.
 
@@ -238,15 +337,39 @@ def measure_steps(config: DictConfig, counts: StepCounts, batch: int) -> tuple[f
     inputs: Batch = synthetic_batch(config.data.image_size, scenes, config.data.targets).to(device)
     if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch) and config.data.latent_cache is not None:
         inputs = with_latents(module, inputs)
-    training, seconds = Training(module, precision(config)), []
+    training, drawn, rasterizer = Training(module, precision(config)), [], module.rasterizer
 
-    def step() -> None:
-        start = synchronized_time()
-        training.step(inputs)
-        seconds.append(synchronized_time() - start)
+    def keeping(gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        drawn[:] = gaussians, cameras
+        return rasterizer(gaussians, cameras)
 
-    for _ in range(UNTIMED_STEPS + TIMED_STEPS):
-        step()
-    growth = peak_megabytes(step, device)
+    def draw() -> None:
+        gaussians = drawn[0].map(lambda tensor: tensor.detach().requires_grad_())
+        torch.autograd.backward([rasterizer(gaussians, drawn[1]).color.sum()])
+
+    module.rasterizer = keeping
+    seconds = median_seconds(lambda: training.step(inputs))
+    drawing = median_seconds(draw) / (drawn[0].opacities.numel() * drawn[1].intrinsics.shape[1]) if drawn else 0.0
+    growth = peak_megabytes(lambda: training.step(inputs), device)
     peak = None if growth is None or scenes < batch else (fixed + growth * MEBIBYTE) / BYTES
-    return statistics.median(seconds[UNTIMED_STEPS:-1]) * batch / scenes, peak
+    return seconds * batch / scenes, peak, measured_speeds(config, device, drawing)
+
+
+def median_seconds(work: Callable[[], object]) -> float:
+    seconds = []
+    for _ in range(UNTIMED_STEPS + TIMED_STEPS):
+        start = synchronized_time()
+        work()
+        seconds.append(synchronized_time() - start)
+    return statistics.median(seconds[UNTIMED_STEPS:])
+
+
+def measured_speeds(config: DictConfig, device: torch.device, drawing: float) -> Speeds:
+    """Return this machine's speeds: a 3 x 3 convolution, and sums of 4 MB and of one number."""
+    images, weights = torch.rand(8, 64, 32, 32, device=device), torch.rand(64, 64, 3, 3, device=device)
+    many, one = torch.rand(2**20, device=device), torch.rand(1, device=device)
+    with autocast(device, precision(config)):
+        flops = 2 * 9 * 64 * images.numel() / median_seconds(lambda: torch.conv2d(images, weights, padding=1))
+    bandwidth = 3 * many.nbytes / median_seconds(lambda: many + many)
+    start = median_seconds(lambda: [one + one for _ in range(1000)]) / 1000
+    return Speeds(flops, bandwidth, start, drawing)

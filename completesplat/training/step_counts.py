@@ -1,15 +1,15 @@
-"""Parameters, FLOPs and memory of one optimizer step, counted on fake tensors, which have shapes but no values.
+"""Parameters, operations and memory of one optimizer step, counted on fake tensors, which have shapes but no values.
 
-Multiplications and additions of matrix products, convolutions and attention are counted, forward and backward, as by
-`torch.utils.flop_counter`; elementwise operations and the rasterizer are not. Memory is what is alive at the same time:
-fake tensors are freed when real ones would be.
+Each operation has its FLOPs (those of matrix products, convolutions and attention, as in `torch.utils.flop_counter`)
+and the bytes that it reads and writes; the rasterizer has its Gaussians. Memory is what is alive at the same time: fake
+tensors are freed when real ones would be.
 """
 
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -35,13 +35,22 @@ aten = torch.ops.aten
 # torch's counter knows the attention kernels of GPUs only.
 FORWARD: Any = flop_counter.sdpa_flop_count
 BACKWARD: Any = flop_counter.sdpa_backward_flop_count
-ATTENTION: dict[Any, Callable[..., Any]] = {
-    aten._scaled_dot_product_flash_attention_for_cpu: lambda *shapes, **_: FORWARD(*shapes[:3]),
-    aten._scaled_dot_product_flash_attention_for_cpu_backward: lambda *shapes, **_: BACKWARD(*shapes[:4]),
+of_shapes: Any = flop_counter.shape_wrapper
+FLOPS: dict[Any, Callable[..., int]] = {
+    **flop_counter.flop_registry,
+    aten._scaled_dot_product_flash_attention_for_cpu: of_shapes(lambda *shapes, **_: FORWARD(*shapes[:3])),
+    aten._scaled_dot_product_flash_attention_for_cpu_backward: of_shapes(lambda *shapes, **_: BACKWARD(*shapes[:4])),
 }
 # Floats for each Gaussian and view: kept for the backward pass (gsplat: 2D mean, conic, depth, radii, colour, opacity,
 # tiles), and added by it (their gradients). The CPU's were measured with bench rasterizers.
 RASTERIZER_FLOATS = {"gpu": (16, 12), "cpu": (5, 40)}
+
+
+class Operation(NamedTuple):
+    """FLOPs of an operation of torch, and the bytes of the tensors that it reads and writes."""
+
+    flops: float
+    bytes: float
 
 
 @dataclass(frozen=True)
@@ -50,22 +59,35 @@ class StepCounts:
 
     Attributes:
         trained, frozen: numbers of parameters.
-        flops: of all accumulated batches and the optimizer.
-        operations: of all accumulated batches, each of which starts a kernel; the optimizer's few are left out.
+        forward, backward, update: operations of the passes of one batch, and of the optimizer.
+        accumulated: number of batches.
+        drawn: Gaussians of a batch, once for each view that they are drawn in.
         memory: bytes at the moment when most are in use, by kind.
         latent_bytes: bytes of one encoded image in a latent cache; None without latents.
     """
 
     trained: int
     frozen: int
-    flops: int
-    operations: int
+    forward: list[Operation]
+    backward: list[Operation]
+    update: list[Operation]
+    accumulated: int
+    drawn: int
     memory: Mapping[str, int]
     latent_bytes: int | None
 
     @property
     def peak(self) -> int:
         return sum(self.memory.values())
+
+    @property
+    def operations(self) -> list[Operation]:
+        """Return the operations of all accumulated batches and of the optimizer."""
+        return (self.forward + self.backward) * self.accumulated + self.update
+
+    @property
+    def flops(self) -> float:
+        return sum(operation.flops for operation in self.operations)
 
 
 class WithoutInitialWeights(TorchFunctionMode):
@@ -92,17 +114,30 @@ def normalize_in_float32(module: nn.Module) -> None:
             part.register_forward_pre_hook(cast)
 
 
+def bytes_moved(arguments: object, results: object) -> int:
+    """Return the bytes of all tensors read and written; an operation without results changes what it has read."""
+    read, written = (
+        [min(x.nbytes, x.untyped_storage().nbytes()) for x in tree_leaves(tree) if isinstance(x, Tensor)]
+        for tree in (arguments, results)
+    )
+    return sum(read) + sum(written or read)
+
+
 class LiveMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Mode that counts the bytes of all tensors that are alive, storages once, their maximum, and operations."""
+    """Mode that counts the bytes of all tensors that are alive, storages once, their maximum, and lists operations."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.bytes = self.peak = self.operations = 0
+        self.bytes = self.peak = 0
+        self.operations: list[Operation] = []
         self.known: weakref.WeakSet[Any] = weakref.WeakSet()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        results = func(*args, **(kwargs or {}))
-        self.operations += func.namespace == "aten" and not func.is_view and "empty" not in func.name()
+        kwargs = kwargs or {}
+        results = func(*args, **kwargs)
+        if func.namespace == "aten" and not func.is_view and "empty" not in func.name():
+            flops = FLOPS[func.overloadpacket](*args, **kwargs, out_val=results) if func.overloadpacket in FLOPS else 0
+            self.operations.append(Operation(flops, bytes_moved((args, kwargs), results)))
         for tensor in tree_leaves(results):
             if isinstance(tensor, Tensor) and (storage := tensor.untyped_storage()) not in self.known:
                 self.known.add(storage)
@@ -118,6 +153,11 @@ class LiveMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
         """Return the maximum since the last call."""
         peak, self.peak = self.peak, self.bytes
         return peak
+
+    def operations_since(self) -> list[Operation]:
+        """Return the operations since the last call."""
+        operations, self.operations = self.operations, []
+        return operations
 
 
 class _Store(torch.autograd.Function):
@@ -141,14 +181,16 @@ class _Store(torch.autograd.Function):
 
 
 class MemoryOnlyRasterizer:
-    """Rasterizer that takes the memory of the `cuda` backend on a GPU, or of `tiled`, and draws nothing."""
+    """Rasterizer that takes the memory of the `cuda` backend on a GPU, or of `tiled`, and counts what it draws."""
 
     def __init__(self, gpu: bool) -> None:
         self.floats = RASTERIZER_FLOATS["gpu" if gpu else "cpu"]
+        self.drawn = 0
 
     @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Return empty images of scenes [batch] from cameras [batch view]."""
+        self.drawn += gaussians.opacities.numel() * cameras.intrinsics.shape[1]
         image = _Store.apply(self.floats, cameras, *vars(gaussians).values())  # type: ignore[no-untyped-call]
         return Rendering(image[:, :, :3], image[:, :, 3:4], image[:, :, 4:])
 
@@ -194,32 +236,38 @@ def count_step(
             latent_bytes = 8 * encoded.mean[0].numel() + part * encoded.condition[0].numel() + 4
             inputs = encoded if cached else inputs
             del encoded
-        flops, operations, memory = _count(Training(module, precision), inputs, accumulated, live)
+        passes, memory = _count(Training(module, precision), inputs, live)
         memory = {"weights": weights, **memory, "batch": memory["batch"] - weights}
         trained = sum(p.numel() for p in module.parameters() if p.requires_grad)
         frozen = sum(p.numel() for p in module.parameters()) - trained
-        return StepCounts(trained, frozen, flops, operations, memory, latent_bytes)
+        drawn = getattr(module.rasterizer, "drawn", 0)
+        return StepCounts(trained, frozen, *passes, accumulated, drawn, memory, latent_bytes)
 
 
-def _count(training: Training, inputs: Batch, accumulated: int, live: LiveMemory) -> tuple[int, int, dict[str, int]]:
-    """Return FLOPs, operations and memory of a step; the weights are part of the batch's."""
-    counter = flop_counter.FlopCounterMode(display=False, custom_mapping=ATTENTION)
-    before, first = live.bytes, live.operations
+def _count(training: Training, inputs: Batch, live: LiveMemory) -> tuple[list[list[Operation]], dict[str, int]]:
+    """Return the operations of both passes and the update, and the memory; the weights are part of the batch's."""
+    before, operations = live.bytes, []
     live.peak_since()
-    with counter:
-        loss = training.loss(inputs)
-        forward, kept = live.peak_since(), live.bytes - before
-        torch.autograd.backward([loss])
-        backward, flops, operations = live.peak_since(), counter.get_total_flops(), live.operations - first
-        training.update()
+    live.operations_since()
+    loss = training.loss(inputs)
+    forward, kept = live.peak_since(), live.bytes - before
+    operations.append(live.operations_since())
+    torch.autograd.backward([loss])
+    backward = live.peak_since()
+    operations.append(live.operations_since())
+    training.update()
+    changed = live.peak_since()
+    live.operations_since()
+    training.update()  # the first one also makes the optimizer's state
+    operations.append(live.operations_since())
     gradients = sum(p.grad.nbytes for p in training.module.parameters() if p.grad is not None)
     states = tree_leaves(list(training.optimizer.state.values()))
     state = sum(x.nbytes for x in states if isinstance(x, Tensor))
     # Gradients of the last step are alive during the forward pass: Lightning removes them before the backward pass.
-    peak = max(forward + gradients + state, backward + state, live.peak_since())
+    peak = max(forward + gradients + state, backward + state, changed)
     memory = {"gradients": gradients, "optimizer": state, "batch": before, "activations": kept}
     memory["intermediate results"] = peak - sum(memory.values())
-    return flops * (accumulated - 1) + counter.get_total_flops(), operations * accumulated, memory
+    return operations, memory
 
 
 @contextmanager

@@ -52,7 +52,7 @@ class Training:
 
     def update(self) -> None:
         """Clip the gradients and change the weights."""
-        torch.nn.utils.clip_grad_norm_(self.module.parameters(), MAXIMAL_NORM)
+        torch.nn.utils.clip_grad_norm_(self.module.parameters(), MAXIMAL_NORM, foreach=True)
         self.optimizer.step()
 
 

@@ -4,8 +4,20 @@ import pytest
 from omegaconf import OmegaConf
 from support import NETWORKS, compose_config, strict_json
 
-from completesplat.commands.plan import Total, plan_of, precision, steps_of
+from completesplat.commands.plan import (
+    Speeds,
+    Total,
+    count_work,
+    loading_seconds,
+    parts_beside_steps,
+    plan_of,
+    precision,
+    seconds_of,
+    speeds_of_gpu,
+    steps_of,
+)
 from completesplat.settings.options import choices_of_verb
+from completesplat.training.step_counts import Operation
 
 SMALL = ["experiment=toy_diffusion", "data.image_size=32", *NETWORKS]
 
@@ -20,11 +32,13 @@ def test_a_plan_is_printed_and_written_and_a_sweep_ends_in_a_total(command, tmp_
     assert a100["fits"]
     assert not mine["fits"]
     assert mine["flops_of_a_step"] == a100["flops_of_a_step"]
-    assert mine["seconds_a_step"] == pytest.approx(mine["flops_of_a_step"] / (1e9 * 0.4), rel=0.1)
-    assert mine["days"] == pytest.approx(4000 * mine["seconds_a_step"] / 86400)
+    assert mine["parts"]["matrix products"] == pytest.approx(mine["flops_of_a_step"] / (1e9 * 0.4), rel=0.1)
+    assert mine["parts"]["waiting for data"] is None
+    assert mine["days"] == pytest.approx(4000 * sum(filter(None, mine["parts"].values())) / 86400)
     assert mine["price"] == pytest.approx(2 * mine["gpu_hours"]) == pytest.approx(2 * 24 * mine["days"])
-    assert a100["seconds_a_step"] == pytest.approx(8e-6 * a100["operations_of_a_step"])  # too small for such a GPU
-    assert "The paper, on one A100: 15.7 ms" in swept.out
+    assert a100["seconds_a_step"] == pytest.approx(8e-6 * a100["operations_of_a_step"], rel=0.01)  # too small a network
+    assert "waiting for data, ms a step" in swept.out
+    assert "price, USD" in swept.out
 
 
 def test_a_sweep_into_nested_folders_ends_in_its_total(tmp_path, capsys):
@@ -67,6 +81,46 @@ def test_this_machine_is_timed():
     plan = plan_of(compose_config("plan", *SMALL, "gpu=this", "data.batch_size=2"))
     assert plan["seconds_a_step"] > 0
     assert plan["memory_measured_GB"] is None or 0.3 < plan["memory_GB"] / plan["memory_measured_GB"] < 3
+
+
+def test_an_operation_takes_the_longest_of_its_flops_its_bytes_and_its_start():
+    speeds = Speeds(flops=100.0, bandwidth=10.0, start=0.5, drawing=0.0)
+    operations = [Operation(200, 10), Operation(50, 30), Operation(0, 40), Operation(0, 1)]
+    assert seconds_of(operations, speeds) == {"matrix products": 2, "reads and writes": 7, "starts of operations": 0.5}
+
+
+def test_a_gpu_of_half_the_flops_draws_half_as_fast():
+    config = compose_config("plan", "gpu=mine", "+gpus.mine={bfloat16: 1, float32: 33.5, memory: 1, bandwidth: 1}")
+    assert speeds_of_gpu(config).drawing == pytest.approx(2 * 5.8e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", ["paper_var_stage1", "paper_diffusion"])
+def test_the_papers_step_is_beside_ours_where_the_data_are_its(experiment):
+    plan = plan_of(compose_config("plan", f"experiment={experiment}", "gpu=a100"))
+    paper = {"paper_var_stage1": 6 * 86400 / 322_000, "paper_diffusion": 2 * 86400 / 1_100_000}[experiment]
+    assert plan["paper_seconds_a_step"] == pytest.approx(paper, rel=0.01)
+    assert "The paper's step" in plan["remarks"][-1]
+
+
+def test_data_that_are_here_are_loaded(tmp_path):
+    assert loading_seconds(compose_config("plan", *SMALL, f"data.root={tmp_path / 'absent'}")) is None
+    settings = [
+        "experiment=toy_var",
+        f"data.root={tmp_path}",
+        "data.image_size=16",
+        "data.scenes=8",
+        "data.batch_size=2",
+    ]
+    config = compose_config("plan", *settings, "data.workers=2")
+    seconds = loading_seconds(config)
+    assert 0 < seconds < 10
+    counts = count_work(config, 2)
+    speeds = Speeds(1e9, 1e9, 1e-6, 0.0)
+    beside = [parts_beside_steps(config, counts, speeds, 2, step, seconds) for step in (0.0, 2 * seconds)]
+    assert [part["waiting for data"] for part in beside] == [pytest.approx(seconds), 0]  # two processes load two scenes
+    assert beside[0]["checkpoints"] == pytest.approx(counts.memory["weights"] * 2 / 0.5e9 / 500, rel=0.1)
+    assert beside[0]["validation"] > 0
 
 
 def test_epochs_of_the_papers_data_are_the_papers_steps():

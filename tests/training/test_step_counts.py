@@ -47,6 +47,10 @@ def test_counts_are_those_by_hand() -> None:
     counts = count_step(TwoLayers, SIZE, BATCH, 0, "32-true", accumulated=2)
     assert counts.flops == 2 * (2 * first + 3 * second)
     assert (counts.trained, counts.frozen) == (8 * 27 + 8 + 4 * 8 + 4, 6)
+    weights, images, between, last = 8 * 27 + 8 + 4 * 8 + 4, 3 * pixels, 8 * pixels, 4 * pixels
+    moved = images + between + between + last + weights + last + 1  # both layers, and the mean
+    assert sum(operation.bytes for operation in counts.forward) == 4 * moved
+    assert counts.operations == 2 * (counts.forward + counts.backward) + counts.update
     kinds = counts.memory
     assert (kinds["weights"], kinds["gradients"]) == (4 * (counts.trained + 6), 4 * counts.trained)
     assert kinds["optimizer"] == 2 * 4 * counts.trained + 4 * 4  # and the number of the step for each tensor
