@@ -1,4 +1,4 @@
-"""The container's and conda's files name what exists; no engine builds them here (.github/workflows/docker.yml does)."""
+"""The files for containers and conda name what exists; a workflow builds them, because no engine is here."""
 
 import re
 import tomllib
