@@ -1,7 +1,7 @@
 """The site, in outputs/site: documents, notebooks, a gallery that turns, weights with scores, API (`make site`).
 
 Nothing is written twice: documents are copied with links that lead to pages, scores come from the weights' cards, and
-the gallery is what `completesplat predict` writes for photos that training never saw. Sphinx builds the pages.
+the gallery is what `completesplat predict` writes for the images of `make demo`. Sphinx builds the pages.
 """
 
 import ast
@@ -37,6 +37,7 @@ OPTIONS = {
     "html_theme": "furo",
     "html_title": "completesplat",
     "html_copy_source": "0",
+    "html_show_copyright": "0",
     "html_static_path": "style",
     "html_css_files": "wide.css",
     "highlight_language": "text",
@@ -51,6 +52,7 @@ SHOWN = {
     "photograph": ("general", "A photograph of a cup of coffee (scikit-image's), by weights for a photo of anything."),
 }
 SAMPLES = 2
+FIRST = "[Scenes that turn](gallery.md), [weights and their scores](weights.md), [API](api.md)."
 # Commands and tables of scores are wider than furo's text.
 STYLE = """
 .content { width: 54em }
@@ -108,13 +110,14 @@ def collect(tree: Path, gallery: Path) -> None:
         write(tree / page_of(path), path.read_bytes())
     for path in files(DOCUMENTS):
         page = page_of(path)
-        # A notebook has no links into the repository, and slashes and quotes of another kind.
+        # Links of notebooks are not changed: these lie in JSON, and none leads into the repository.
         write(
             tree / page, path.read_bytes() if page.suffix == ".ipynb" else moved(path.read_text(), path, page).encode()
         )
     first = tree / "index.md"
     title, badge, text = first.read_text().partition(" [![")  # a badge within a heading is drawn as large as its text
-    write(first, "\n".join([f"{title}\n\n{badge.strip()}{text}", *map(contents, CONTENTS, CONTENTS.values())]).encode())
+    text = f"{title}\n\n{FIRST} {badge.strip()}{text}"
+    write(first, "\n".join([text, *map(contents, CONTENTS, CONTENTS.values())]).encode())
     write(tree / "style/wide.css", STYLE.encode())
     write(tree / "weights.md", weights_page().encode())
     write(tree / "gallery.md", gallery_page(gallery).encode())
