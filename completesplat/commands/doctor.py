@@ -34,7 +34,7 @@ EXTRAS = {
     "perceptual": "to train on perceptual features without a download",
 }
 DEVICES = {
-    "cuda": "networks and splats of fit, test and view; splats of predict, whose networks run on the CPU",
+    "cuda": "networks and splats of all verbs but predict, which computes its networks on the CPU",
     "mps": "networks of fit, test and data latents, whose splats the CPU draws (tiled); all else runs on the CPU. Not"
     " run yet; PYTORCH_ENABLE_MPS_FALLBACK=1 has the CPU compute what MPS lacks",
     "cpu": "all networks and splats",
@@ -123,7 +123,7 @@ def check_device() -> Iterator[Finding]:
         yield Finding("GPU", "no", f"{reason}; all works on the CPU, slower")
     available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
     device = next(name for name, here in available.items() if here)
-    yield Finding("device", "yes", f"{device}: {DEVICES[device]}")
+    yield Finding("used device", "yes", f"{device}: {DEVICES[device]}")
     for name in FASTER:
         fault = failure(name, None)
         message = "a test rendering agrees with the reference" if fault is None else fault

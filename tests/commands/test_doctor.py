@@ -91,4 +91,4 @@ def test_the_device_is_named_with_what_runs_on_it(monkeypatch):
         monkeypatch.setattr("torch.cuda.is_available", lambda cuda=cuda: cuda)
         monkeypatch.setattr("torch.backends.mps.is_available", lambda mps=mps: mps)
         details = {finding.name: finding.details for finding in doctor.check_device()}
-        assert details["device"] == f"{device}: {doctor.DEVICES[device]}"
+        assert details["used device"] == f"{device}: {doctor.DEVICES[device]}"
