@@ -20,6 +20,7 @@ from completesplat.losses import Prediction, WeightedSum
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
 from completesplat.settings.schema import Positive, Range, Share
+from completesplat.tensors import as_float64
 
 POSITION_RATE, POSITION_DECAY = 1.6e-4, 0.01
 RATES = {"log_scales": 5e-3, "quaternions": 1e-3, "logits": 5e-2, "harmonics": 2.5e-3}
@@ -170,11 +171,12 @@ def scale_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"])
 
     Their double sum is written as one sum, by C(0, k) + ... + C(n - 1, k) = C(n, k + 1).
     """
-    n, o = copies.double()[:, None], opacity_of_copies(opacities.double(), copies)[:, None]
+    alpha, n = as_float64(opacities), as_float64(copies)[:, None]
+    o = opacity_of_copies(alpha, copies.to(alpha.device))[:, None]
     j = torch.arange(1, int(copies.max()) + 1, dtype=torch.float64, device=o.device)
     logarithm = torch.lgamma(n + 1) - torch.lgamma(j + 1) - torch.lgamma((n - j).clamp(min=0) + 1)
     terms = torch.where(j <= n, logarithm.exp() * o**j / j.sqrt(), 0) * (1 - 2 * ((j + 1) % 2))
-    return (opacities / terms.sum(-1)).to(opacities.dtype)
+    return (alpha / terms.sum(-1)).to(opacities)
 
 
 @torch.no_grad()

@@ -16,6 +16,7 @@ from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.baselines.preoptimized import occupied
 from completesplat.errors import CompleteSplatError
 from completesplat.splatter_image import SplatterImage
+from completesplat.tensors import as_float64
 
 Raw = Float[Tensor, "batch layer 15 height width"]
 
@@ -65,11 +66,11 @@ class SparseVAE(nn.Module):
     @torch.no_grad()
     def measure(self, images: Iterable[SplatterImage]) -> None:
         """Set the normalisation to the mean and standard deviation over the occupied places of these images."""
-        count, total, squares = (torch.zeros_like(self.mean, dtype=torch.float64) for _ in range(3))
+        count, total, squares = (torch.zeros_like(as_float64(self.mean)) for _ in range(3))
         for image in images:
             mask = occupied(image)[:, :, None]
-            raw = torch.where(mask, image.raw, 0.0).double()
-            count += mask.double().sum(dim=(0, 3, 4), keepdim=True)[0]
+            raw = as_float64(torch.where(mask, image.raw, 0.0))
+            count += as_float64(mask).sum(dim=(0, 3, 4), keepdim=True)[0]
             total += raw.sum(dim=(0, 3, 4), keepdim=True)[0]
             squares += raw.square().sum(dim=(0, 3, 4), keepdim=True)[0]
         mean = total / count.clamp(min=1)

@@ -128,7 +128,7 @@ def _result(path: Path, root: Path) -> ResultsFile:
         raise ValueError(f"it does not say how it was measured; {HOW}")
     if not entries:
         raise ValueError("it holds no scores by predictor")
-    return ResultsFile(path.parent, str(path.parent.relative_to(root)), cast(Protocol, protocol), entries)
+    return ResultsFile(path.parent, path.parent.relative_to(root).as_posix(), cast(Protocol, protocol), entries)
 
 
 def _mapping(value: object) -> Mapping[str, object]:

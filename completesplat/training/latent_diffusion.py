@@ -184,7 +184,7 @@ class LatentDiffusion(DiffusionScorer, Stage):
                     f"latents are {sizes[0]} and the conditioning's features {sizes[1]} in size: "
                     "conditioning.channels and autoreconstructor.encoder.channels must have as many levels"
                 )
-            drawn.append(latent.double().cpu())
+            drawn.append(latent.cpu().double())
         latents = torch.cat(gather_values(torch.cat(drawn) if drawn else torch.zeros(1, 1, 1, 1)))
         mean, std = latents.mean((0, 2, 3)), latents.std((0, 2, 3), correction=0)
         if not (std > 0).all():
