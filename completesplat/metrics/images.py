@@ -50,10 +50,11 @@ def load_or_missing(
 
 
 def values_of(metric: ImageMetric, predicted: Images, true: Images, counted: Counted) -> Tensor:
-    """Return a metric's values, one for each image, of float32 images in [0, 1]; where the metric is a network, move it.
+    """Return a metric's values, one for each image, of float32 images in [0, 1].
 
     An argument `masks` gets the pixels that count: all of them, or the object's, where other pixels are black. Metrics
-    of torchmetrics, which may average over the images of a call, are called for each image.
+    of torchmetrics, which may average over the images of a call, are called for each image. Networks are moved to the
+    images' device.
     """
     from torchmetrics import Metric
 
@@ -68,7 +69,7 @@ def values_of(metric: ImageMetric, predicted: Images, true: Images, counted: Cou
 
 
 def style_of(name: str, metric: Any) -> Style:
-    """Return the style of a metric: its attributes `heading`, `higher_is_better`, `decimals`, else those of its name."""
+    """Return a metric's style: its attributes `heading`, `higher_is_better`, `decimals`, else the style of its name."""
     known = STYLES.get(name, Style(name))
     higher = getattr(metric, "higher_is_better", None)
     better = known.better if higher is None else "↑" if higher else "↓"

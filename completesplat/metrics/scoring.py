@@ -124,7 +124,7 @@ class Evaluation:
             metric, true, counted = self.metrics[self.criterion], truth.images[1:], _counted(truth[1:], "full")
             by_noise = [values_of(metric, noise, true, counted).mean().item() for noise in noisy]
         by = [scores["full", "novel", self.criterion] for scores in each]
-        higher = self.styles[self.criterion].higher_is_better
+        higher = bool(self.styles[self.criterion].higher_is_better)
         curves = {"curve": expected_best_curve(by, higher), "curve_noisy_mean": expected_best_curve(by_noise, higher)}
         self.drawn[name] = {**curves, "diversity": diversity(images[:, 1:]), "ranks": ranks}
 

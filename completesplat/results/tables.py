@@ -63,7 +63,7 @@ def marks(values: Sequence[float | None], competing: Sequence[bool], style: Styl
     Scores are compared as they are written, so that scores which look equal share a mark; None was not measured. Naive
     predictors and upper bounds are not `competing` and have no mark, nor have metrics without a better direction.
     """
-    sign = {True: -1, False: 1}.get(style.higher_is_better)
+    sign = {"↑": -1, "↓": 1}.get(style.better)
     written = [
         sign * float(style.text(value)) if sign and competes and value is not None else None
         for value, competes in zip(values, competing, strict=True)
