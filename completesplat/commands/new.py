@@ -37,7 +37,7 @@ def new_files(kind: str, name: str) -> dict[Path, str]:
     if not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
         raise CompleteSplatError(f"name={name}: must be a Python name: letters, digits and underscores")
     classes = "".join(word.capitalize() for word in name.split("_"))
-    text = (TEMPLATES / f"{kind}.txt").read_text().replace("@toys@\n", (TEMPLATES / "_toys.txt").read_text())
+    text = (TEMPLATES / f"{kind}.txt").read_text().replace("@opened@\n", (TEMPLATES / "_opened.txt").read_text())
     text = text.replace("@name@", name).replace("@Name@", classes)
     _, *parts = FILE.split(text)
     files = {Path(path): body.strip("\n") + "\n" for path, body in zip(parts[::2], parts[1::2], strict=True)}
