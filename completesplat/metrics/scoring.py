@@ -134,8 +134,9 @@ class Evaluation:
         for region in REGIONS:
             for metric, style in self.styles.items():
                 values = [scores[region, "novel", metric] for scores in each]
-                if style.higher_is_better is not None:
-                    chosen[region, metric] = best_sample(values, style.higher_is_better)
+                numbers = not any(map(isnan, values))
+                if metric == self.criterion or (numbers and style.higher_is_better is not None):
+                    chosen[region, metric] = best_sample(values, bool(style.higher_is_better))
         by_criterion = {region: chosen[region, self.criterion] for region in REGIONS}
         scores = {key: each[by_criterion[key[0]]][key] for key in each[0]}
         self._add(BEST, name, scores, {region: images[i] for region, i in by_criterion.items()}, truth)

@@ -256,9 +256,9 @@ def _evaluated(records: Sequence[FlatScores], names: Sequence[str]) -> list[str]
     pairs = [(f"object_novel_{name}", f"full_novel_{name}") for name in ("psnr", "ssim")]
     masked = any(record.get(name) != record.get(whole) for record in records for name, whole in pairs)
     # Without masks, every pixel is the object's; with them, sharpness is the object's.
-    apart = ("full_novel_sharpness", "object_novel_lpips") if masked else "object"
-    present = [name for name in names if any(name in record for record in records)]
-    return [name for name in present if not name.startswith(apart)]
+    of_objects = [name for name in names if name.startswith("object_")]
+    apart = ["full_novel_sharpness", "object_novel_lpips"] if masked else of_objects
+    return [name for name in names if name not in apart and any(name in record for record in records)]
 
 
 def mode_tables(runs: Sequence[ResultsFile]) -> list[Table]:

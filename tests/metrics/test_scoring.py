@@ -248,6 +248,18 @@ def test_own_metrics_are_scored_for_each_region_and_view_beside_the_others_which
     }
 
 
+def test_a_metric_without_a_number_has_no_best_sample_and_the_others_keep_theirs():
+    class Undefined(Darker):
+        def __call__(self, predicted, true):
+            return torch.full((3,), math.nan)
+
+    evaluation = Evaluation(samples=2, metrics=OURS | {"darker": Undefined()})
+    evaluation.update_samples("scene", off_by(0.1, 0.01), scenes(1, 2).all_views()[0])
+    results = evaluation.results()
+    assert math.isnan(results["model"]["full"]["novel"]["darker"])
+    assert results["best_of_k_by_metric"]["full"]["novel"].keys() == {"psnr", "ssim"}
+
+
 def test_a_metric_that_gives_no_value_for_each_view_is_refused():
     evaluation = Evaluation(metrics={"psnr": psnr, "mean": lambda predicted, true: (predicted - true).mean()})
     with pytest.raises(CompleteSplatError, match=r"evaluation.metrics.mean: its values are \[\], not one .* 2 images"):
