@@ -42,6 +42,7 @@ class Protocol(TypedDict, total=False):
     data_set: str
     resolution: int
     scenes: int
+    metrics: dict[str, dict[str, Any]]
     missing: dict[str, str]
     machine: dict[str, Any]
     checkpoint: dict[str, str]
