@@ -1,4 +1,4 @@
-"""Renders of a folder of meshes: list of objects, jobs of worker processes, continuation, broken meshes."""
+"""Renders of a folder of meshes: list of objects, jobs of worker processes, broken meshes, data module."""
 
 import json
 import logging
@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event
-from typing import Annotated, Any, NamedTuple, Unpack
+from typing import Annotated, Any, ClassVar, NamedTuple, Unpack
 from urllib.parse import unquote
 
 import numpy as np
@@ -21,6 +21,7 @@ from PIL import Image
 from rich.progress import track
 
 from completesplat.data.co3d.annotations import viewpoint
+from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.writing import (
     FOLDERS,
     Annotation,
@@ -33,7 +34,7 @@ from completesplat.data.co3d.writing import (
 from completesplat.data.hidden_modes import in_mode
 from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
-from completesplat.data.rendered.drawing import RenderSettings, check_surroundings, draw_rendered_scene
+from completesplat.data.rendered.drawing import PAINTS, RenderSettings, check_surroundings, draw_rendered_scene
 from completesplat.data.validation import MissingFile, UnreadableFile, read_points
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import atomic_folder, folder_names, write_text
@@ -299,3 +300,16 @@ def _viewpoint(camera: Cameras) -> dict[str, object]:
     matrix, intrinsics = camera.world_to_camera.numpy(), camera.intrinsics.numpy()
     focal, center = intrinsics.diagonal()[:2] / half, 1 - intrinsics[:2, 2] / half
     return viewpoint(matrix[:3, :3], matrix[:3, 3], focal.tolist(), center.tolist())
+
+
+class RenderedDataModule(CO3DDataModule):
+    """`CO3DDataModule` of objects that `render` wrote below `root`, split by seed."""
+
+    record = OBJECT
+    chances: ClassVar = {name: paint.chance for name, paint in PAINTS.items()}
+
+    def __init__(self, root: str, **settings: Any) -> None:
+        super().__init__(root, CATEGORY, subset=None, **settings)
+
+    def describe(self) -> dict[str, str | None]:
+        return super().describe() | {"data_set": CATEGORY}
