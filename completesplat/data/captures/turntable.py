@@ -168,9 +168,7 @@ def _write_turn(folder: Path, count: int | None, out: Path, settings: TurntableS
     cameras = _on_circle(angles, settings["elevation"], 2 * focal / height, focal, photos[0][0].width)
     whole = Square(0, 0, photos[0][0].width)
     size = min(128, photos[0][0].width)
-    images, masks = (
-        torch.stack([cut_square(x, whole, size) / 255 for x in part]) for part in zip(*photos, strict=True)
-    )
+    images, masks = (torch.stack([cut_square(x, whole, size) / 255 for x in xs]) for xs in zip(*photos, strict=True))
     turn = examine(images, masks, angles, cameras)
     for kind in ("images", "masks"):
         (out / kind).mkdir(parents=True)
