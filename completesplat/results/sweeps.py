@@ -133,17 +133,9 @@ def summarize(*folders: Path) -> tuple[list[Entry], Table]:
     body = score_rows(rows, ("method", "seeds", "scenes"), columns, Notes(), marked=True)
     headings = [Heading("ablation", figures=False), Heading("seeds"), Heading("scenes")]
     headings += [score_heading(name, styles[metric_of(name)]) for name in names]
-    remarks = [CAPTION if rows else "No job of this sweep has finished.", *_remarks(jobs, rows)]
+    remarks = [CAPTION if rows else "No job of this sweep has finished.", *_progress_remarks(jobs)]
+    remarks += [*_row_remarks(rows), *_program_remarks([job.record for job in jobs if job.record])]
     return rows, Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
-
-
-def _remarks(jobs: Sequence[Job], rows: Sequence[Entry]) -> list[str]:
-    """Return sentences on finished and missing jobs, on rows that do not compare, on commit, machine and commands."""
-    return [
-        *_progress_remarks(jobs),
-        *_row_remarks(rows),
-        *_program_remarks([job.record for job in jobs if job.record]),
-    ]
 
 
 def _progress_remarks(jobs: Sequence[Job]) -> list[str]:

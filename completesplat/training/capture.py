@@ -16,10 +16,9 @@ from torch.optim import Adam
 from completesplat.baselines.fitting import (
     NEIGHBOURS,
     POSITION_DECAY,
-    POSITION_RATE,
-    RATES,
     Count,
     RawGaussians,
+    adam,
     gaussians_at_points,
     initial_gaussians,
     position_noise,
@@ -179,12 +178,10 @@ class CaptureFit(Stage):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Build Adam with 3DGS's rates and epsilon; the rate of the positions decays to a hundredth."""
-        near, far = self.sequence("train").depth_ranges.mean(0).tolist()
-        rates = {name: self.fitting.other_rates * RATES[name] for name in RATES}
-        rates = {"means": self.fitting.position_rate * POSITION_RATE * 0.5 * (far - near), **rates}
-        optimizer = Adam([{"params": [self.raw[name]], "lr": rate} for name, rate in rates.items()], eps=1e-15)
+        depth_ranges, settings = self.sequence("train").depth_ranges, self.fitting
+        optimizer = adam(dict(self.raw.items()), depth_ranges, settings.position_rate, settings.other_rates)
         steps = max(1, self.trainer.estimated_stepping_batches)
-        decays = [lambda step: POSITION_DECAY ** (step / steps), *[lambda step: 1.0] * (len(rates) - 1)]
+        decays = [lambda step: POSITION_DECAY ** (step / steps), *[lambda step: 1.0] * (len(self.raw) - 1)]
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": Schedule(optimizer, decays), "interval": "step"}}
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:

@@ -141,7 +141,6 @@ def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: st
     if not path.is_file():
         raise WeightsError(f"{path}: no such file; {advice}")
     if expected is not None and not (actual := sha256_of(path)).startswith(expected):
-        raise WeightsError(
-            f"{path}: SHA-256 {actual}, not {sha256}; {advice} (if that file is meant, {hash_setting}={actual})"
-        )
+        meant = f"if that file is meant, {hash_setting}={actual}"
+        raise WeightsError(f"{path}: SHA-256 {actual}, not {sha256}; {advice} ({meant})")
     return path

@@ -8,8 +8,7 @@ from fake_mps import FakeMPS
 
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.reconstructor import Reconstructor
-from completesplat.baselines.preoptimized import occupied, project_to_splatter_image
-from completesplat.baselines.sparse_vae import SparseVAE
+from completesplat.baselines.preoptimized import SparseVAE, occupied, project_to_splatter_image
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole

@@ -21,8 +21,7 @@ from completesplat.data.co3d.annotations import read_frames
 from completesplat.data.images.files import read_depth
 from completesplat.data.rendered.blender import find_blender
 from completesplat.data.rendered.drawing import PAINTS
-from completesplat.data.rendered.module import RenderedDataModule
-from completesplat.data.rendered.rendering import render
+from completesplat.data.rendered.rendering import RenderedDataModule, render
 from completesplat.errors import CompleteSplatError
 from completesplat.files import folder_names
 from completesplat.geometry.cameras import Cameras, look_at, pixel_rays, project
