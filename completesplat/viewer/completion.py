@@ -51,6 +51,7 @@ class Completion:
 
     def complete(self, image: Path, name: str, client: viser.ClientHandle | None) -> None:
         """Load an image file; raise a `CompleteSplatError` if it is none, or its background cannot be removed."""
+        show_status(self.page.server, f"reading {name}")
         self.load(name, self.model.read(image, remove_background=self.controls.remove_background.value), client)
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
