@@ -12,8 +12,8 @@ import numpy as np
 import torch
 import viser
 
-from completesplat.data.images.files import open_image
-from completesplat.errors import CompleteSplatError, errors_at
+from completesplat.data.images.files import open_image, refused_as_bad
+from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED, FORMATS, suffix, write_formats
 from completesplat.export.images import to_pixels
 from completesplat.export.prediction import PHOTO_FILE
@@ -195,11 +195,11 @@ class Page:
         self.show_photo(path)
 
     def show_photo(self, scene: Path) -> None:
-        """Show a prediction's photo, if its folder has one, in the panel; raise CompleteSplatError for a bad one."""
+        """Show a prediction's photo, if its folder has one, in the panel; raise BadImage for a damaged one."""
         file = (scene if scene.is_dir() else scene.parent) / PHOTO_FILE
         self.photo.content = ""
         if file.is_file():
-            with errors_at(file), open_image(file, ("PNG",)) as image:
+            with refused_as_bad(str(file)), open_image(file, ("PNG",)) as image:
                 self.photo.content = preview_of(np.asarray(image.convert("RGB").resize((THUMBNAIL,) * 2)), "photo")
 
     def _choose(self, _: viser.GuiEvent[Any]) -> None:

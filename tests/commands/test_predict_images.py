@@ -150,7 +150,9 @@ def test_images_that_fail_are_named_and_do_not_stop_the_others(predict, tmp_path
     done = [line.partition(":")[0] for line in finished.out.splitlines() if "/5 " in line]
     assert done == ["1/5 a.png", "5/5 a.png"]
     result = [(path.parent.name, path.name) for path in (tmp_path / "out").glob("*/*")]
-    assert sorted(result) == [(a, name) for a in ("a", "a_2") for name in ("photo.png", "sample_00.ply", "scene.json", "sheet.png")]
+    assert sorted(result) == [
+        (a, name) for a in ("a", "a_2") for name in ("photo.png", "sample_00.ply", "scene.json", "sheet.png")
+    ]
     assert (tmp_path / "out/a/sample_00.ply").read_bytes() != (tmp_path / "out/a_2/sample_00.ply").read_bytes()
 
 
