@@ -129,6 +129,8 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     page = Page(server, splats, saver, scenes)
     if model is None:
         page.show(samples, status)
+        if config.scene is not None:
+            page.show_photo(path)
         return page
     start = {name: config[name] for name in SLIDERS} | {"remove_background": remove}
     completion = Completion(page, model, start)

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -208,7 +209,8 @@ class CaptureFit(Stage):
             try:
                 converter = find_splat_transform() if set(part.formats) & set(CONVERTED) else None
                 part, comments = replace(part, converter=converter), [f"scene {name}"]
-                files |= write_scene(self.scene_folder, "scene", "", shot, self.rasterizer, part, comments)[-1]
+                on_file = partial(logger.info, "writing %s")
+                files |= write_scene(self.scene_folder, "scene", "", shot, self.rasterizer, part, comments, on_file)[-1]
             except CompleteSplatError as error:
                 logger.warning("left out: %s", error)
         title = f"{name}: held-out photos, Gaussians fitted to the {len(self.sequence('train').frames)} others"

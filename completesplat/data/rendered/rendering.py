@@ -5,6 +5,7 @@ import logging
 import math
 import os
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
@@ -37,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 CATEGORY = "rendered"
 DESCRIPTION, OBJECT, BROKEN = "rendered.json", "object.json", "broken.json"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 SUFFIXES = ("glb", "gltf", "obj", "ply", "stl", "fbx", "usd", "usda", "usdc", "usdz")
 MOST_POINTS = 20_000
 SKY = 1e9  # Cycles has 1e10 where no surface is
@@ -63,7 +64,7 @@ class BrokenMesh(Exception):
 
 
 def find_meshes(folder: Path) -> list[Asset]:
-    """List the mesh files below a folder by path; a sequence is named after its file's path.
+    """List the mesh files below a folder by path; a sequence is named after its file's path without suffix, if unique.
 
     Raises:
         MissingFile: the folder does not exist or has no mesh.
@@ -74,7 +75,10 @@ def find_meshes(folder: Path) -> list[Asset]:
     if not paths:
         raise MissingFile(f"no meshes there ({', '.join(SUFFIXES)})", str(folder))
     relative = [path.relative_to(folder).as_posix() for path in paths]
-    return [Asset(*mesh) for mesh in zip(folder_names(relative), relative, paths, strict=True)]
+    objects = [path.removesuffix(Path(path).suffix) for path in relative]
+    count = Counter(objects)
+    names = folder_names(name if count[name] == 1 else path for name, path in zip(objects, relative, strict=True))
+    return [Asset(*mesh) for mesh in zip(names, relative, paths, strict=True)]
 
 
 def check_named_files(mesh: Path, root: Path) -> None:
