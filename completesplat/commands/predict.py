@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from glob import glob
 from hashlib import sha256
 from pathlib import Path
@@ -43,6 +43,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", 
 OF_RUNS = ("image", "out", "shard", "shards", "devices")  # settings on which no single prediction depends
 FAR = 1.5  # ratio of tan(fov / 2), photo to training, from which a warning is given
 UNLIKE = 2.0  # distance from the training images (`distance_to_training`) from which a warning is given
+sha256_of_weights = cache(sha256_of)  # a process has one model, of up to gigabytes
 RESIZING = 0.1  # change of a distance that resizing to another model's size and back may cause
 # The network has 56.4 million numbers in float32; its authors' checkpoint may hold more.
 ELSEWHERE = (
@@ -100,7 +101,8 @@ def predict_share(
     model = open_generator(config, images)
     waiting = [(image, folder) for image, folder in photos if not is_predicted(folder, config, model, image)]
     if len(waiting) < len(photos):
-        print(f"{len(photos) - len(waiting)} of {len(photos)} images: predicted before, not repeated", flush=True)
+        before = f"{len(photos) - len(waiting)} of {len(photos)} images: predicted before by the same settings"
+        print(f"{before}; to repeat one, remove its folder in {out}", flush=True)
     return predict_images(config, model, waiting, wanted)
 
 
@@ -117,8 +119,9 @@ def is_predicted(folder: Path, config: DictConfig, model: SceneModel, image: Pat
 def made_from(config: DictConfig, model: SceneModel, image: Path) -> str:
     """Return a digest of what a prediction depends on: the version, settings, and contents of all files."""
     settings = {str(key): value for key, value in config.items() if key not in OF_RUNS}
-    files = [sha256_of(Path(file)) for file in (image, config.mask, model.file) if file is not None]
-    return sha256(json.dumps([__version__, settings, files], sort_keys=True, default=str).encode()).hexdigest()
+    files = [sha256_of(Path(file)) for file in (image, config.mask) if file is not None]
+    weights = None if model.file is None else sha256_of_weights(Path(model.file))
+    return sha256(json.dumps([__version__, settings, files, weights], sort_keys=True, default=str).encode()).hexdigest()
 
 
 def find_images(image: object) -> list[Path]:

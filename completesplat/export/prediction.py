@@ -169,7 +169,8 @@ def write_prediction(
     views, depths = [], []
     files = {"photo": PHOTO_FILE}
     for i, shot in enumerate(shots):
-        comments = [*(f"{name} {value}" for name, value in settings.items()), f"sample {i}"]
+        # Scenes do not depend on hidden pixels, of which the digest `made_from` does.
+        comments = [*(f"{name} {value}" for name, value in settings.items() if name != "made_from"), f"sample {i}"]
         name, number = f"sample_{i:02}", f"_{i:02}"
         around, depth, written = write_scene(folder, name, number, shot, rasterizer, wanted, comments, on_file)
         views.append(around)
