@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-processes test-slow test-wheel test-browser fuzz check size lock bench gpu docs notebooks release clean
+.PHONY: help demo demo-train test test-processes test-slow test-wheel test-browser fuzz check size lock bench gpu docs site notebooks release clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -105,6 +105,12 @@ gpu: $(READY) ## What only a GPU can show, 25 minutes, in outputs/gpu: tests, ti
 docs: $(READY) ## The API reference, from the docstrings, in outputs/api
 	$(BIN)/pdoc --docformat google --output-directory outputs/api completesplat '!completesplat.data.rendered._scene_script' '!completesplat.data.rendered._scene_meshes'
 	@echo "outputs/api/completesplat.html"
+
+# Predictions of the gallery are kept in outputs/gallery: remove it to make them again.
+site: docs ## The site in outputs/site: documents, notebooks, API, weights, and scenes that turn (these need Node.js)
+	@$(BIN)/python -c "import furo, myst_nb" 2> /dev/null || \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev,site]"
+	$(BIN)/python notebooks/website.py
 
 notebooks: $(READY) ## Run every notebook from top to bottom, and store what it prints and draws
 	$(BIN)/python tests/stored_notebooks.py

@@ -7,14 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from completesplat.geometry import rotations
 from completesplat.geometry.cameras import transform_points
 from completesplat.geometry.harmonics import degree_of, harmonics, rotated
-from completesplat.geometry.rotations import (
-    matrix_to_quaternion,
-    normalize_quaternion,
-    quaternion_multiply,
-    quaternion_to_matrix,
-)
 from completesplat.tensors import TensorDataclass, concatenate
 
 
@@ -39,14 +34,14 @@ class Gaussians(TensorDataclass):
 
     def covariances(self) -> Float[Tensor, "*batch gaussian 3 3"]:
         """Return R S S^T R^T (Kerbl et al. 2023, Eq. 6)."""
-        root = quaternion_to_matrix(self.quaternions) * self.scales[..., None, :]
+        root = rotations.quaternion_to_matrix(self.quaternions) * self.scales[..., None, :]
         return root @ root.mT
 
     def transform(self, matrix: Float[Tensor, "*#batch 4 4"]) -> "Gaussians":
         """Move the Gaussians by a rotation and translation (the upper left block must be a rotation)."""
-        rotation = matrix_to_quaternion(matrix[..., :3, :3])[..., None, :]
+        rotation = rotations.matrix_to_quaternion(matrix[..., :3, :3])[..., None, :]
         # Normalise first, because a zero quaternion would stay zero instead of taking the rotation.
-        quaternions = quaternion_multiply(rotation, normalize_quaternion(self.quaternions))
+        quaternions = rotations.quaternion_multiply(rotation, rotations.normalize_quaternion(self.quaternions))
         return replace(self, means=transform_points(matrix, self.means), quaternions=quaternions)
 
     def seen_from(self, centers: Float[Tensor, "*batch 3"]) -> "Gaussians":

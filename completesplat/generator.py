@@ -16,7 +16,7 @@ from torch import Tensor
 from completesplat.autoreconstructor.encoder import Images
 from completesplat.autoreconstructor.model import DepthRange, VariationalAutoReconstructor
 from completesplat.baselines.splatter_image.model import PublishedModel, is_published
-from completesplat.diffusion.guidance import allowed_skip_weight
+from completesplat.diffusion.guidance import Latents, allowed_skip_weight
 from completesplat.diffusion.sampling import PART, Sampler, draw_noise, in_parts, one_thread_each, with_forward_process
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
@@ -98,7 +98,7 @@ class CompleteSplat(SceneModel):
         self.latent_mean.copy_(torch.tensor(mean)[:, None, None])
         self.latent_std.copy_(torch.tensor(std)[:, None, None])
 
-    def standardised(self, latent: Float[Tensor, "batch channel _ _"]) -> Float[Tensor, "batch channel _ _"]:
+    def standardised(self, latent: Latents) -> Latents:
         """Scale latents for the denoiser: mean 0 and standard deviation 1 in each channel over the training set."""
         return (latent - self.latent_mean) / self.latent_std
 

@@ -78,9 +78,8 @@ class TrainingImages(TypedDict, total=False):
 
 # Settings of models: those of `CompleteSplat`, and those of `DeterministicModel`. All but `training` are needed.
 COMMON_SETTINGS = {"image_size": Annotated[int, Range(8, 1024)], "training": TrainingImages}
-SAMPLING_SETTINGS = (
-    dict.fromkeys(("autoreconstructor", "conditioning", "denoiser", "sampler"), PartConfig) | COMMON_SETTINGS
-)
+SAMPLING_PARTS = ("autoreconstructor", "conditioning", "denoiser", "sampler")
+SAMPLING_SETTINGS = dict.fromkeys(SAMPLING_PARTS, PartConfig) | COMMON_SETTINGS
 DETERMINISTIC_SETTINGS = {"network": PartConfig} | COMMON_SETTINGS
 
 

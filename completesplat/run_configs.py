@@ -19,13 +19,7 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import SHORT, printable
 from completesplat.parts import PATH, check_architecture, check_sizes, own_part, stored_config
 from completesplat.scene_model import camera_tensors
-from completesplat.settings.checks import (
-    check_image_size,
-    check_optimizer,
-    check_parts,
-    each_part,
-    remove_start_weights,
-)
+from completesplat.settings import checks
 from completesplat.settings.options import conf_folder
 from completesplat.settings.schema import check_value
 from completesplat.weights import CAMERA, CONFIG_FILE, RUN_CONFIG_FILE, RUN_WEIGHTS, SCENES, first_line, read_small
@@ -134,9 +128,9 @@ def _changed(config: Any, overrides: list[str]) -> Any:
     for section in SECTIONS:
         check_value(section, Mapping[str, object], changed[section])
     if overrides:
-        check_parts(changed)
-        check_image_size(changed)
-        check_optimizer(changed.model.get("optimizer"))
+        checks.check_parts(changed)
+        checks.check_image_size(changed)
+        checks.check_optimizer(changed.model.get("optimizer"))
     return changed
 
 
@@ -145,10 +139,10 @@ def without_training(config: Any) -> Any:
 
     `rasterizer=cuda` becomes `auto`, which is the same where there is a GPU.
     """
-    remove_start_weights(config)
+    checks.remove_start_weights(config)
     terms = OmegaConf.select(config, "model.loss.terms") or {}
     for name in list(terms):
-        if any(getattr(kind, "only_for_training", False) for _, kind in each_part(terms[name])):
+        if any(getattr(kind, "only_for_training", False) for _, kind in checks.each_part(terms[name])):
             terms[name] = None
     if OmegaConf.select(config, "model.rasterizer._target_") == "completesplat.rasterizers.selection.cuda":
         config.model.rasterizer._target_ = "completesplat.rasterizers.selection.auto"

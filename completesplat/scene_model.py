@@ -199,10 +199,8 @@ class SceneModel(nn.Module):
         Raises:
             CompleteSplatError: the axes are parallel, or meet behind the first camera.
         """
-        center = nearest_to_axes(cameras)
-        depth = (
-            0.0 if center is None else transform_points(cameras[0].world_to_camera, center.float()[None])[0, 2].item()
-        )
+        center, first = nearest_to_axes(cameras), cameras[0].world_to_camera
+        depth = 0.0 if center is None else transform_points(first, center.float()[None])[0, 2].item()
         if depth <= 0:
             raise CompleteSplatError("the cameras do not look at one place: where the scene lies cannot be told")
         return cameras.scale_world(torch.tensor(self.middle_depth(self.depth_range) / depth))

@@ -23,6 +23,11 @@ def in_float32() -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
+def as_float64(tensor: Tensor) -> Tensor:
+    """Return a tensor in float64; on the CPU if it was on Apple's MPS, which has no float64."""
+    return (tensor.cpu() if tensor.device.type == "mps" else tensor).double()
+
+
 @dataclass(frozen=True)
 class TensorDataclass:
     """Base of the frozen dataclasses whose fields are tensors, nested tensor dataclasses, or static values.

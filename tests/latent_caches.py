@@ -42,7 +42,7 @@ def pack(raw: Path, **settings: object) -> Path:
     data = rooms(raw, **settings)
     sources = {split: data.source(split) for split in ("train", "val", "test")}
     out = raw.with_name("packed")
-    return prepare(sources, data.packed_settings(), out, workers=1, max_bad_fraction=1.0, progress=False)
+    return prepare(sources, data.packed_settings(), out, workers=1, policy=("skip", 1.0), progress=False)
 
 
 def rooms(root: Path, **settings: object) -> RE10KDataModule:

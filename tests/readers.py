@@ -28,7 +28,7 @@ from completesplat.data.validation import refused_to
 from completesplat.errors import DataError, errors_at
 from completesplat.export.ply import write_ply
 from completesplat.ply_files import read_vertices
-from completesplat.training.encoding import encode_training_set
+from completesplat.training.encoding import FrameEncoder, encode_training_set
 from completesplat.viewer.sample import read_newest, read_scene
 
 Damage = Callable[[Path], object]
@@ -126,7 +126,7 @@ def read_capture(folder: Path) -> Usable:
 
 def write_latents(folder: Path) -> None:
     root = sound_rooms(folder.with_name("rooms"))
-    encode_training_set(small_autoreconstructor(), rooms(root), folder, progress=False)
+    encode_training_set(FrameEncoder(small_autoreconstructor()), rooms(root), folder, progress=False)
 
 
 def read_latents(folder: Path) -> list[list]:

@@ -7,7 +7,7 @@ import ast
 import graphlib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import pytest
 from lines_of_code import lines_of_code
@@ -137,6 +137,18 @@ def unsafe_calls(tree: ast.AST, path: str) -> list[str]:
     return result
 
 
+def native_names(tree: ast.AST) -> list[str]:
+    """Lines that make a name of a path below a folder with this system's slashes, which on Windows lean backwards."""
+    texts = [node for node in ast.walk(tree) if isinstance(node, ast.FormattedValue)]
+    texts += [n.args[0] for n in ast.walk(tree) if isinstance(n, ast.Call) and ast.unparse(n.func) == "str" and n.args]
+    values = [text.value if isinstance(text, ast.FormattedValue) else text for text in texts]
+    return [
+        f"line {value.lineno}"
+        for value in values
+        if isinstance(value, ast.Call) and isinstance(value.func, ast.Attribute) and value.func.attr == "relative_to"
+    ]
+
+
 def docstrings(tree: ast.AST) -> set[int]:
     """Identities of the constants that are docstrings (of modules, classes, functions, and of attributes)."""
     statements = [child for node in ast.walk(tree) for child in ast.iter_child_nodes(node)]
@@ -185,6 +197,10 @@ def test_no_code_is_loaded_or_run_no_function_long_and_datasets_are_named_in_dat
     assert {path: result for path, tree in written.items() if (result := long_functions(tree))} == {}
 
 
+def test_names_below_a_folder_have_forward_slashes_on_windows_too() -> None:
+    assert {path: result for path, tree in TREES.items() if (result := native_names(tree))} == {}
+
+
 def test_files_stay_short_and_few() -> None:
     lengths = {path: len(text.splitlines()) for path, text in FILES.items()}
     assert {path: length for path, length in lengths.items() if length > LONGEST_FILE} == {}
@@ -215,6 +231,11 @@ def test_the_rules_notice() -> None:
     assert [case for case in UPWARD if len(upward_imports({case[0]: ast.parse(case[1])})) != 1] == []
     unsafe = [source.strip() for source in UNSAFE.split(";")]
     assert [source for source in unsafe if len(unsafe_calls(ast.parse(source), "training/x.py")) != 1] == []
+    native = ["str(path.relative_to(root))", "f'a {x.relative_to(root)}'"]
+    assert [source for source in native if len(native_names(ast.parse(source))) != 1] == []
+    assert native_names(ast.parse("path.relative_to(root).as_posix()")) == []
+    name = PureWindowsPath("C:/a/b/c").relative_to("C:/a")
+    assert (str(name), name.as_posix()) == (r"b\c", "b/c")
     assert [source for source in NAMING if not dataset_names(ast.parse(source))] == []
     sources = {"a.py": ast.parse("class A: pass\nclass B: pass"), "b.py": ast.parse("def f():\n    class A: pass")}
     functions = {"a.py": ast.parse("def f():\n    pass"), "b.py": ast.parse("def f():\n    def g(): pass")}

@@ -21,13 +21,16 @@ DISTRIBUTIONS = packages_distributions()
 # Why something is declared that nothing imports.
 NEVER_IMPORTED = {
     "beartype": "checks the types of jaxtyping in all tests (pytest's options)",
+    "furo": "`make site`",
     "hydra-submitit-launcher": "found by hydra: hydra/launcher=submitit_slurm",
     "ipykernel": "runs the notebooks",
     "pdoc": "`make docs`",
     "mypy": "a program",
+    "myst-nb": "`make site`",
     "nbclient": "runs the notebooks",
     "pytest-xdist": "an option of pytest",
     "ruff": "a program",
+    "sphinx": "`make site`",
 }
 
 # Scripts that Blender's Python runs, which has its own packages.

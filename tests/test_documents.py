@@ -7,12 +7,13 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from omegaconf import OmegaConf
 from written_commands import BLOCK, CHANGELOG, DOCUMENTS, README, ROOT, STUDIES
 
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 PATH = re.compile(r"`((?:completesplat|conf|tests|notebooks|\.ci)/[\w./]*)`")
-YOURS = ("conf/rasterizer/mine.yaml", "conf/loss/mine.yaml")
+TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -40,9 +41,8 @@ def test_links_lead_somewhere_and_paths_and_targets_of_make_exist(document):
         assert not anchor or anchor in anchors(target), link
     text = document.read_text()
     for path in PATH.findall(text):
-        assert (ROOT / path).exists() or path in YOURS, path
-    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    assert set(re.findall(r"(?:^|`)make ([a-z-]+)", text, re.MULTILINE)) <= targets
+        assert (ROOT / path).exists(), path
+    assert set(re.findall(r"(?:^|`)make ([a-z-]+)", text, re.MULTILINE)) <= TARGETS
 
 
 def test_the_readme_is_a_page_and_leads_to_every_document():
@@ -113,7 +113,14 @@ def test_the_hooks_are_the_checks_of_make_and_the_workflow_runs_what_must_hold()
     recipe = subprocess.run(["make", "--dry-run", "check"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     assert all(hook.language == "system" for hook in hooks)
     assert {hook.entry.removesuffix(" --force-exclude") for hook in hooks} <= set(recipe.splitlines())
-    text = (ROOT / ".github/workflows/ci.yml").read_text()
-    assert "- run: .ci/run\n" in text
+    assert "- run: .ci/run\n" in (ROOT / ".github/workflows/ci.yml").read_text()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / ".github/workflows").iterdir()), ids=lambda path: path.name)
+def test_workflows_use_githubs_own_actions_the_oldest_python_and_known_targets_of_make(path):
+    text = path.read_text()
     assert re.findall(r"uses: \S+", text) == re.findall(r"uses: actions/[\w-]+@v\d+(?=\n)", text)
-    assert f'python-version: "{PROJECT["requires-python"].removeprefix(">=")}"' in text
+    oldest = PROJECT["requires-python"].removeprefix(">=")
+    assert {*re.findall(r'python-version: "(.*)"', text)} <= {oldest}
+    assert {*re.findall(r"run: make ([a-z-]+)", text)} <= TARGETS
+    assert yaml.safe_load(text)["permissions"]["contents"] == "read"

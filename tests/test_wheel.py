@@ -55,7 +55,7 @@ def test_the_installed_wheel_predicts_sweeps_and_writes_tables_from_an_empty_fol
     run("predict", f"image={couch}", "weights=rendered_couches", "samples=1", "steps=2", "frames=2", "out=SCENES")
     for name in (image.stem, couch.stem):
         scenes = {path.name for path in (tmp_path / "SCENES" / name).iterdir()}
-        assert scenes == {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json"}
+        assert scenes == {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json", "photo.png"}
     brief = [f"data.root={toy_root}", *SMALL, "callbacks.images=null"]
     run("fit", "-m", "experiment=toy_var", *brief, "seed=0,1", "out=SWEEP")
     assert [strict_json(tmp_path / f"SWEEP/seed-{seed}/metrics.json")["steps"] for seed in (0, 1)] == [2, 2]

@@ -93,9 +93,7 @@ def _needed_settings(config: Mapping[str, object], part: str) -> str:
     conditioning = part == "conditioning"
     names = SETTINGS | ({"latent_channels": "out_channels"} if conditioning else {})
     place = part if conditioning else f"{part}.encoder"
-    values = {
-        ours: json.dumps(config[theirs], separators=(",", ":")) for theirs, ours in names.items() if theirs in config
-    }
+    values = {names[key]: json.dumps(config[key], separators=(",", ":")) for key in names if key in config}
     overrides = [f"{place}.{name}={value}" for name, value in values.items()]
     return f"its config.json asks for {' '.join(overrides)}" if overrides else "no config.json gives its sizes"
 

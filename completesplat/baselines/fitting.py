@@ -20,6 +20,7 @@ from completesplat.losses import Prediction, WeightedSum
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
 from completesplat.settings.schema import Positive, Range, Share
+from completesplat.tensors import as_float64
 
 POSITION_RATE, POSITION_DECAY = 1.6e-4, 0.01
 RATES = {"log_scales": 5e-3, "quaternions": 1e-3, "logits": 5e-2, "harmonics": 2.5e-3}
@@ -134,7 +135,8 @@ def fit_gaussians(
     """
     with torch.inference_mode(False), torch.enable_grad():
         raw = initial_gaussians(views, depth_range, settings.count, settings.opacity, generator)
-        optimizer = _optimizer(raw, settings, depth_range)
+        parameters = {name: tensor.requires_grad_() for name, tensor in vars(raw).items()}
+        optimizer = adam(parameters, depth_range, settings.position_rate, settings.other_rates)
         positions = optimizer.param_groups[0]
         decay = POSITION_DECAY ** (1 / max(settings.steps, 1))
         for step in range(settings.steps):
@@ -150,14 +152,18 @@ def fit_gaussians(
         return raw.gaussians().detach()
 
 
-def _optimizer(raw: RawGaussians, settings: FittingSettings, depth_range: Tensor) -> torch.optim.Adam:
-    """Return Adam with 3DGS's epsilon (`gaussian_model.py`), which is small compared with a Gaussian's gradients."""
+def adam(
+    raw: Mapping[str, Tensor], depth_ranges: Float[Tensor, "_ 2"], position_rate: float, other_rates: float
+) -> torch.optim.Adam:
+    """Return Adam for tensors of `RawGaussians` by name, with factors on 3DGS's rates; the positions come first.
+
+    Its epsilon is 3DGS's (`gaussian_model.py`), which is small compared with a Gaussian's gradients.
+    """
     # Half of the mean depth range: the spread of the initial Gaussians (3DGS uses the spread of the cameras).
-    extent = (0.5 * (depth_range[:, 1] - depth_range[:, 0])).mean().item()
-    rates = {name: settings.other_rates * rate for name, rate in RATES.items()}
-    rates = {"means": settings.position_rate * POSITION_RATE * extent, **rates}
-    groups = [{"params": [getattr(raw, name).requires_grad_()], "lr": rate} for name, rate in rates.items()]
-    return torch.optim.Adam(groups, eps=1e-15)
+    extent = (0.5 * (depth_ranges[:, 1] - depth_ranges[:, 0])).mean().item()
+    rates = {"means": position_rate * POSITION_RATE * extent}
+    rates |= {name: other_rates * rate for name, rate in RATES.items()}
+    return torch.optim.Adam([{"params": [raw[name]], "lr": rate} for name, rate in rates.items()], eps=1e-15)
 
 
 def opacity_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
@@ -170,11 +176,12 @@ def scale_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"])
 
     Their double sum is written as one sum, by C(0, k) + ... + C(n - 1, k) = C(n, k + 1).
     """
-    n, o = copies.double()[:, None], opacity_of_copies(opacities.double(), copies)[:, None]
+    alpha, n = as_float64(opacities), as_float64(copies)[:, None]
+    o = opacity_of_copies(alpha, copies.to(alpha.device))[:, None]
     j = torch.arange(1, int(copies.max()) + 1, dtype=torch.float64, device=o.device)
     logarithm = torch.lgamma(n + 1) - torch.lgamma(j + 1) - torch.lgamma((n - j).clamp(min=0) + 1)
     terms = torch.where(j <= n, logarithm.exp() * o**j / j.sqrt(), 0) * (1 - 2 * ((j + 1) % 2))
-    return (opacities / terms.sum(-1)).to(opacities.dtype)
+    return (alpha / terms.sum(-1)).to(opacities)
 
 
 @torch.no_grad()

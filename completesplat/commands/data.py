@@ -77,7 +77,7 @@ def prepare(
     if manifest.is_packed(data.root):
         raise CompleteSplatError(f"{data.root} is prepared already")
     sources, settings = _sources(data, splits), data.packed_settings()
-    writing.prepare(sources, settings, out, codec, sequences_per_shard, workers, on_bad, max_bad_fraction)
+    writing.prepare(sources, settings, out, codec, sequences_per_shard, workers, (on_bad, max_bad_fraction))
 
 
 def latents(
@@ -99,7 +99,7 @@ def latents(
 
     from completesplat.autoreconstructor.model import VariationalAutoReconstructor
     from completesplat.run_configs import config_of_run
-    from completesplat.training.encoding import encode_training_set
+    from completesplat.training.encoding import FrameEncoder, encode_training_set
     from completesplat.training.stopping import stopped_together
     from completesplat.weights.checkpoint_reading import load_part
 
@@ -113,9 +113,8 @@ def latents(
     fabric = Fabric(devices=devices, num_nodes=num_nodes)
     with stopped_together():
         fabric.launch()
-        store = encode_training_set(
-            autoreconstructor, data, out, frames, views, precision, conditioning, batch_size, fabric.device
-        )
+        encoder = FrameEncoder(autoreconstructor, conditioning, precision, fabric.device)
+        store = encode_training_set(encoder, data, out, frames, views, batch_size)
     logger.info("standard deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 

@@ -33,6 +33,12 @@ EXTRAS = {
     "slurm": "to spread sweeps over a cluster",
     "perceptual": "to train on perceptual features without a download",
 }
+DEVICES = {
+    "cuda": "networks and splats of all verbs but predict, which computes its networks on the CPU",
+    "mps": "networks of fit, test and data latents, whose splats the CPU draws (tiled); all else runs on the CPU. Not"
+    " run yet; PYTORCH_ENABLE_MPS_FALLBACK=1 has the CPU compute what MPS lacks",
+    "cpu": "all networks and splats",
+}
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
 LEAST_SPACE = 100_000_000  # bytes that the files of a few predictions take
 
@@ -99,7 +105,7 @@ def check_imports() -> Iterator[Finding]:
 
 
 def check_device() -> Iterator[Finding]:
-    """Yield CPU, GPUs and rasterizers. A missing GPU is no error: small models draw samples in seconds without one."""
+    """Yield CPU, GPUs, what runs where, and rasterizers. A missing GPU is no error: small models are fast without."""
     import torch
 
     from completesplat.rasterizers.selection import FASTER, failure
@@ -115,6 +121,9 @@ def check_device() -> Iterator[Finding]:
         built = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
         reason = f"torch {torch.__version__}, built {built}, finds none (nvidia-smi shows the driver's)"
         yield Finding("GPU", "no", f"{reason}; all works on the CPU, slower")
+    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    device = next(name for name, here in available.items() if here)
+    yield Finding("used device", "yes", f"{device}: {DEVICES[device]}")
     for name in FASTER:
         fault = failure(name, None)
         message = "a test rendering agrees with the reference" if fault is None else fault

@@ -104,7 +104,8 @@ def run(
         if not tester.is_global_zero:
             return
         described = protocol(evaluation, module, data, results, out) | tested.facts()
-        write_json(out / METRICS, {"protocol": described} | results)
+        results = {"protocol": described} | results
+        write_json(out / METRICS, results)
     show(evaluation_table(results, MODEL if tested.scenes is None else module.method), width=160)
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")

@@ -94,9 +94,10 @@ def run(config: DictConfig, out: Path) -> None:
             return
         results: dict[str, object] = {"steps": trainer.global_step, "data.batch_per_process": share, **metrics}
         if scores is not None:
-            show(evaluation_table(scores), width=160)
-            described = protocol(config.evaluation, module, tested, scores, out) | _facts(trainer, out)
+            evaluation: Any = OmegaConf.to_container(config.evaluation, resolve=True)
+            described = protocol(evaluation, module, tested, scores, out) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
+            show(evaluation_table({"protocol": described} | scores), width=160)
         write_json(out / METRICS, results)  # the last file, because it means that the job is done
 
 

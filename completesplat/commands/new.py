@@ -14,7 +14,7 @@ from completesplat.files import write_text
 from completesplat.settings.options import conf_folder
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
-KINDS = ("loss", "rasterizer", "dataset", "ablation", "experiment")
+KINDS = ("loss", "metric", "rasterizer", "encoder", "callback", "dataset", "ablation", "experiment")
 FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)  # line of a template that names the file which follows
 
 
@@ -37,7 +37,8 @@ def new_files(kind: str, name: str) -> dict[Path, str]:
     if not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
         raise CompleteSplatError(f"name={name}: must be a Python name: letters, digits and underscores")
     classes = "".join(word.capitalize() for word in name.split("_"))
-    text = (TEMPLATES / f"{kind}.txt").read_text().replace("@name@", name).replace("@Name@", classes)
+    text = (TEMPLATES / f"{kind}.txt").read_text().replace("@opened@\n", (TEMPLATES / "_opened.txt").read_text())
+    text = text.replace("@name@", name).replace("@Name@", classes)
     _, *parts = FILE.split(text)
     files = {Path(path): body.strip("\n") + "\n" for path, body in zip(parts[::2], parts[1::2], strict=True)}
     for path in files:

@@ -1,5 +1,6 @@
 """`completesplat predict`: complete scenes, each from one photo, or one scene from several photos."""
 
+import json
 import logging
 import math
 import os
@@ -7,11 +8,13 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from glob import glob
+from hashlib import sha256
 from pathlib import Path
 
 import numba.np.arraymath  # else the first kernel imports it, and scipy with it  # noqa: F401
+import torch
 from hydra.utils import instantiate
 from jaxtyping import Float
 from omegaconf import DictConfig
@@ -22,20 +25,25 @@ from torch import Tensor
 
 from completesplat.commands.trained import open_generator, shown_background
 from completesplat.data.images.photograph import Photograph, outside_of_box, outside_of_mask
+from completesplat.data.validation.processes import map_in_processes
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
-from completesplat.export.prediction import OutputFiles, Shot, write_prediction
+from completesplat.export.prediction import SCENE_FILE, OutputFiles, Shot, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.files import folder_names, printable, safe_name
 from completesplat.generator import CompleteSplat
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene_model import SceneModel, distance_to_training, distances_to_shipped
 from completesplat.settings.checks import REMOVE
+from completesplat.version import __version__
+from completesplat.weights import sha256_of
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
+OF_RUNS = ("image", "out", "shard", "shards", "devices")  # settings on which no single prediction depends
 FAR = 1.5  # ratio of tan(fov / 2), photo to training, from which a warning is given
 UNLIKE = 2.0  # distance from the training images (`distance_to_training`) from which a warning is given
+sha256_of_weights = cache(sha256_of)  # a process has one model, of up to gigabytes
 RESIZING = 0.1  # change of a distance that resizing to another model's size and back may cause
 # The network has 56.4 million numbers in float32; its authors' checkpoint may hold more.
 ELSEWHERE = (
@@ -48,15 +56,72 @@ log = logging.getLogger(__name__)
 
 
 def run(config: DictConfig, out: Path) -> None:
-    """Write each photo's files into `out/<its name>/`."""
+    """Write the files of each photo in this shard into `out/<its name>/`, by `devices` processes.
+
+    Raises:
+        CompleteSplatError: the only image failed, or some of several, which the message names; the others are written.
+        DiskError: the disk is full; the remaining images are not predicted.
+    """
     wanted = output_files(config)
     images = find_images(config.image)
     if config.mask is not None and len(images) > 1:
         raise CompleteSplatError("mask=FILE belongs to one image; box=[x0,y0,x1,y1] goes for several")
+    if config.shard >= config.shards:
+        raise CompleteSplatError(f"shard={config.shard}: the last of shards={config.shards} is {config.shards - 1}")
     if config.cameras is not None:
-        predict_from_views(config, images, wanted, out)
-    else:
-        predict_images(config, open_generator(config, images), images, wanted, out)
+        return predict_from_views(config, images, wanted, out)
+    start, threads = time.perf_counter(), max(1, torch.get_num_threads() // config.devices)
+    share = partial(predict_share, config, images, wanted, out, threads)
+    results = list(map_in_processes(share, range(config.devices), config.devices))
+    count, failed = sum(count for count, _ in results), [name for _, names in results for name in names]
+    seconds = time.perf_counter() - start
+    if count > 1:
+        print(f"{count} photos in {seconds:.0f} s by {config.devices} process(es): {60 * count / seconds:.1f} a minute")
+    if failed:
+        text = f"{len(failed)} of {count + len(failed)} images failed ({', '.join(failed)})"
+        raise CompleteSplatError(f"{text}; the others are in {out}" if count else text)
+
+
+def predict_share(
+    config: DictConfig, images: Sequence[Path], wanted: OutputFiles, out: Path, threads: int, process: int
+) -> tuple[int, list[str]]:
+    """Predict every N-th image, from this process' first on, unless it is finished; N processes do all.
+
+    Returns:
+        The number of images that were predicted, and the names of those that failed.
+    """
+    if config.devices > 1:
+        torch.set_num_threads(threads)
+        if torch.cuda.is_available():
+            torch.cuda.set_device(process % torch.cuda.device_count())
+    mine = slice(config.shard + config.shards * process, None, config.shards * config.devices)
+    photos = [*zip(images, (out / name for name in folder_names(image.stem for image in images)), strict=True)][mine]
+    if not photos:
+        return 0, []
+    model = open_generator(config, images)
+    waiting = [(image, folder) for image, folder in photos if not is_predicted(folder, config, model, image)]
+    if len(waiting) < len(photos):
+        before = f"{len(photos) - len(waiting)} of {len(photos)} images: predicted before by the same settings"
+        print(f"{before}; to repeat one, remove its folder in {out}", flush=True)
+    return predict_images(config, model, waiting, wanted)
+
+
+def is_predicted(folder: Path, config: DictConfig, model: SceneModel, image: Path) -> bool:
+    """Return whether a folder has all files of this image's prediction by the same settings and weights."""
+    try:
+        made = json.loads((folder / SCENE_FILE).read_text())
+        whole = all((folder / name).is_file() for name in made["files"].values())
+        return whole and made["settings"]["made_from"] == made_from(config, model, image)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return False
+
+
+def made_from(config: DictConfig, model: SceneModel, image: Path) -> str:
+    """Return a digest of what a prediction depends on: the version, settings, and contents of all files."""
+    settings = {str(key): value for key, value in config.items() if key not in OF_RUNS}
+    files = [sha256_of(Path(file)) for file in (image, config.mask) if file is not None]
+    weights = None if model.file is None else sha256_of_weights(Path(model.file))
+    return sha256(json.dumps([__version__, settings, files, weights], sort_keys=True, default=str).encode()).hexdigest()
 
 
 def find_images(image: object) -> list[Path]:
@@ -112,35 +177,35 @@ def _names(value: object) -> tuple[str, ...]:
 
 
 def predict_images(
-    config: DictConfig, model: SceneModel, images: Sequence[Path], wanted: OutputFiles, out: Path
-) -> None:
-    """Write each image's files into a folder below `out`, with a progress bar, or a line per step without a terminal.
+    config: DictConfig, model: SceneModel, photos: Sequence[tuple[Path, Path]], wanted: OutputFiles
+) -> tuple[int, list[str]]:
+    """Write images' files into their folders, with a progress bar, or lines without a terminal or by several processes.
+
+    Returns:
+        The number of images that were predicted, and the names of those that failed.
 
     Raises:
-        CompleteSplatError: the only image failed, or some of several, which the message names; the others are written.
+        CompleteSplatError: the only image failed.
         DiskError: the disk is full; the remaining images are not predicted.
     """
     console, failed = Console(), []
     _warn_of_hidden_parts(config, model)
     rasterizer = instantiate(config.rasterizer, _convert_="all")
     wanted = replace(wanted, background=shown_background(config.background, model))
-    folders = folder_names(image.stem for image in images)
-    with Progress(console=console, disable=not console.is_terminal) as bar:
+    with Progress(console=console, disable=config.devices > 1 or not console.is_terminal) as bar:
         steps = 1 + config.samples * (len(wanted.formats) + len(wanted.videos))
-        task = bar.add_task("", total=len(images) * steps)
-        for index, (image, folder) in enumerate(zip(images, folders, strict=True)):
+        task = bar.add_task("", total=len(photos) * steps)
+        for index, (image, folder) in enumerate(photos):
             name, start = printable(image.name), time.perf_counter()
             begin = partial(_begin, bar, task, name)
-            predict = partial(_predict, config, model, rasterizer, wanted, image, out / folder, begin)
-            if not _succeeds(predict, image, is_only=len(images) == 1):
+            predict = partial(_predict, config, model, rasterizer, wanted, image, folder, begin)
+            if not _succeeds(predict, image, is_only=len(photos) == 1 == config.devices):
                 failed.append(name)
-            elif not console.is_terminal:
+            elif bar.disable:
                 seconds = f"{time.perf_counter() - start:.0f} s"
-                print(f"{index + 1}/{len(images)} {name}: {out / folder} ({seconds})", flush=True)
+                print(f"{index + 1}/{len(photos)} {name}: {folder} ({seconds})", flush=True)
             bar.update(task, completed=(index + 1) * steps)
-    if failed:
-        share = f"{len(failed)} of {len(images)} images failed ({', '.join(failed)})"
-        raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(images) else share)
+    return len(photos) - len(failed), failed
 
 
 def _begin(bar: Progress, task: TaskID, image: str, step: str, advance: int = 1) -> None:
@@ -222,6 +287,8 @@ def _predict(
     folder: Path,
     begin: Callable[..., None],
 ) -> None:
+    if config.background == REMOVE:
+        begin("removing the background", advance=0)
     photograph = model.read(image, config.fov, config.background == REMOVE)
     visible = visible_part(config, image, model.image_size)
     if warnings := photo_warnings(photograph, model, whole=visible is None):
@@ -238,6 +305,7 @@ def _predict(
     recorded = {
         **settings,
         **sampler,
+        "made_from": made_from(config, model, image),
         "image": printable(image.name),
         "weights": printable(Path(config.weights).name),
         "screen_space_dilation": config.screen_space_dilation,

@@ -2,9 +2,11 @@
 
 import subprocess
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from completesplat.metrics import Style
 from completesplat.results.machine import machine
 from completesplat.results.runs import read_record, shell_command
 from completesplat.version import __version__
@@ -29,10 +31,11 @@ def git_commit() -> str | None:
 
 
 METRICS: dict[str, dict[str, object]] = {
-    "psnr": {"range": [0, 1], "limit_db": 100},
-    "ssim": {"window": 11, "sigma": 1.5, "border": "mirrored, counted", "range": [0, 1]},
-    "lpips": {"net": "vgg", "version": "0.1", "range": [-1, 1]},
+    "completesplat.metrics.images.psnr": {"range": [0, 1], "limit_db": 100},
+    "completesplat.metrics.images.ssim": {"window": 11, "sigma": 1.5, "border": "mirrored, counted", "range": [0, 1]},
+    "completesplat.metrics.images.perceptual_metric": {"net": "vgg", "version": "0.1", "range": [-1, 1]},
 }
+"""How the package's image metrics measure, by the `_target_` of their config."""
 
 
 def protocol(
@@ -59,13 +62,18 @@ def protocol(
         "object_pixels": "background black in both, by the true mask cut at 0.5",
         "average": "over the views of a scene, then over scenes",
         "sharpness": "squared differences of neighbours, summed over a scene's novel views, over the truth's",
-        "metrics": {name: METRICS[name] for name in scored.metrics if name in METRICS},
+        "metrics": {name: described_metric(evaluation["metrics"][name], x) for name, x in scored.styles.items()},
         "missing": scored.missing,
         **provenance(data, out),
     }
     for metric in scored.set_metrics:
         described["metrics"] |= metric.settings()
     return described
+
+
+def described_metric(config: Mapping[str, object], style: Style) -> dict[str, object]:
+    """Return how an image metric measures; of those that are not in `METRICS`, the config, and `style` for tables."""
+    return METRICS.get(str(config["_target_"]), {**config, "style": asdict(style)})
 
 
 def provenance(data: "SceneDataModule", out: Path) -> dict[str, object]:

@@ -14,7 +14,6 @@ from rich.console import Console
 
 from completesplat.commands import quieten
 from completesplat.commands.trained import TrainedModel, diffusion_of
-from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.export.images import image_sheet, write_png
 from completesplat.files import write_json
 from completesplat.results.tables import records_table, show
@@ -26,7 +25,6 @@ from completesplat.studies.controls import OnProgress, controls_rows, controls_s
 from completesplat.studies.depth import depth_rows, depth_strips
 from completesplat.studies.ladder import ladder_rows
 from completesplat.studies.samples import SampleRenderer, first_scenes
-from completesplat.training.scoring import Scorer
 
 Weights = Annotated[Sequence[Share], Entries(1)]
 
@@ -109,16 +107,11 @@ def _report(path: Path, title: str, rows: Sequence[Mapping[str, object]], run: R
 @contextmanager
 def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], OnProgress]]:
     """Yield renderer and first test scenes (on a GPU if there is one), and a status."""
-    stage, data = _opened_stage(run)
+    quieten()
+    model = run["ckpt"], run["overrides"], run["trust"], run["weights"]
+    stage, data = TrainedModel(*model, data=run.get("data"), rasterizer=run["rasterizer"], seed=run["seed"]).open()
+    stage = stage.to("cuda" if torch.cuda.is_available() else "cpu").eval()
     scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
     renderer = SampleRenderer(diffusion_of(stage), stage.rasterizer, stage.background, run["samples"], run["seed"])
     with Console(stderr=True).status("drawing") as status:
         yield renderer, scenes, lambda text: status.update(f"drawing: {text}")
-
-
-def _opened_stage(run: Run) -> tuple[Scorer, SceneDataModule]:
-    """Return the stage, on a GPU if there is one, and the data."""
-    quieten()
-    model = run["ckpt"], run["overrides"], run["trust"], run["weights"]
-    stage, data = TrainedModel(*model, data=run.get("data"), rasterizer=run["rasterizer"], seed=run["seed"]).open()
-    return stage.to("cuda" if torch.cuda.is_available() else "cpu").eval(), data

@@ -87,7 +87,7 @@ def scenes_in(path: Path) -> dict[str, Path]:
         return {path.name: path}
     inner = [entry for folder in (path, path / SCENES) if folder.is_dir() for entry in sorted(folder.iterdir())]
     found = [x for x in inner if x.suffix.lower() in SPLATS or any(any(x.glob(name)) for name in SCENE_FILES)]
-    return {printable(str(x.relative_to(path))): x for x in found}
+    return {printable(x.relative_to(path).as_posix()): x for x in found}
 
 
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
@@ -129,6 +129,8 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     page = Page(server, splats, saver, scenes)
     if model is None:
         page.show(samples, status)
+        if config.scene is not None:
+            page.show_photo(path)
         return page
     start = {name: config[name] for name in SLIDERS} | {"remove_background": remove}
     completion = Completion(page, model, start)

@@ -63,23 +63,19 @@ def in_mode(image: Path, mode: str) -> Path:
 class HiddenModeScenes:
     """Sequence of scenes in all their modes, each read when it is indexed; see `SceneDataModule.hidden_modes`.
 
-    The reference is a sequence's first frame, as in any test.
+    The reference is a sequence's first frame, as in any test. The store reads data as they were made, not prepared.
 
     Args:
         record: name -> JSON file of a sequence: its true mode (`hidden`), and the modes' `chances` if they are its own.
         chances: probabilities of the modes by name.
         views: largest number of views that show the modes.
         spread: number of further, evenly spread views.
-
-    Raises:
-        DataError: `store` reads prepared data.
     """
 
     def __init__(
         self, store: SceneStore, record: Callable[[str], Path], chances: Mapping[str, float], views: int, spread: int
     ) -> None:
-        if not isinstance(store.source, CO3DSource):
-            raise DataError("hidden modes need data as they were made, not prepared")
+        assert isinstance(store.source, CO3DSource)
         self.store, self.record, self.chances, self.views, self.spread = store, record, chances, views, spread
         self.modes = [replace(store, source=store.source.with_images(partial(in_mode, mode=mode))) for mode in chances]
 

@@ -29,9 +29,8 @@ def allowed_skip_weight(given: float | None, visible: Tensor | None = None) -> f
         check_value("skip_weight", Share, given)
     hidden = visible is not None and bool((visible < 1).any())
     if hidden and given:
-        raise CompleteSplatError(
-            f"skip_weight={given:g}: must be 0 where the image is hidden, as skips carry its pixels into the scene"
-        )
+        reason = "skips carry its pixels into the scene"
+        raise CompleteSplatError(f"skip_weight={given:g}: must be 0 where the image is hidden, as {reason}")
     return (0.0 if hidden else 1.0) if given is None else given
 
 

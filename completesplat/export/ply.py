@@ -55,7 +55,7 @@ def _further_names(count: int) -> list[str]:
 
 def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian property"]:
     """Return a row for each Gaussian, computed in float64 so that only the stored float32 is rounded."""
-    g = gaussians.detach().to("cpu", torch.float64)
+    g = gaussians.detach().to("cpu").to(torch.float64)
     logits = g.opacities.logit(SMALLEST_ALPHA)[:, None]
     # Quaternions of unit length (up to float32 rounding) stay, because normalising them again would change bits.
     is_unit = (g.quaternions.square().sum(-1, keepdim=True) - 1).abs() < 1e-6

@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -41,6 +42,9 @@ from completesplat.rasterizers import Rasterizer
 logger = logging.getLogger(__name__)
 
 DIRECTIONS = 8
+PHOTO_FILE, SCENE_FILE = "photo.png", "scene.json"
+SPLATS, VIDEOS = "|".join(map(format_suffix, FORMATS)), "|".join(PATHS)
+WRITTEN = re.compile(rf"sample_\d+({SPLATS})|({VIDEOS})_\d+\.mp4|(depth|normals|opacity)_\d+\.png|{SCENE_FILE}")
 FARTHEST = 1000.0  # scene radii from the origin, about, where float32 is still finer than a hundredth of a pixel
 CONVENTIONS = {
     "axes": "OpenCV's for cameras: +x right, +y down, +z forward; world_to_camera gives the world's",
@@ -141,7 +145,9 @@ def write_prediction(
     settings: Mapping[str, Any],
     on_file: Callable[[str], None] = lambda name: None,
 ) -> None:
-    """Write `sample_00.ply`, `orbit_00.mp4`, ..., `sheet.png` and `scene.json`.
+    """Write `photo.png`, `sample_00.ply`, `orbit_00.mp4`, ..., `sheet.png` and, when all is done, `scene.json`.
+
+    The files of an earlier prediction in the folder are removed first; others that a user put there remain.
 
     Args:
         image: the input image.
@@ -157,10 +163,14 @@ def write_prediction(
     shots = [replace(x, scene=cleaned(x.scene, f"{settings['image']}: sample {i}")) for i, x in enumerate(shots)]
     scenes, reference = [shot.scene for shot in shots], shots[0].camera
     make_folder(folder)
+    for file in filter(lambda file: WRITTEN.fullmatch(file.name), [*folder.iterdir()]):
+        file.unlink()
+    write_png(folder / PHOTO_FILE, Image.fromarray(to_pixels(image)))
     views, depths = [], []
-    files: dict[str, str] = {}
+    files = {"photo": PHOTO_FILE}
     for i, shot in enumerate(shots):
-        comments = [*(f"{name} {value}" for name, value in settings.items()), f"sample {i}"]
+        # Scenes do not depend on hidden pixels, of which the digest `made_from` does.
+        comments = [*(f"{name} {value}" for name, value in settings.items() if name != "made_from"), f"sample {i}"]
         name, number = f"sample_{i:02}", f"_{i:02}"
         around, depth, written = write_scene(folder, name, number, shot, rasterizer, wanted, comments, on_file)
         views.append(around)
@@ -176,7 +186,7 @@ def write_prediction(
         written, ends = write_maps(folder, scenes, reference, rasterizer)
         files |= written
         recorded["depth_map_ends"] = list(ends)
-    write_scene_json(folder / "scene.json", reference, recorded, settings["seed"], {**files, "sheet": "sheet.png"})
+    write_scene_json(folder / SCENE_FILE, reference, recorded, settings["seed"], {**files, "sheet": "sheet.png"})
 
 
 def write_fitted_scene(

@@ -26,7 +26,8 @@ from completesplat.geometry.cameras import Cameras, transform_points
 PROGRAM = "splat-transform"
 PACKAGE = "@playcanvas/splat-transform@2.7.1"
 LIMIT_SECONDS = 600
-WIDEST_WINDOW, LARGEST_FOV = 16 / 9, 120.0
+WIDEST_WINDOW, LARGEST_FOV = 20 / 9, 120.0  # phones' windows
+CONTROLS = b"<style>#controlsWrap.faded-out { visibility: visible; opacity: 1 }</style>"
 IN_A_ROOM = b"const isObjectExperience = !bbox.containsPoint(resetCamera.position);"
 
 log = logging.getLogger(__name__)
@@ -106,7 +107,8 @@ def write_turning_page(path: Path, gaussians: Gaussians, view: PageView, convert
         settings.write_text(json.dumps(viewer_settings(view, turn)))
         html = Path(folder) / "page.html"
         converter.convert(scene, html, ["--viewer-settings", str(settings)])
-        write_bytes(path, around_the_target(html.read_bytes()))
+        # The viewer hides its controls after 4 seconds, and a person may not find them.
+        write_bytes(path, around_the_target(html.read_bytes()).replace(b"</head>", CONTROLS + b"</head>", 1))
 
 
 def around_the_target(page: bytes) -> bytes:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from completesplat.errors import WeightsError
 from completesplat.metrics.images import Images, MissingMetrics, load_or_missing
+from completesplat.tensors import as_float64
 from completesplat.weights import first_line, weights_file
 
 URL = "https://nvlabs-fi-cdn.nvidia.com/stylegan2-ada-pytorch/pretrained/metrics/inception-2015-12-05.pt"
@@ -145,9 +146,10 @@ def frechet_distance(first: FirstSet, second: SecondSet) -> float:
     identity = nn.Identity()
     identity.num_features = first.shape[1]  # type: ignore[assignment]
     # The sets are complete; among several processes torchmetrics would wait for the others' sets and add them.
+    first, second = as_float64(first), as_float64(second)
     metric = FrechetInceptionDistance(identity, sync_on_compute=False).to(first.device)
-    metric.update(first.double(), real=True)
-    metric.update(second.double(), real=False)
+    metric.update(first, real=True)
+    metric.update(second, real=False)
     return metric.compute().item()
 
 
@@ -161,10 +163,11 @@ def kernel_distance(
     """
     from torchmetrics.image.kid import poly_mmd
 
+    first, second = as_float64(first), as_float64(second)
     size = min(subset_size, len(first), len(second))
     generator = torch.Generator().manual_seed(seed)
     values = []
     for _ in range(subsets):
         a, b = (x[torch.randperm(len(x), generator=generator)[:size].to(x.device)] for x in (first, second))
-        values.append(poly_mmd(a.double(), b.double()))
+        values.append(poly_mmd(a, b))
     return torch.stack(values).mean().item()

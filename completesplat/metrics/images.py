@@ -1,25 +1,29 @@
-"""Image metrics with one value per image: PSNR, SSIM, and LPIPS if its weights are available."""
+"""Image metrics with one value per image: PSNR, SSIM, LPIPS if its weights are available, and the user's own."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from inspect import signature
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from completesplat.errors import WeightsError
 from completesplat.losses.lpips import PerceptualDistance, load_heads, load_vgg16
 from completesplat.losses.ssim import structural_similarity
-from completesplat.metrics import PSNR_LIMIT
+from completesplat.metrics import PSNR_LIMIT, STYLES, Style
 
 T = TypeVar("T")
 Images = Float[Tensor, "image 3 height width"]
 PerImage = Float[Tensor, " image"]
+Counted = Bool[Tensor, "image 1 height width"]
+ImageMetric = Callable[..., Tensor]
+"""Callable of predicted and true images, and of `masks` if it has this argument, as `values_of` calls it."""
 
 FLATTEST = (1 / 255) ** 2
 """Smallest gradient energy of a truth that sharpness is measured against: one step of 8 bits in all images together."""
-ADVICE = "give torchvision's VGG16 as evaluation.scoring.perceptual.vgg_weights=FILE_OR_URL"
+ADVICE = "give torchvision's VGG16 as evaluation.metrics.lpips.vgg_weights=FILE_OR_URL"
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,33 @@ def load_or_missing(
         return MissingMetrics(" ".join(str(error).split()), names)
 
 
+def values_of(metric: ImageMetric, predicted: Images, true: Images, counted: Counted) -> Tensor:
+    """Return a metric's values, one for each image, of float32 images in [0, 1].
+
+    An argument `masks` gets the pixels that count: all of them, or the object's, where other pixels are black. Metrics
+    of torchmetrics, which may average over the images of a call, are called for each image. Networks are moved to the
+    images' device.
+    """
+    from torchmetrics import Metric
+
+    if isinstance(metric, nn.Module):
+        metric.to(predicted.device)
+    if isinstance(metric, Metric):
+        values = [metric(image[None], truth[None]) for image, truth in zip(predicted, true, strict=True)]
+        metric.reset()
+        return torch.stack(values).flatten()
+    masked = "masks" in signature(getattr(metric, "forward", metric)).parameters
+    return metric(predicted, true, masks=counted) if masked else metric(predicted, true)
+
+
+def style_of(name: str, metric: Any) -> Style:
+    """Return a metric's style: its attributes `heading`, `higher_is_better`, `decimals`, else the style of its name."""
+    known = STYLES.get(name, Style(name))
+    higher = getattr(metric, "higher_is_better", None)
+    better = known.better if higher is None else "↑" if higher else "↓"
+    return Style(getattr(metric, "heading", known.heading), better, getattr(metric, "decimals", known.decimals))
+
+
 def psnr(predicted: Images, true: Images) -> PerImage:
     """Return the peak signal-to-noise ratio in dB, for values in [0, 1]; at most `PSNR_LIMIT`."""
     # torchmetrics makes the number of values on the GPU, which waits for it.
@@ -59,7 +90,7 @@ def ssim(predicted: Images, true: Images) -> PerImage:
     return structural_similarity(predicted, true).mean((1, 2, 3))
 
 
-def gradient_energy(images: Images, counted: Bool[Tensor, "image 1 height width"]) -> float:
+def gradient_energy(images: Images, counted: Counted) -> float:
     """Return the sum of squared differences between neighbours in rows and columns, where both pixels are counted."""
     total = 0.0
     for axis in (-2, -1):
@@ -68,7 +99,7 @@ def gradient_energy(images: Images, counted: Bool[Tensor, "image 1 height width"
     return total
 
 
-def sharpness(predicted: Images, true: Images, counted: Bool[Tensor, "image 1 height width"]) -> float | None:
+def sharpness(predicted: Images, true: Images, counted: Counted) -> float | None:
     """Return the gradient energy of predicted images over that of the true ones: 1 is as sharp, less is a blur.
 
     Noise has gradients, too, so more than 1 is not better. Both energies are sums over all images, so that an image

@@ -10,22 +10,26 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from completesplat.tensors import as_float64
+
 
 def energy_score(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " value"]) -> float:
     """Return E |x - y| - E |x - x'| / 2 for samples x, x' and truth y; distances are root mean squares of values."""
+    samples, truth = as_float64(samples), as_float64(truth)
     count, size = samples.shape
-    spread = torch.pdist(samples.double()).sum() * 2 / (count * (count - 1))
-    error = torch.linalg.vector_norm(samples.double() - truth.double(), dim=1).mean()
+    spread = torch.pdist(samples).sum() * 2 / (count * (count - 1))
+    error = torch.linalg.vector_norm(samples - truth, dim=1).mean()
     return float((error - spread / 2) / size**0.5)
 
 
 def crps(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " value"]) -> float:
     """Return the continuous ranked probability score of each single value, averaged over the values."""
+    samples, truth = as_float64(samples), as_float64(truth)
     count = len(samples)
     # The sum of |x - x'| over all pairs, from the sorted values.
     weights = 2 * torch.arange(count, device=samples.device) - count + 1
-    pairs = (samples.double().sort(0).values * weights[:, None]).sum(0) / (count * (count - 1))
-    return float(((samples.double() - truth.double()).abs().mean(0) - pairs).mean())
+    pairs = (samples.sort(0).values * weights[:, None]).sum(0) / (count * (count - 1))
+    return float(((samples - truth).abs().mean(0) - pairs).mean())
 
 
 def rank_histogram(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " value"]) -> Float[Tensor, " rank"]:
@@ -36,4 +40,4 @@ def rank_histogram(samples: Float[Tensor, "sample value"], truth: Float[Tensor, 
     ranks = torch.arange(len(samples) + 1, device=samples.device)[:, None]
     below = (samples < truth).sum(0)
     equal = (samples == truth).sum(0)
-    return (((ranks >= below) & (ranks <= below + equal)) / (equal + 1)).double().mean(1)
+    return as_float64(((ranks >= below) & (ranks <= below + equal)) / (equal + 1)).mean(1)

@@ -2,7 +2,7 @@
 
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from math import comb, isnan
 from typing import Any
@@ -15,11 +15,19 @@ from completesplat.data.loading.distributed import gather_values
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.surfaces import hidden_from
 from completesplat.metrics.image_sets import ImageSets, SetMetric
-from completesplat.metrics.images import MissingMetrics, object_only, psnr, sharpness, ssim
+from completesplat.metrics.images import (
+    ImageMetric,
+    MissingMetrics,
+    object_only,
+    psnr,
+    sharpness,
+    ssim,
+    style_of,
+    values_of,
+)
 from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
 from completesplat.scene import SceneBatch, Views
 
-ImageMetric = Callable[[Tensor, Tensor], Tensor]
 Scores = dict[tuple[str, str, str], float]
 DepthMaps = Float[Tensor, "image 1 height width"]
 SampledViews = Float[Tensor, "sample view 3 height width"]
@@ -31,7 +39,7 @@ BEST_RULES = {
     BEST_BY_METRIC: "of each region and metric another sample: the best by it, in novel views; no metrics of sets",
 }
 """Rules by which rows choose the best sample; the paper states none."""
-HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}
+TAKEN = ("sharpness", "energy", "crps", "fid", "kid")  # names of scores that are no image metrics
 
 
 class Evaluation:
@@ -44,7 +52,7 @@ class Evaluation:
         samples: number of samples per scene. With more than one, the rows are `model` (the first sample), two oracles
             (`best_of_k`, `best_of_k_by_metric`; see `BEST_RULES`) and `mean_of_k`.
         seed: seed of the samples; a scene's seed depends on this one and on the scene's name only.
-        perceptual: LPIPS, or why it is missing.
+        metrics: image metrics by name (by default PSNR and SSIM), or why they are missing; null leaves one out.
         sets: metrics of whole sets of novel views by name, or why they are missing.
     """
 
@@ -53,20 +61,27 @@ class Evaluation:
         samples: int = 1,
         criterion: str = "psnr",
         seed: int = 0,
-        perceptual: ImageMetric | MissingMetrics | None = None,
+        metrics: Mapping[str, ImageMetric | MissingMetrics | None] | None = None,
         sets: Mapping[str, SetMetric | MissingMetrics | None] | None = None,
     ) -> None:
-        self.metrics: dict[str, ImageMetric] = {"psnr": psnr, "ssim": ssim}
-        if perceptual is not None and not isinstance(perceptual, MissingMetrics):
-            self.metrics["lpips"] = perceptual
+        given = {name: x for name, x in (metrics or {"psnr": psnr, "ssim": ssim}).items() if x is not None}
+        self.metrics = {name: metric for name, metric in given.items() if not isinstance(metric, MissingMetrics)}
+        self.styles = {name: style_of(name, metric) for name, metric in self.metrics.items()}
         candidates = list((sets or {}).values())
-        absent = [metric for metric in (perceptual, *candidates) if isinstance(metric, MissingMetrics)]
+        absent = [metric for metric in (*given.values(), *candidates) if isinstance(metric, MissingMetrics)]
         self.missing = {name: str(metric) for metric in absent for name in metric.names}
+        for name, metric in self.metrics.items():
+            if name in TAKEN or not name.isidentifier():
+                raise CompleteSplatError(f"evaluation.metrics.{name}: choose another name, of letters and digits")
+            if not callable(metric):
+                raise CompleteSplatError(f"evaluation.metrics.{name}={metric}: give evaluation.metrics.{name}._target_")
         if samples < 1:
             raise CompleteSplatError(f"evaluation.scoring.samples={samples}: must be at least 1")
         if criterion not in self.metrics:
             message = self.missing.get(criterion, f"choose one of {', '.join(self.metrics)}")
             raise CompleteSplatError(f"evaluation.scoring.criterion={criterion}: {message}")
+        if self.styles[criterion].higher_is_better is None:
+            raise CompleteSplatError(f"evaluation.scoring.criterion={criterion}: the metric needs `higher_is_better`")
         self.samples, self.criterion, self.seed = samples, criterion, seed
         self.set_metrics = [
             metric for metric in candidates if metric is not None and not isinstance(metric, MissingMetrics)
@@ -106,8 +121,10 @@ class Evaluation:
         self.scores[MODEL][name] |= proper
         with torch.autocast(images.device.type, enabled=False):
             noisy = noisy_mean(images.float(), self.scene_seed(name))[:, 1:]
-            by_noise = [self.metrics[self.criterion](noise, truth.images[1:]).mean().item() for noise in noisy]
-        by, higher = [scores["full", "novel", self.criterion] for scores in each], HIGHER_IS_BETTER[self.criterion]
+            metric, true, counted = self.metrics[self.criterion], truth.images[1:], _counted(truth[1:], "full")
+            by_noise = [values_of(metric, noise, true, counted).mean().item() for noise in noisy]
+        by = [scores["full", "novel", self.criterion] for scores in each]
+        higher = bool(self.styles[self.criterion].higher_is_better)
         curves = {"curve": expected_best_curve(by, higher), "curve_noisy_mean": expected_best_curve(by_noise, higher)}
         self.drawn[name] = {**curves, "diversity": diversity(images[:, 1:]), "ranks": ranks}
 
@@ -115,13 +132,15 @@ class Evaluation:
         """Add the scores of the samples that `BEST_RULES` choose from a scene's, given the scores of each."""
         chosen: dict[tuple[str, str], int] = {}
         for region in REGIONS:
-            for metric in self.metrics:
+            for metric, style in self.styles.items():
                 values = [scores[region, "novel", metric] for scores in each]
-                chosen[region, metric] = best_sample(values, HIGHER_IS_BETTER[metric])
+                numbers = not any(map(isnan, values))
+                if metric == self.criterion or (numbers and style.higher_is_better is not None):
+                    chosen[region, metric] = best_sample(values, bool(style.higher_is_better))
         by_criterion = {region: chosen[region, self.criterion] for region in REGIONS}
         scores = {key: each[by_criterion[key[0]]][key] for key in each[0]}
         self._add(BEST, name, scores, {region: images[i] for region, i in by_criterion.items()}, truth)
-        by_metric = {(r, v, m): each[chosen[r, m]][r, v, m] for r, v, m in each[0] if m in self.metrics}
+        by_metric = {(r, v, m): each[chosen[r, m]][r, v, m] for r, v, m in each[0] if (r, m) in chosen}
         self.scores[BEST_BY_METRIC][name] = by_metric
 
     def score(self, images: Float[Tensor, "view 3 height width"], truth: Views) -> Scores:
@@ -129,12 +148,16 @@ class Evaluation:
         scores: Scores = {}
         for region in REGIONS:
             predicted, true = _region(images, truth, region), _region(truth.images, truth, region)
+            counted = _counted(truth, region)
             for name, metric in self.metrics.items():
                 with torch.autocast(images.device.type, enabled=False):  # metrics compute in float32
-                    values = metric(predicted.float(), true)
+                    values = values_of(metric, predicted.float(), true, counted)
+                if values.shape != images.shape[:1]:
+                    shapes = f"its values are {list(values.shape)}, not one for each of {len(images)} images"
+                    raise CompleteSplatError(f"evaluation.metrics.{name}: {shapes}")
                 scores[region, "reference", name] = values[0].item()
                 scores[region, "novel", name] = values[1:].mean().item()
-            sharp = sharpness(images[1:].float(), truth.images[1:], _counted(truth[1:], region))
+            sharp = sharpness(images[1:].float(), truth.images[1:], counted[1:])
             scores |= {} if sharp is None else {(region, "novel", "sharpness"): sharp}
         return scores
 

@@ -58,14 +58,12 @@ def fit_front(
                 best, least = moved.detach(), error.item()
             if number > rounds or least <= ENOUGH * shown.sum().item() / 2:
                 break
-            gradients = torch.autograd.grad(error, moves)
+            grads = torch.autograd.grad(error, moves)
             # torch.optim's Adam is the same; its first step imports torch's compiler, which takes a second.
             factor = min(1, number / WARM_UP) * (1 + math.cos(math.pi * (number - 1) / rounds)) / 2
-            for move, mean, square, gradient, rate in zip(
-                moves, means, squares, gradients, RATES.values(), strict=True
-            ):
-                mean.lerp_(gradient, 1 - BETAS[0])
-                square.lerp_(gradient.square(), 1 - BETAS[1])
+            for move, mean, square, grad, rate in zip(moves, means, squares, grads, RATES.values(), strict=True):
+                mean.lerp_(grad, 1 - BETAS[0])
+                square.lerp_(grad.square(), 1 - BETAS[1])
                 deviation = (square / (1 - BETAS[1] ** number)).sqrt() + DAMPING
                 move.data -= rate * factor * mean / (1 - BETAS[0] ** number) / deviation
     return best

@@ -38,8 +38,8 @@ class TiledRasterizer:
 
     @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Render scenes [batch] from cameras [batch view]; CUDA tensors are copied here and the images back."""
-        if gaussians.means.is_cuda:
+        """Render scenes [batch] from cameras [batch view]; a GPU's tensors are copied here and the images back."""
+        if gaussians.means.device.type != "cpu":
             return self(gaussians.to("cpu"), cameras.to("cpu")).to(gaussians.means.device)
         _check(gaussians, cameras)
         images = _Rasterize.apply(cameras, self.constants, *vars(gaussians).values())  # type: ignore[no-untyped-call]

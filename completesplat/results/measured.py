@@ -3,15 +3,14 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import TypeVar, cast
 
-from completesplat.results.runs import MODEL, UPPER_BOUND, FlatScores, Protocol, ResultsFile, flat_scores
+from completesplat.metrics import STYLES, Style
+from completesplat.results.runs import MODEL, PROTOCOL, UPPER_BOUND, FlatScores, Protocol, ResultsFile, flat_scores
 from completesplat.results.tables import (
     ABSENT,
     LEGEND,
-    METRICS,
     SHARPNESS_NOTE,
-    SHOWN,
     SSIM_NOTE,
     UNMARKED,
     Cell,
@@ -20,9 +19,11 @@ from completesplat.results.tables import (
     Table,
     TableRow,
     marks,
+    metric_of,
     records_table,
     score_cell,
     score_heading,
+    shown_scores,
 )
 
 BEST_OF_K, BEST_BY_METRIC, MEAN_OF_K = "best_of_k", "best_of_k_by_metric", "mean_of_k"
@@ -107,11 +108,11 @@ class Entry:
         """Whether the predictor is the run's model rather than a naive one."""
         return self.predictor in (MODEL, BEST_OF_K, BEST_BY_METRIC, MEAN_OF_K)
 
-    def cell(self, name: str, notes: Notes, mark: str = UNMARKED) -> Cell:
+    def cell(self, name: str, style: Style, notes: Notes, mark: str = UNMARKED) -> Cell:
         """Return a cell with the score `REGION_VIEW_METRIC`, or with the number of the note on why it is missing."""
         if (value := self.scores.get(name)) is not None or not self.lacking:
-            return score_cell(name, value, self.deviations.get(name), mark)
-        metric = name.rpartition("_")[2]
+            return score_cell(style, value, self.deviations.get(name), mark)
+        metric = metric_of(name)
         reason = self.protocol.get("missing", {}).get(metric, self.lacking)
         return Cell(f"missing: note {notes.number(f'{metric}: {reason}')}")
 
@@ -122,6 +123,12 @@ class Entry:
         cells |= {part: time_cell(self.scores.get(f"seconds_{part}")) for part in COST}
         counts = {"seeds": self.seeds, "scenes": self.scenes}
         return cells | {key: Cell("" if value is None else str(value)) for key, value in counts.items()}
+
+
+def styles_of(entries: Sequence[Entry]) -> dict[str, Style]:
+    """Return the styles of the metrics, the package's and then the user's own, which the entries' protocols state."""
+    measured = [metric for entry in entries for metric in entry.protocol.get("metrics", {}).items()]
+    return STYLES | {name: Style(**described["style"]) for name, described in measured if "style" in described}
 
 
 def score_rows(
@@ -136,14 +143,16 @@ def score_rows(
         marked: whether to mark the best.
     """
     competing = [marked and entry.ours and not entry.upper_bound for entry in entries]
-    mark = {name: marks([entry.scores.get(name) for entry in entries], competing, name) for name, _ in columns}
+    metrics = styles_of(entries)
+    styles = {name: metrics[metric_of(name)] for name, _ in columns}
+    mark = {name: marks([entry.scores.get(name) for entry in entries], competing, x) for name, x in styles.items()}
     rows = []
     for index, entry in enumerate(entries):
         leading = entry.leading(notes)
         cells = [leading.get(key, Cell(ABSENT)) for key in keys]
         for name, data_set in columns:
             apart = data_set not in (None, entry.protocol.get("data_set"))
-            cells.append(Cell(ABSENT) if apart else entry.cell(name, notes, mark[name][index]))
+            cells.append(Cell(ABSENT) if apart else entry.cell(name, styles[name], notes, mark[name][index]))
         rows.append(TableRow("ours" if entry.ours else "naive", cells))
     return rows
 
@@ -199,52 +208,57 @@ def _score_table(name: str, entries: Sequence[Entry]) -> Table:
         if not entry.ours:
             naive.setdefault((entry.predictor, *scores.items()), entry)
     selected = [*(entry for entry in entries if entry.ours), *naive.values()]
-    columns = [column for column in SHOWN if any(_known(entry, column) for entry in selected)]
+    styles = styles_of(selected)
+    columns = [column for column in shown_scores(styles) if any(_known(entry, column) for entry in selected)]
     rows = score_rows(selected, OF_RUNS, [(column, None) for column in columns], notes, marked=True)
     title = f"{protocol['data_set']}, {protocol.get('name', 'scores')}, {protocol['resolution']} pixels"
     remarks = ["Ours, best in bold and second best underlined; not by the protocol of any published table."]
     remarks += [f"Measured alike in all rows. {SSIM_NOTE}", LEGEND]
-    return Table(name, title, [*leading_headings(OF_RUNS), *map(score_heading, columns)], rows, remarks, notes)
+    headings = [score_heading(column, styles[metric_of(column)]) for column in columns]
+    return Table(name, title, [*leading_headings(OF_RUNS), *headings], rows, remarks, notes)
 
 
 def _known(entry: Entry, column: str) -> bool:
     """Return whether an entry has the score of a column, or a stated reason for lacking it."""
-    region, _, name = column.split("_")
+    region, _, name = column.split("_", 2)
     stated = name in entry.protocol.get("missing", {}) and any(key.startswith(region) for key in entry.scores)
     return stated or column in entry.scores
 
 
 def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = MODEL) -> Table:
-    """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks.
+    """Return a row for each predictor, PSNR in dB; object pixels only if there are masks.
 
     Args:
+        results: the protocol (without it, metrics of the user's own are left out), and `Evaluation.results`.
         model: the label of the predictor that is the model.
     """
-    records = {model if name == MODEL else name: flat_scores(entry) for name, entry in results.items()}
+    protocol, measured = results.get(PROTOCOL, {}), {name: x for name, x in results.items() if name != PROTOCOL}
+    records = {model if name == MODEL else name: flat_scores(entry) for name, entry in measured.items()}
     first = next(iter(records.values()))
-    names = _evaluated(list(records.values()))
     entries = []
     for label, scores in records.items():
         bound = " (upper bound)" if scores.get(UPPER_BOUND) else ""
-        entries.append(Entry(label + bound, scores, None))
+        entries.append(Entry(label + bound, scores, None, protocol=cast(Protocol, protocol)))
+    styles = styles_of(entries)
+    names = _evaluated(list(records.values()), shown_scores(styles))
     rows = score_rows(entries, ["method"], [(name, None) for name in names], Notes(), marked=False)
     headings = [Heading("predictor", figures=False)]
-    for region, view, metric in (name.split("_") for name in names):
-        headings.append(Heading(f"{'all' if region == 'full' else region}\npixels\n{view}\n{METRICS[metric]}"))
-    fitted = {label: entry.get("fitted_to") for label, entry in zip(records, results.values(), strict=True)}
+    for region, view, metric in (name.split("_", 2) for name in names):
+        headings.append(Heading(f"{'all' if region == 'full' else region}\npixels\n{view}\n{styles[metric].heading}"))
+    fitted = {label: entry.get("fitted_to") for label, entry in zip(records, measured.values(), strict=True)}
     remarks = [f"{label}: fitted to {views}." for label, views in fitted.items() if views]
     title = f"{first['scenes']:.0f} scenes, {first['views']:.0f} novel views"
     return Table(title, title, headings, rows, [*remarks, SSIM_NOTE, SHARPNESS_NOTE])
 
 
-def _evaluated(records: Sequence[FlatScores]) -> list[str]:
-    """Return the names of the scores in the table, fewer than there are: more columns are too wide."""
+def _evaluated(records: Sequence[FlatScores], names: Sequence[str]) -> list[str]:
+    """Return those of the scores that are in the table, fewer than there are: more columns are too wide."""
     pairs = [(f"object_novel_{name}", f"full_novel_{name}") for name in ("psnr", "ssim")]
     masked = any(record.get(name) != record.get(whole) for record in records for name, whole in pairs)
     # Without masks, every pixel is the object's; with them, sharpness is the object's.
-    apart = ("full_novel_sharpness", "object_novel_lpips") if masked else "object"
-    present = [name for name in SHOWN if any(name in record for record in records)]
-    return [name for name in present if not name.startswith(apart)]
+    of_objects = [name for name in names if name.startswith("object_")]
+    apart = ["full_novel_sharpness", "object_novel_lpips"] if masked else of_objects
+    return [name for name in names if name not in apart and any(name in record for record in records)]
 
 
 def mode_tables(runs: Sequence[ResultsFile]) -> list[Table]:

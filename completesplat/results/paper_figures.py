@@ -173,7 +173,7 @@ def published_tables(tree: RunTree | None) -> list[Table]:
         entries = []
         if table.get("options"):
             for folder, tested in sweeps.items():
-                entries += sweep_entries(table, str(folder.relative_to(tree.folder)), tested)
+                entries += sweep_entries(table, folder.relative_to(tree.folder).as_posix(), tested)
         else:
             entries = [entry for entry in single if is_comparable(table, entry)]
             placed += entries

@@ -42,6 +42,7 @@ class Protocol(TypedDict, total=False):
     data_set: str
     resolution: int
     scenes: int
+    metrics: dict[str, dict[str, Any]]
     missing: dict[str, str]
     machine: dict[str, Any]
     checkpoint: dict[str, str]
@@ -128,7 +129,7 @@ def _result(path: Path, root: Path) -> ResultsFile:
         raise ValueError(f"it does not say how it was measured; {HOW}")
     if not entries:
         raise ValueError("it holds no scores by predictor")
-    return ResultsFile(path.parent, str(path.parent.relative_to(root)), cast(Protocol, protocol), entries)
+    return ResultsFile(path.parent, path.parent.relative_to(root).as_posix(), cast(Protocol, protocol), entries)
 
 
 def _mapping(value: object) -> Mapping[str, object]:

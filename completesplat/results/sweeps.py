@@ -12,16 +12,17 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 
 from completesplat.results.machine import machine
-from completesplat.results.measured import Entry, score_rows
+from completesplat.results.measured import Entry, score_rows, styles_of
 from completesplat.results.runs import MODEL, SEED, UPPER_BOUND, Job, Record, collect, shell_command
 from completesplat.results.tables import (
-    SHOWN,
     SSIM_NOTE,
     Heading,
     Notes,
     Table,
+    metric_of,
     score_heading,
     show,
+    shown_scores,
     write_csv,
     write_documents,
 )
@@ -92,10 +93,10 @@ def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> Entry:
     scores = _complete_scores(tables)
     means = {name: fmean(values) for name, values in scores.items()}
     if predictor != MODEL:
-        return Entry(label, means, scenes, predictor, bound)
+        return Entry(label, means, scenes, predictor, bound, protocol=jobs[0].protocol)
     deviations = {name: _deviation(values) for name, values in scores.items()} if len(jobs) > 1 else {}
     steps = _common(job.steps for job in jobs)
-    return Entry(label, means, scenes, predictor, bound, len(jobs), steps, deviations)
+    return Entry(label, means, scenes, predictor, bound, len(jobs), steps, deviations, jobs[0].protocol)
 
 
 def _complete_scores(tables: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
@@ -126,21 +127,15 @@ def summarize(*folders: Path) -> tuple[list[Entry], Table]:
     """
     jobs = collect(*folders)
     rows = sweep_rows([job for job in jobs if job.finished])
-    names = [name for name in SHOWN if any(name in row.scores for row in rows)]
+    styles = styles_of(rows)
+    names = [name for name in shown_scores(styles) if any(name in row.scores for row in rows)]
     columns = [(name, None) for name in names]
     body = score_rows(rows, ("method", "seeds", "scenes"), columns, Notes(), marked=True)
-    headings = [Heading("ablation", figures=False), Heading("seeds"), Heading("scenes"), *map(score_heading, names)]
-    remarks = [CAPTION if rows else "No job of this sweep has finished.", *_remarks(jobs, rows)]
+    headings = [Heading("ablation", figures=False), Heading("seeds"), Heading("scenes")]
+    headings += [score_heading(name, styles[metric_of(name)]) for name in names]
+    remarks = [CAPTION if rows else "No job of this sweep has finished.", *_progress_remarks(jobs)]
+    remarks += [*_row_remarks(rows), *_program_remarks([job.record for job in jobs if job.record])]
     return rows, Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
-
-
-def _remarks(jobs: Sequence[Job], rows: Sequence[Entry]) -> list[str]:
-    """Return sentences on finished and missing jobs, on rows that do not compare, on commit, machine and commands."""
-    return [
-        *_progress_remarks(jobs),
-        *_row_remarks(rows),
-        *_program_remarks([job.record for job in jobs if job.record]),
-    ]
 
 
 def _progress_remarks(jobs: Sequence[Job]) -> list[str]:

@@ -1,22 +1,18 @@
 """Table type of all results, and its writers for Markdown, LaTeX, CSV and the terminal."""
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from completesplat.files import atomic_path, write_text
-from completesplat.metrics import PSNR_LIMIT
+from completesplat.metrics import PSNR_LIMIT, STYLES, Style
 
 if TYPE_CHECKING:
     from rich.table import Table as PrintedTable
 
-METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID", "sharpness": "sharpness"}
-FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f", "sharpness": ".2f"}
-BETTER = {"psnr": "↑", "ssim": "↑", "lpips": "↓", "fid": "↓", "kid": "↓", "sharpness": "(truth: 1)"}
-"""Better direction of each metric. Sharpness has none, because a blur has less than the truth and noise has more."""
 HEADING_GROUPS = {
     "full_novel": "all pixels, novel views",
     "object_novel": "object pixels, novel views",
@@ -39,30 +35,37 @@ ESCAPES = str.maketrans(
 ABSENT, BLANK = "-", "(blank)"
 LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK}: left blank in the paper."
 
-SHOWN = [f"full_novel_{name}" for name in METRICS]
-SHOWN += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips", "sharpness")]
-SHOWN += [f"{region}_reference_{name}" for region in ("full", "object") for name in ("psnr", "ssim")]
-"""Scores that a table shows if a row has them."""
 PLAIN = (type(None), str, bool, int, float)  # types of values that a table can show
 CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
 
 
-def score_heading(name: str) -> "Heading":
+def shown_scores(metrics: Collection[str]) -> list[str]:
+    """Return the scores (`REGION_VIEW_METRIC`) that a table of these metrics shows if a row has them."""
+    of_objects = [name for name in metrics if name not in ("fid", "kid")]
+    names = [f"full_novel_{name}" for name in metrics] + [f"object_novel_{name}" for name in of_objects]
+    return names + [f"{region}_reference_{name}" for region in ("full", "object") for name in ("psnr", "ssim")]
+
+
+def metric_of(name: str) -> str:
+    """Return the metric of a score named `REGION_VIEW_METRIC`."""
+    return name.split("_", 2)[2]
+
+
+def score_heading(name: str, style: Style) -> "Heading":
     """Return a heading for a score named `REGION_VIEW_METRIC`: its better direction, grouped by region and view."""
-    group, _, metric = name.rpartition("_")
-    return Heading(f"{METRICS[metric]} {BETTER[metric]}", HEADING_GROUPS[group])
+    group = name.removesuffix(f"_{metric_of(name)}")
+    return Heading(f"{style.heading} {style.better}".rstrip(), HEADING_GROUPS[group])
 
 
-def marks(values: Sequence[float | None], competing: Sequence[bool], name: str) -> list[str]:
-    """Return for each score of a metric (or `REGION_VIEW_METRIC`) the mark of the best, the second best, or none.
+def marks(values: Sequence[float | None], competing: Sequence[bool], style: Style) -> list[str]:
+    """Return for each score of a metric the mark of the best, the second best, or none.
 
     Scores are compared as they are written, so that scores which look equal share a mark; None was not measured. Naive
     predictors and upper bounds are not `competing` and have no mark, nor have metrics without a better direction.
     """
-    name = name.rpartition("_")[2]
-    sign = {"↑": -1, "↓": 1}.get(BETTER[name])
+    sign = {"↑": -1, "↓": 1}.get(style.better)
     written = [
-        sign * float(format(value, FORMATS[name])) if sign and competes and value is not None else None
+        sign * float(style.text(value)) if sign and competes and value is not None else None
         for value, competes in zip(values, competing, strict=True)
     ]
     ranked = sorted({value for value in written if value is not None and value == value})  # without NaN
@@ -79,13 +82,12 @@ class Cell:
     value: float | None = None
 
 
-def score_cell(name: str, value: float | None, deviation: float | None = None, mark: str = UNMARKED) -> Cell:
-    """Return a cell with a score named `REGION_VIEW_METRIC` (empty for None), and its deviation if there is one."""
-    metric = name.rpartition("_")[2]
-    if value is None or (metric == "psnr" and value == PSNR_LIMIT):
+def score_cell(style: Style, value: float | None, deviation: float | None = None, mark: str = UNMARKED) -> Cell:
+    """Return a cell with a score (empty for None), and its deviation if there is one."""
+    if value is None or (style == STYLES["psnr"] and value == PSNR_LIMIT):
         return Cell("" if value is None else "the same image", mark, value)
-    after = "" if deviation is None else f" ± {deviation:{FORMATS[metric]}}"
-    return Cell(f"{value:{FORMATS[metric]}}{after}", mark, value)
+    after = "" if deviation is None else f" ± {style.text(deviation)}"
+    return Cell(f"{style.text(value)}{after}", mark, value)
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,9 @@ class SceneSettings(TypedDict):
 class PredictSettings(SceneSettings):
     """Settings of `completesplat predict`. All samples of an image, or frames of a video, are in memory at once."""
 
+    shard: Annotated[int, Range(0)]
+    shards: Positive
+    devices: Positive
     samples: Annotated[int, Range(1, 1000)]
     seed: Seed
     batch: Positive | None

@@ -39,7 +39,7 @@ def controls_rows(
     `near_degrees` from the reference's direction, which mostly show surfaces of the input. `diversity` is of targets.
     """
 
-    def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> dict[str, float | None]:
+    def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> Row:
         images = renderer(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
         reference, targets = scene.reference, scene.targets[0]
         seen = near_reference(reference.cameras[0], targets.cameras, near_degrees)

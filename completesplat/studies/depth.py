@@ -34,20 +34,18 @@ def depth_rows(
     in the deviations. A figure that no scene has is None.
     """
 
-    def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> dict[str, float | None]:
+    def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> Row:
         rendering = renderer.render(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
         return deviations(surface_depth(rendering), scene, far_degrees)
 
     return over_settings(settings, scenes, measure, tick)
 
 
-def deviations(
-    depth: Float[Tensor, "sample view 1 height width"], scene: SceneBatch, far_degrees: float
-) -> dict[str, float | None]:
+def deviations(depth: Float[Tensor, "sample view 1 height width"], scene: SceneBatch, far_degrees: float) -> Row:
     """Return the figures of `depth_rows` for one scene (a batch of one), given depths of all its views."""
     maps, masks = deviation(depth), scene.all_views().masks[0]
     far = 1 + torch.nonzero(~near_reference(scene.reference.cameras[0], scene.targets.cameras[0], far_degrees))[:, 0]
-    figures: dict[str, float | None] = {}
+    figures: Row = {}
     for name, views in (("reference", far.new_zeros(1)), ("far", far)):
         figures[f"{name}_deviation"] = _mean(maps[views])
         figures[f"{name}_object_deviation"] = _mean(maps[views][masks[views] > 0.5])

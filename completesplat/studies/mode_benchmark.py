@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from completesplat.autoreconstructor.encoder import Features
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
@@ -46,14 +47,12 @@ def decoding_methods(
         masked: whether the model sees only the visible part of the reference image.
     """
 
-    def input_image(scene: SceneBatch) -> Float[Tensor, "1 3 _ _"]:
-        return scene.reference.images * scene.visible if masked else scene.reference.images
-
-    def encode(scene: SceneBatch, with_views: bool = model.sees_views) -> Posterior:
-        return model.posterior(input_image(scene), scene.all_views() if with_views else None, scene.depth_range)[0]
+    def encode(scene: SceneBatch, with_views: bool = model.sees_views) -> tuple[Posterior, Features]:
+        image = scene.reference.images * scene.visible if masked else scene.reference.images
+        return model.posterior(image, scene.all_views() if with_views else None, scene.depth_range)
 
     def decode(latents: Float[Tensor, "sample channel _ _"], scene: SceneBatch) -> Gaussians:
-        features = model.encoder.features(input_image(scene) * 2 - 1, model.reconstructor.feature_levels)
+        _, features = encode(scene, False)
 
         def decode_part(part: slice) -> Gaussians:
             count = len(latents[part])
@@ -65,18 +64,18 @@ def decoding_methods(
         return concatenate(in_parts(decode_part, len(latents), batch))
 
     def decode_samples(scene: SceneBatch, encoded: SceneBatch, seed: int) -> Gaussians:
-        q = encode(encoded)
+        q, _ = encode(encoded)
         # On the CPU, so that a seed means the same on every device.
         noise = torch.randn(samples, *q.mean.shape[1:], generator=torch.Generator().manual_seed(seed))
         return decode(q.mean + noise.to(q.mean) * q.std, scene)
 
     methods: dict[str, Method] = {
-        "posterior_mean": lambda scene, other, seed: decode(encode(scene).mean, scene),
+        "posterior_mean": lambda scene, other, seed: decode(encode(scene)[0].mean, scene),
         "posterior_samples": lambda scene, other, seed: decode_samples(scene, scene, seed),
         "other_scene": lambda scene, other, seed: decode_samples(scene, other, seed),
     }
     if model.sees_views:
-        methods["reference_only"] = lambda scene, other, seed: decode(encode(scene, False).mean, scene)
+        methods["reference_only"] = lambda scene, other, seed: decode(encode(scene, False)[0].mean, scene)
     return methods
 
 

@@ -56,9 +56,7 @@ def statistics(sequences: Mapping[str, Iterable[PosedSequence]]) -> dict[str, An
 def show_statistics(results: dict[str, Any]) -> None:
     """Print the splits side by side."""
     splits = results["splits"]
-    counts = [
-        {"split": split, **{key: summary[key] for key in ("sequences", "frames")}} for split, summary in splits.items()
-    ]
+    counts = [{"split": split, "sequences": s["sequences"], "frames": s["frames"]} for split, s in splits.items()]
     columns = {"": Heading("", figures=False)}
     columns |= {f"{split} {part}": Heading(part, split) for split in splits for part in PARTS}
     ranges: list[dict[str, object]] = []

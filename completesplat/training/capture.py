@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,10 +17,9 @@ from torch.optim import Adam
 from completesplat.baselines.fitting import (
     NEIGHBOURS,
     POSITION_DECAY,
-    POSITION_RATE,
-    RATES,
     Count,
     RawGaussians,
+    adam,
     gaussians_at_points,
     initial_gaussians,
     position_noise,
@@ -179,12 +179,10 @@ class CaptureFit(Stage):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Build Adam with 3DGS's rates and epsilon; the rate of the positions decays to a hundredth."""
-        near, far = self.sequence("train").depth_ranges.mean(0).tolist()
-        rates = {name: self.fitting.other_rates * RATES[name] for name in RATES}
-        rates = {"means": self.fitting.position_rate * POSITION_RATE * 0.5 * (far - near), **rates}
-        optimizer = Adam([{"params": [self.raw[name]], "lr": rate} for name, rate in rates.items()], eps=1e-15)
+        depth_ranges, settings = self.sequence("train").depth_ranges, self.fitting
+        optimizer = adam(dict(self.raw.items()), depth_ranges, settings.position_rate, settings.other_rates)
         steps = max(1, self.trainer.estimated_stepping_batches)
-        decays = [lambda step: POSITION_DECAY ** (step / steps), *[lambda step: 1.0] * (len(rates) - 1)]
+        decays = [lambda step: POSITION_DECAY ** (step / steps), *[lambda step: 1.0] * (len(self.raw) - 1)]
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": Schedule(optimizer, decays), "interval": "step"}}
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
@@ -211,7 +209,8 @@ class CaptureFit(Stage):
             try:
                 converter = find_splat_transform() if set(part.formats) & set(CONVERTED) else None
                 part, comments = replace(part, converter=converter), [f"scene {name}"]
-                files |= write_scene(self.scene_folder, "scene", "", shot, self.rasterizer, part, comments)[-1]
+                on_file = partial(logger.info, "writing %s")
+                files |= write_scene(self.scene_folder, "scene", "", shot, self.rasterizer, part, comments, on_file)[-1]
             except CompleteSplatError as error:
                 logger.warning("left out: %s", error)
         title = f"{name}: held-out photos, Gaussians fitted to the {len(self.sequence('train').frames)} others"

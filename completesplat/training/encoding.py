@@ -4,14 +4,12 @@ import hashlib
 import logging
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import torch
 from jaxtyping import Float
 from rich.filesize import decimal
@@ -22,32 +20,18 @@ from torch.utils.data import DataLoader, Dataset
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import gather_values, processes
-from completesplat.data.loading.latent_cache import (
-    FILE,
-    CachedSequence,
-    LatentCache,
-    LatentCacheManifest,
-    Origin,
-    Rows,
-    latent_row,
-    latent_schema,
-    write_manifest,
-)
+from completesplat.data.loading.latent_cache import CachedSequence, LatentCache, Origin, Rows, Sums, write_cache
 from completesplat.data.loading.scenes import LoadedScenes, SceneStore, collate
 from completesplat.data.loading.view_selection import spread_around
 from completesplat.data.packed.manifest import MANIFEST
 from completesplat.data.packed.source import PackedSource
-from completesplat.data.packed.writing import UNFINISHED
 from completesplat.data.sequences import spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.files import atomic_path
 from completesplat.scene import SceneBatch
 from completesplat.signals import leave_to_parent
-from completesplat.version import __version__
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 Moments = Float[np.ndarray, "row channel _ _"]
-Sums = Float[np.ndarray, "3 channel"]
 
 logger = logging.getLogger(__name__)
 
@@ -83,26 +67,51 @@ def check_cache(store: LatentCache, autoreconstructor: VariationalAutoReconstruc
         raise WeightsError(f"{store.folder}: holds {content}; {advice}")
 
 
-@torch.no_grad()
-def encode_scenes(
-    scenes: SceneBatch,
-    autoreconstructor: VariationalAutoReconstructor,
-    conditioning: nn.Module | None,
-    precision: torch.dtype,
-    device: torch.device | str,
-) -> Rows:
-    """Encode the reference images of scenes; return the rows "mean", "log_variance" and "condition"."""
-    scenes = scenes.to(device)
-    images = scenes.reference.images
-    views = scenes.all_views() if autoreconstructor.sees_views else None
-    posterior, _ = autoreconstructor.posterior(images, views, scenes.depth_range)
-    outputs = {"mean": posterior.mean, "log_variance": posterior.log_variance}
-    if conditioning is not None:
-        outputs["condition"] = conditioning.eval()(images)
-    rows = {name: value.to(precision).cpu().numpy() for name, value in outputs.items()}
-    if conditioning is not None:
-        return rows
-    return {"condition": (images * 255).round().to(torch.uint8).cpu().numpy(), **rows}
+@dataclass(frozen=True)
+class FrameEncoder:
+    """Frozen networks that encode scenes, on a device.
+
+    Args:
+        conditioning: frozen network from images to features, which are stored; None: the images are stored.
+        precision: "float32", or "float16" for half the space, with relative errors of at most 2^-11 in means and 0.8%
+            in variances. (The diffusion's first timestep adds noise of 0.029 to latents of unit variance.)
+
+    Raises:
+        CompleteSplatError: the conditioning is trained.
+    """
+
+    autoreconstructor: VariationalAutoReconstructor
+    conditioning: nn.Module | None = None
+    precision: str = "float32"
+    device: torch.device | str = "cpu"
+
+    def __post_init__(self) -> None:
+        if self.conditioning is not None and not self.conditioning.frozen:
+            message = "a conditioning that is trained needs images, not features: leave conditioning out"
+            raise CompleteSplatError(message)
+        for network in filter(None, (self.autoreconstructor, self.conditioning)):
+            network.to(self.device).eval()
+
+    @torch.no_grad()
+    def __call__(self, scenes: SceneBatch) -> Rows:
+        """Encode the reference images of scenes; return the rows "mean", "log_variance" and "condition"."""
+        scenes, network = scenes.to(self.device), self.autoreconstructor
+        images = scenes.reference.images
+        views = scenes.all_views() if network.sees_views else None
+        posterior, _ = network.posterior(images, views, scenes.depth_range)
+        outputs = {"mean": posterior.mean, "log_variance": posterior.log_variance}
+        if self.conditioning is not None:
+            outputs["condition"] = self.conditioning(images)
+        rows = {name: value.to(PRECISIONS[self.precision]).cpu().numpy() for name, value in outputs.items()}
+        if self.conditioning is not None:
+            return rows
+        return {"condition": (images * 255).round().to(torch.uint8).cpu().numpy(), **rows}
+
+    def origin(self, data: SceneDataModule, frames: int | None, views: int) -> Origin:
+        """Return what determines the content of a cache of the training data."""
+        encoder, features = fingerprints(self.autoreconstructor, self.conditioning)
+        fingerprint, settings = data.source("train").fingerprint(), data.packed_settings()
+        return Origin(encoder, features, fingerprint, settings, data.image_size, frames, views, self.precision)
 
 
 def moment_sums(mean: Moments, log_variance: Moments) -> Sums:
@@ -112,23 +121,13 @@ def moment_sums(mean: Moments, log_variance: Moments) -> Sums:
     return np.stack([np.full_like(total, mean[:, 0].size), total, squares])
 
 
-def moments(sums: Sums) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return mean and standard deviation of each channel; Var[h] = E[mean^2] + E[variance] - E[mean]^2."""
-    count, total, squares = sums
-    mean = total / count
-    return tuple(mean.tolist()), tuple(np.sqrt(squares / count - np.square(mean)).tolist())
-
-
 def encode_training_set(
-    autoreconstructor: VariationalAutoReconstructor,
+    encode: FrameEncoder,
     data: SceneDataModule,
     out: Path,
     frames: int | None = None,
     views: int = 7,
-    precision: str = "float32",
-    conditioning: nn.Module | None = None,
     batch_size: int = 64,
-    device: torch.device | str = "cpu",
     progress: bool = True,
 ) -> LatentCache:
     """Encode every frame of every sequence of a packed training set, without augmentation.
@@ -139,26 +138,22 @@ def encode_training_set(
     Args:
         frames: at most this many frames of a sequence, evenly spaced; None: all.
         views: number of other views, evenly spread over the sequence, for a posterior that sees views.
-        precision: "float32", or "float16" for half the space, with relative errors of at most 2^-11 in means and 0.8%
-            in variances. (The diffusion's first timestep adds noise of 0.029 to latents of unit variance.)
-        conditioning: frozen network from images to features, which are stored; None: the images are stored.
 
     Raises:
         DataError: damaged or unpacked data, too little space, another cache in the folder, or encodings not finite.
     """
-    views = views if autoreconstructor.sees_views else 0
-    source = _packed(data)
-    origin = _origin(autoreconstructor, data, conditioning, frames, views, precision)
+    views = views if encode.autoreconstructor.sees_views else 0
+    source = data.source("train")
+    if not isinstance(source, PackedSource):
+        advice = "run `completesplat data prepare` first, then give overrides=['data.root=STORE']"
+        raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
+    origin = encode.origin(data, frames, views)
     if (out / MANIFEST).is_file():
         if (store := LatentCache(out)).origin != origin:
             raise DataError("already holds another store: choose another folder, or remove this one", str(out))
         logger.info("%s already holds these encodings", out)
         return store
     out.mkdir(parents=True, exist_ok=True)
-    frozen, features = autoreconstructor.to(device).eval(), None if conditioning is None else conditioning.to(device)
-    encode = partial(
-        encode_scenes, autoreconstructor=frozen, conditioning=features, precision=PRECISIONS[precision], device=device
-    )
     counts = {name: len(source.read(name).frames) for name in source.names}
     sequences = [CachedSequence(name, count, tuple(spread_places(count, frames))) for name, count in counts.items()]
     places = [(sequence.name, place) for sequence in sequences for place in sequence.stored]
@@ -167,19 +162,11 @@ def encode_training_set(
     _check_space(len(places), len(sequences), sum(rows.nbytes for rows in blank.values()), out)
     batches = _encoded_batches(references, encode, batch_size, data.workers, progress)
     if processes()[0] == 0:
-        _write_store(out, origin, blank, batches, sequences)
+        write_cache(out, origin, batches, sequences)
     else:
         deque(batches, maxlen=0)
     gather_values(None)  # the other processes wait until the manifest is written
     return LatentCache(out)
-
-
-def _packed(data: SceneDataModule) -> PackedSource:
-    source = data.source("train")
-    if not isinstance(source, PackedSource):
-        advice = "run `completesplat data prepare` first, then give overrides=['data.root=STORE']"
-        raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
-    return source
 
 
 @dataclass(frozen=True)
@@ -216,7 +203,7 @@ def _scenes(loaded: LoadedScenes) -> SceneBatch:
 
 
 def _encoded_batches(
-    references: References, encode: Callable[[SceneBatch], Rows], batch_size: int, workers: int, progress: bool
+    references: References, encode: FrameEncoder, batch_size: int, workers: int, progress: bool
 ) -> Iterator[tuple[Rows, Sums]]:
     """Yield rows and moment sums of all batches in order. Each process encodes a share, so all must iterate.
 
@@ -250,48 +237,6 @@ def _check_space(frames: int, sequences: int, bytes_per_frame: int, out: Path) -
     if size > free:
         raise DataError(f"not enough space: {needed}; frames=N takes fewer frames of a sequence", str(out))
     logger.info(needed)
-
-
-def _write_store(
-    out: Path, origin: Origin, blank: Rows, batches: Iterator[tuple[Rows, Sums]], sequences: Sequence[CachedSequence]
-) -> None:
-    """Write all sequences, with the shapes of `blank`, then the manifest."""
-    total, written, schema = np.zeros(()), 0, latent_schema(origin)
-    waiting = {name: rows[:0] for name, rows in blank.items()}  # of sequences that are not complete
-    with (
-        atomic_path(out / FILE, f"{FILE}{UNFINISHED}") as unfinished,
-        unfinished.open("wb") as file,
-        pa.ipc.new_stream(file, schema) as writer,
-    ):
-        for rows, sums in batches:
-            total = total + sums
-            waiting = {name: np.concatenate([values, rows[name]]) for name, values in waiting.items()}
-            for sequence in sequences[written:]:
-                count = len(sequence.stored)
-                if len(waiting["mean"]) < count:
-                    break
-                complete = {name: np.ascontiguousarray(values[:count]) for name, values in waiting.items()}
-                writer.write_batch(latent_row(sequence.name, complete, schema))
-                waiting = {name: values[count:] for name, values in waiting.items()}
-                written += 1
-    shapes = {name: rows.shape[1:] for name, rows in blank.items()}
-    size = (out / FILE).stat().st_size
-    write_manifest(out, LatentCacheManifest(__version__, origin, *moments(total), shapes, tuple(sequences), size))
-
-
-def _origin(
-    autoreconstructor: VariationalAutoReconstructor,
-    data: SceneDataModule,
-    conditioning: nn.Module | None,
-    frames: int | None,
-    views: int,
-    precision: str,
-) -> Origin:
-    if conditioning is not None and not conditioning.frozen:
-        raise CompleteSplatError("a conditioning that is trained needs images, not features: leave conditioning out")
-    encoder, features = fingerprints(autoreconstructor, conditioning)
-    fingerprint, settings = data.source("train").fingerprint(), data.packed_settings()
-    return Origin(encoder, features, fingerprint, settings, data.image_size, frames, views, precision)
 
 
 def _refuse_not_finite(rows: Rows, references: References, batch: Sequence[int]) -> None:

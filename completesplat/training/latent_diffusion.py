@@ -11,11 +11,12 @@ from torch import Tensor
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.loading.distributed import gather_values
 from completesplat.data.loading.latent_cache import LatentCache
+from completesplat.diffusion.guidance import Latents
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
-from completesplat.scene import CachedScene, SceneBatch
+from completesplat.scene import Batch, SceneBatch
 from completesplat.settings.schema import Natural, Positive, Share
 from completesplat.training.encoding import check_cache
 from completesplat.training.scoring import Scorer
@@ -170,7 +171,7 @@ class LatentDiffusion(DiffusionScorer, Stage):
             )
 
     @torch.no_grad()
-    def _measure_latents(self, loader: Iterable[SceneBatch | CachedScene], cache: LatentCache | None) -> None:
+    def _measure_latents(self, loader: Iterable[Batch], cache: LatentCache | None) -> None:
         """Measure mean and standard deviation of each latent channel, with which the denoiser's are standardised.
 
         The paper does not state how it scales latents; the values are stored with the weights. A cache has exact ones.
@@ -184,7 +185,7 @@ class LatentDiffusion(DiffusionScorer, Stage):
                     f"latents are {sizes[0]} and the conditioning's features {sizes[1]} in size: "
                     "conditioning.channels and autoreconstructor.encoder.channels must have as many levels"
                 )
-            drawn.append(latent.double().cpu())
+            drawn.append(latent.cpu().double())
         latents = torch.cat(gather_values(torch.cat(drawn) if drawn else torch.zeros(1, 1, 1, 1)))
         mean, std = latents.mean((0, 2, 3)), latents.std((0, 2, 3), correction=0)
         if not (std > 0).all():
@@ -195,9 +196,7 @@ class LatentDiffusion(DiffusionScorer, Stage):
         for logger in self.trainer.loggers:
             logger.log_metrics(logs, step=self.trainer.global_step)
 
-    def inputs(
-        self, batch: SceneBatch | CachedScene
-    ) -> tuple[Float[Tensor, "batch channel height width"], Float[Tensor, "batch features _ _"]]:
+    def inputs(self, batch: Batch) -> tuple[Latents, Float[Tensor, "batch features _ _"]]:
         """Return a draw of the scaled latents, and phi_ref.
 
         Encoded scenes have images for a conditioning that is trained, and features for one that is frozen.
@@ -210,7 +209,7 @@ class LatentDiffusion(DiffusionScorer, Stage):
         latent = parts.standardised(Posterior(batch.mean, batch.log_variance).sample())
         return latent, batch.condition if parts.conditioning.frozen else parts.conditioning(batch.condition)
 
-    def training_step(self, batch: SceneBatch | CachedScene, index: int) -> Float[Tensor, ""]:
+    def training_step(self, batch: Batch, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat
         latent, conditioning = (x.repeat_interleave(self.noise_draws, 0) for x in self.inputs(batch))
         conditioned = torch.rand(len(latent), device=self.device) >= self.unconditional_probability

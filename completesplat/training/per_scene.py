@@ -15,8 +15,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from completesplat.baselines.fitting import FittingSettings, fit_gaussians
-from completesplat.baselines.preoptimized import project_to_splatter_image
-from completesplat.baselines.sparse_vae import SparseVAE
+from completesplat.baselines.preoptimized import SparseVAE, project_to_splatter_image
 from completesplat.data.loading.distributed import gather_values, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.errors import CompleteSplatError

@@ -37,6 +37,7 @@ class Completion:
     def load(self, name: str, photograph: Photograph, client: viser.ClientHandle | None = None) -> None:
         """Show this photo in the panel, and draw its samples."""
         self.photograph = name, photograph
+        self.page.photo.content = ""  # of an earlier scene
         label = f"{name}, field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"
         self.controls.preview.content = preview_of(to_pixels(photograph.image), label)
         self.page.view.set_up(self.model.up.tolist())
@@ -51,6 +52,7 @@ class Completion:
 
     def complete(self, image: Path, name: str, client: viser.ClientHandle | None) -> None:
         """Load an image file; raise a `CompleteSplatError` if it is none, or its background cannot be removed."""
+        show_status(self.page.server, f"reading {name}")
         self.load(name, self.model.read(image, remove_background=self.controls.remove_background.value), client)
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:

@@ -8,19 +8,32 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import viser
 
+from completesplat.data.images.files import open_image, refused_as_bad
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED, FORMATS, suffix, write_formats
 from completesplat.export.images import to_pixels
+from completesplat.export.prediction import PHOTO_FILE
 from completesplat.export.splat_transform import PageView, find_splat_transform
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.files import SPLATS, printable, write_text
 from completesplat.geometry.cameras import Cameras
+from completesplat.geometry.trajectories import orbit
 from completesplat.rasterizers import Rasterizer
 from completesplat.viewer.access import GuardedServer, show_status, stop_server, with_head
-from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Pixels, add_looking, add_opening, add_saving, thumbnail_row
+from completesplat.viewer.panel import (
+    SIDE_BY_SIDE,
+    VIDEO,
+    Pixels,
+    add_looking,
+    add_opening,
+    add_saving,
+    preview_of,
+    thumbnail_row,
+)
 from completesplat.viewer.sample import Sample, read_scene
 from completesplat.viewer.splat_view import SplatView
 
@@ -105,8 +118,9 @@ class Saver:
         return [self._video(sample) if kind == VIDEO else self._scene(kind, sample) for sample in samples]
 
     def thumbnail(self, sample: Sample, size: int) -> Pixels:
-        """Render a sample from its reference camera, with `size` px on the longer side."""
-        camera, scene = sample.reference, sample.for_viewers()
+        """Render a sample from behind, where samples differ, with `size` px on the longer side."""
+        up = torch.from_numpy(self.view.up).to(sample.reference.intrinsics)
+        camera, scene = orbit(sample.reference, sample.pivot(), up, 2)[1], sample.for_viewers()
         factor = size / max(camera.image_size)
         height, width = (max(1, round(side * factor)) for side in camera.image_size)
         intrinsics = camera.intrinsics * camera.intrinsics.new_tensor([[factor], [factor], [1.0]])
@@ -151,6 +165,7 @@ class Page:
         self.opening = add_opening(server.gui, [*scenes])
         self.opening.upload.on_upload(self._upload)
         self.opening.chosen.on_update(self._choose)
+        self.photo = server.gui.add_html("", order=0.4)
         self.looking = add_looking(server.gui)
         self._connect_looking()
         self.saving = add_saving(server.gui, FORMATS)
@@ -177,6 +192,15 @@ class Page:
         samples, up = read_scene(path)
         self.view.set_up(up)
         self.show(samples, name)
+        self.show_photo(path)
+
+    def show_photo(self, scene: Path) -> None:
+        """Show a prediction's photo, if its folder has one, in the panel; raise BadImage for a damaged one."""
+        file = (scene if scene.is_dir() else scene.parent) / PHOTO_FILE
+        self.photo.content = ""
+        if file.is_file():
+            with refused_as_bad(str(file)), open_image(file, ("PNG",)) as image:
+                self.photo.content = preview_of(np.asarray(image.convert("RGB").resize((THUMBNAIL,) * 2)), "photo")
 
     def _choose(self, _: viser.GuiEvent[Any]) -> None:
         name = self.opening.chosen.value
@@ -265,10 +289,12 @@ class Page:
             return
 
         def save() -> None:
+            show_status(self.server, f"saving {kind}")
             try:
                 files = self.saver.save(kind, self.view.visible)
             except CompleteSplatError as error:
                 return self.tell(error, client)
+            show_status(self.server, "")
             for file in files:
                 client.send_file_download(file.name, file.read_bytes())
             client.add_notification("Saved", f"{', '.join(file.name for file in files)} in {self.saver.folder}")

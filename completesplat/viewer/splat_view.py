@@ -22,13 +22,14 @@ from completesplat.viewer.sample import Sample
 
 LARGEST_COVARIANCE = 3e4
 GAP, NARROWEST_WINDOW, SAME = 1.25, 1.1, 0.15
+MARGIN = 1.15  # height and width that are shown, as multiples of the photo's
 ORBIT_CAMERAS = 12
 REFERENCE_COLOR, ORBIT_COLOR = (200, 60, 40), (60, 60, 60)
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """A row of samples and its camera. A single sample is seen exactly as by its reference camera.
+    """A row of samples and its camera. A single sample is seen as by its reference camera, with a margin around it.
 
     Attributes:
         pivots: the point that each sample turns about, before it is moved to its place.
@@ -87,7 +88,7 @@ def arrangement_of(samples: Sequence[Sample]) -> Arrangement:
         aspect = NARROWEST_WINDOW
         distance = max(distance, len(samples) * spacing / 2 / (tangent * aspect))
     position = pivot - forward * distance
-    return Arrangement(pivots, pose[:3, 0], spacing, position, pivot, 2 * math.atan(tangent), aspect)
+    return Arrangement(pivots, pose[:3, 0], spacing, position, pivot, 2 * math.atan(MARGIN * tangent), aspect)
 
 
 class SplatView:

@@ -5,6 +5,7 @@ a model card too, `README.md`.
 """
 
 import hashlib
+import logging
 import os
 import re
 from collections.abc import Sequence
@@ -23,6 +24,8 @@ NEWEST = "images/newest"  # in a training run's folder, too: its fixed scenes as
 CAMERA = "camera"  # in stage 1's checkpoints: the typical camera of the training set
 LARGEST_TEXT = 1_000_000
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+
+log = logging.getLogger(__name__)
 
 
 def shipped() -> dict[str, Path]:
@@ -107,6 +110,7 @@ def from_hub(
     """
     from huggingface_hub import snapshot_download
 
+    log.info("%s: not a folder here; asking the Hugging Face hub", hub_id)
     try:
         return Path(snapshot_download(hub_id, allow_patterns=list(names)))
     except Exception as error:  # from the hub, its HTTP library or the file system
@@ -141,7 +145,6 @@ def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: st
     if not path.is_file():
         raise WeightsError(f"{path}: no such file; {advice}")
     if expected is not None and not (actual := sha256_of(path)).startswith(expected):
-        raise WeightsError(
-            f"{path}: SHA-256 {actual}, not {sha256}; {advice} (if that file is meant, {hash_setting}={actual})"
-        )
+        meant = f"if that file is meant, {hash_setting}={actual}"
+        raise WeightsError(f"{path}: SHA-256 {actual}, not {sha256}; {advice} ({meant})")
     return path

@@ -4,11 +4,11 @@ from functools import partial
 
 import pytest
 import torch
+from fake_mps import FakeMPS
 
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.reconstructor import Reconstructor
-from completesplat.baselines.preoptimized import occupied, project_to_splatter_image
-from completesplat.baselines.sparse_vae import SparseVAE
+from completesplat.baselines.preoptimized import SparseVAE, occupied, project_to_splatter_image
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
@@ -54,6 +54,15 @@ def test_values_of_occupied_places_have_mean_0_and_deviation_1(measured):
         expected = torch.ones(CHANNELS)
         expected[3] = 0  # the ray's depth leaves nothing of the offset along the optical axis
         torch.testing.assert_close(values.std(0, correction=0), expected, atol=1e-3, rtol=0)
+
+
+def test_the_same_is_measured_on_a_device_without_float64(measured):
+    vae = tiny_vae()
+    with FakeMPS():
+        vae.mean, vae.std = vae.mean.to("mps"), vae.std.to("mps")
+        vae.measure([image.to("mps") for image in IMAGES])
+        moments = vae.mean.cpu(), vae.std.cpu()
+    torch.testing.assert_close(moments, (measured.mean, measured.std))
 
 
 def test_what_does_not_vary_is_centred_and_an_empty_layer_left_alone():

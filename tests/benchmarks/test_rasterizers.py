@@ -5,9 +5,16 @@ from types import SimpleNamespace
 import pytest
 from support import compose_config, strict_json
 
-from completesplat.benchmarks import rasterizers, workloads
-from completesplat.benchmarks.rasterizers import BACKENDS, LONGEST_SECONDS, side_by_side, speed_rows, working_backends
-from completesplat.benchmarks.workloads import Backend, splatter_scene
+from completesplat.benchmarks import rasterizers
+from completesplat.benchmarks.rasterizers import (
+    BACKENDS,
+    LONGEST_SECONDS,
+    Backend,
+    side_by_side,
+    speed_rows,
+    splatter_scene,
+    working_backends,
+)
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -73,7 +80,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 def test_there_is_one_row_for_each_backend_and_workload(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     """The reference skips large workloads."""
-    monkeypatch.setattr(workloads, "MOST_REFERENCE_PAIRS", 2 * 8**2 * 8**2)  # size 8 in one view, just
+    monkeypatch.setattr(rasterizers, "MOST_REFERENCE_PAIRS", 2 * 8**2 * 8**2)  # size 8 in one view, just
     messages: list[str] = []
     milliseconds = {"tiled": 250, "other": 500, "reference": 750}
     backends = [clock.backend(name, time / 1000) for name, time in milliseconds.items()]

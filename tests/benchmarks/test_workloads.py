@@ -8,7 +8,7 @@ import pytest
 import torch
 from rasterizer_scenes import render_with_gradients
 
-from completesplat.benchmarks.workloads import OPACITIES, rendering_milliseconds, splatter_scene
+from completesplat.benchmarks.rasterizers import OPACITIES, rendering_milliseconds, splatter_scene
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers import Rendering

@@ -82,3 +82,13 @@ def test_missing_node_and_blender_are_no_errors_but_ffmpeg_and_space_are_needed(
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda place: usage._replace(free=10_000_000))
     assert states(doctor.check_tools(tmp_path)) == expected | {"ffmpeg": "broken", "free disk": "broken"}
+
+
+def test_the_device_is_named_with_what_runs_on_it(monkeypatch):
+    monkeypatch.setattr("completesplat.results.machine.machine", lambda: {"processor": "any"})
+    monkeypatch.setattr("completesplat.rasterizers.selection.FASTER", {})
+    for cuda, mps, device in ((True, False, "cuda"), (False, True, "mps"), (False, False, "cpu")):
+        monkeypatch.setattr("torch.cuda.is_available", lambda cuda=cuda: cuda)
+        monkeypatch.setattr("torch.backends.mps.is_available", lambda mps=mps: mps)
+        details = {finding.name: finding.details for finding in doctor.check_device()}
+        assert details["used device"] == f"{device}: {doctor.DEVICES[device]}"

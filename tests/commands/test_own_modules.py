@@ -1,9 +1,11 @@
 """Modules and settings of the user's own, in the working folder, as the documents describe them."""
 
 import os
+import shutil
 import subprocess
 import sys
 from functools import partial
+from itertools import product
 
 import pytest
 from omegaconf import OmegaConf
@@ -11,6 +13,7 @@ from support import SMALL, strict_json
 from written_commands import ROOT
 
 from completesplat import compose
+from completesplat.commands.new import KINDS
 
 MINE = """
 from torch import nn
@@ -21,7 +24,19 @@ class MyLoss(nn.Module):
 """
 ABLATION = "# @package _global_\nloss: {terms: {ssim: null}}\n"
 OWN_TERM = ["ablation=mine", "+loss.terms.mine.weight=0.1", "+loss.terms.mine.term._target_=mine.MyLoss"]
-KINDS = ["loss", "rasterizer", "dataset", "ablation", "experiment"]
+MYMETRIC = """
+from pathlib import Path
+
+Path(__file__).with_name("imported").touch()
+
+
+class Bias:
+    higher_is_better, heading, decimals = False, "bias", 4
+
+    def __call__(self, predicted, true, masks):
+        return ((predicted - true).mean(1, keepdim=True) * masks).mean((1, 2, 3)).abs()
+"""
+OWN_METRIC = "+evaluation.metrics.my_bias._target_=mymetric.Bias"
 
 
 @pytest.fixture
@@ -83,6 +98,7 @@ def test_modules_of_the_working_folder_stand_in_for_no_others(own, name):
 
 @pytest.mark.processes
 def test_what_is_begun_runs_as_it_is_written(command, own):
+    assert all(f" {kind}" in command.succeeds("new", "--help").out for kind in KINDS)
     for kind in KINDS:
         *written, following = command.succeeds("new", kind, f"my_{kind}").out.splitlines()
         assert all((own / name).is_file() for name in written)
@@ -92,7 +108,7 @@ def test_what_is_begun_runs_as_it_is_written(command, own):
     program = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *sorted(own.glob("test_*.py"))]
     done = subprocess.run(program, cwd=own, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
-    assert "6 passed" in done.stdout
+    assert "9 passed" in done.stdout
     assert "exists already" in command.refuses("new", "loss", "my_loss")
 
 
@@ -100,7 +116,7 @@ def test_what_is_begun_runs_as_it_is_written(command, own):
     ("given", "message"),
     [
         (["loss"], "name is needed: give name=VALUE"),
-        (["thing", "mine"], "kind=thing: choose one of loss, rasterizer, dataset, ablation, experiment"),
+        (["thing", "mine"], "kind=thing: choose one of loss, metric, rasterizer, encoder, callback, dataset"),
         (["loss", "a-b"], "name=a-b: must be a Python name"),
         (["loss", "json"], "name=json: a module has this name"),
         (["ablation", "full"], "name=full: the package has conf/ablation/full.yaml"),
@@ -110,6 +126,50 @@ def test_what_is_begun_runs_as_it_is_written(command, own):
 def test_what_cannot_be_begun_is_refused(command, own, given, message):
     assert command.refuses("new", *given).startswith(message)
     assert {path.name for path in own.iterdir()} == {"mine.py", "conf"}
+
+
+@pytest.fixture
+def own_metric(own):
+    (own / "mymetric.py").write_text(MYMETRIC)
+    yield own
+    sys.modules.pop("mymetric", None)
+
+
+def test_a_metric_of_the_working_folder_stands_beside_the_others_wherever_they_do(command, own_metric, pipeline):
+    test = ["test", f"ckpt={pipeline.var}", "trainer.accelerator=cpu", "logger=csv"]
+    printed = command.succeeds(*test, OWN_METRIC, "out=RUNS/OWN").out
+    own = strict_json(own_metric / "RUNS/OWN/metrics.json")
+    plain = strict_json(pipeline.var / "metrics.json")["test"]
+    stated = own["protocol"]["metrics"].pop("my_bias")
+    assert stated == {"_target_": "mymetric.Bias", "style": {"heading": "bias", "better": "↓", "decimals": 4}}
+    assert own["protocol"]["metrics"] == plain["protocol"]["metrics"]
+    logged = (own_metric / "RUNS/OWN/metrics.csv").read_text().splitlines()[0].split(",")
+    for predictor, region, view in product(plain.keys() - {"protocol"}, ("full", "object"), ("novel", "reference")):
+        scores = own[predictor][region][view]
+        assert 0 <= scores.pop("my_bias") < 1
+        assert scores == pytest.approx(plain[predictor][region][view], rel=1e-5)
+        place = "test" if predictor == "model" else f"test/{predictor}"
+        assert f"{place}/{region}/{view}/my_bias" in logged
+    assert "bias" in printed
+    command.succeeds("report", "tables", "runs=RUNS", "out=TABLES")
+    assert (own_metric / "TABLES/tables.md").read_text().count("novel views: bias ↓ |") == 2
+
+
+def test_a_metric_that_a_run_names_is_not_imported(command, own_metric, pipeline, tmp_path, monkeypatch):
+    """Not even if the run is the user's own: what is measured is up to who tests."""
+    shutil.copytree(pipeline.var, own_metric / "RUN")
+    config = OmegaConf.load(own_metric / "RUN/config.yaml")
+    config.evaluation.metrics = {"psnr": {"_target_": "mymetric.Bias"}}
+    OmegaConf.save(config, own_metric / "RUN/config.yaml")
+    command.succeeds("test", "ckpt=RUN", "trainer.accelerator=cpu", "out=OUT")
+    assert not (own_metric / "imported").exists()
+    config.model.metric = {"_target_": "mymetric.Bias"}
+    OmegaConf.save(config, own_metric / "RUN/config.yaml")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    monkeypatch.syspath_prepend(own_metric)
+    assert "names mymetric.Bias, which is no part" in command.refuses("test", f"ckpt={own_metric / 'RUN'}", "out=OUT")
+    assert not (own_metric / "imported").exists()
 
 
 @pytest.mark.slow

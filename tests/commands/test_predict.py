@@ -45,7 +45,7 @@ def splats(folder: Path) -> list[bytes]:
 
 def test_every_file_is_there_and_opens(predict):
     folder = predict("steps=null")
-    names = {"sample_00.ply", "sample_01.ply", "orbit_00.mp4", "orbit_01.mp4", "sheet.png", "scene.json"}
+    names = {"sample_00.ply", "sample_01.ply", "orbit_00.mp4", "orbit_01.mp4", "sheet.png", "scene.json", "photo.png"}
     assert {path.name for path in folder.iterdir()} == names
     vertices = PlyData.read(folder / "sample_01.ply")["vertex"].data
     assert len(vertices) == 2 * 32 * 32

@@ -150,8 +150,63 @@ def test_images_that_fail_are_named_and_do_not_stop_the_others(predict, tmp_path
     done = [line.partition(":")[0] for line in finished.out.splitlines() if "/5 " in line]
     assert done == ["1/5 a.png", "5/5 a.png"]
     result = [(path.parent.name, path.name) for path in (tmp_path / "out").glob("*/*")]
-    assert sorted(result) == [(a, name) for a in ("a", "a_2") for name in ("sample_00.ply", "scene.json", "sheet.png")]
+    assert sorted(result) == [
+        (a, name) for a in ("a", "a_2") for name in ("photo.png", "sample_00.ply", "scene.json", "sheet.png")
+    ]
     assert (tmp_path / "out/a/sample_00.ply").read_bytes() != (tmp_path / "out/a_2/sample_00.ply").read_bytes()
+
+
+def test_a_prediction_leaves_no_file_of_an_earlier_one_and_what_a_user_put_there(predict, tmp_path):
+    image, folder = save(tmp_path / "a.png"), tmp_path / "out/a"
+    assert predict(image, "formats=[ply,glb]", "video=[orbit]", "maps=true").status == 0
+    (folder / "sample_00_mine.ply").write_text("mine")
+    assert predict(image, "formats=[splat]").status == 0
+    kept = {"photo.png", "sample_00.splat", "sample_00_mine.ply", "sheet.png", "scene.json"}
+    assert {path.name for path in folder.iterdir()} == kept
+
+
+def test_a_finished_prediction_is_not_repeated_unless_something_has_changed(predict, tmp_path, monkeypatch):
+    images = [save(tmp_path / f"x/{name}.png") for name in "abc"]
+    assert predict(tmp_path / "x").status == 0
+
+    def repeated(*settings: str) -> set[str]:
+        out = predict(tmp_path / "x", *settings).out.splitlines()
+        return {line.split()[1] for line in out if re.match(r"\d/\d ", line)}
+
+    assert repeated() == set()
+    (tmp_path / "out/a/scene.json").unlink()  # as a killed process leaves it
+    (tmp_path / "out/b/sample_00.ply").unlink()
+    assert repeated() == {"a.png:", "b.png:"}
+    save(images[2], "blue")
+    assert repeated() == {"c.png:"}
+    assert repeated("seed=1") == {"a.png:", "b.png:", "c.png:"}
+    assert repeated("seed=1", "shard=1", "shards=2") == set()
+
+
+def test_shards_are_each_image_once_and_names_do_not_depend_on_them(predict, tmp_path):
+    for place in ("x/a.png", "x/b.png", "y/a.png"):
+        save(tmp_path / place)
+    images = f"[{tmp_path / 'x'},{tmp_path / 'y'}]"
+    assert "1/2 a.png" in predict(images, "shard=0", "shards=2").out
+    assert sorted(path.name for path in (tmp_path / "out").glob("*/")) == ["a", "a_2"]
+    assert "1/1 b.png" in predict(images, "shard=1", "shards=2").out
+    assert predict(images, "shard=3", "shards=4").status == 0  # nothing is left for it
+    assert "shard=2: the last of shards=2 is 1" in predict(images, "shard=2", "shards=2").err
+
+
+@pytest.mark.processes
+def test_two_processes_predict_each_image_once_and_go_on_after_one_failed(command, tiny_weights, tmp_path):
+    for name in ("a.png", "c.png", "d.png"):
+        save(tmp_path / "x" / name)
+    (tmp_path / "x/b.png").write_text("no image")
+    given = [f"image={tmp_path / 'x'}", f"weights={tiny_weights}", f"out={tmp_path / 'out'}", *QUICK, "devices=2"]
+    finished = command("predict", *given)
+    assert (finished.status, finished.err.splitlines()[-1]) == (
+        2,
+        f"error: 1 of 4 images failed (b.png); the others are in {tmp_path / 'out'}",
+    )
+    assert re.search(r"^3 photos in \d+ s by 2 process\(es\): [\d.]+ a minute$", finished.out, re.M)
+    assert {path.parent.name for path in (tmp_path / "out").glob("*/scene.json")} == {"a", "c", "d"}
 
 
 def test_if_all_fail_nothing_is_said_to_be_left(predict, command, tmp_path):
@@ -221,7 +276,9 @@ def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
 
     monkeypatch.setattr("completesplat.scene_model.read_photograph", read)
     for setting, removed in (("background=remove", True), ("background=1", False)):
-        assert predict(save(tmp_path / "a.png"), setting).status == 0
+        done = predict(save(tmp_path / "a.png"), setting)
+        assert done.status == 0
+        assert ("a.png: removing the background" in done.out) == removed
         settings = strict_json(tmp_path / "out/a/scene.json")["settings"]
         assert (given["removed"], settings.get("background")) == (removed, "remove" if removed else None)
 
@@ -236,7 +293,8 @@ def test_videos_and_formats_are_written_and_recorded_and_a_strange_field_of_view
     folder = tmp_path / "out/a"
     written = {path.name for path in folder.iterdir()}
     videos = {"swipe_00.mp4", "wobble_00.mp4"}
-    assert written == videos | {"sample_00.splat", "sample_00.sog", "sample_00.html", "sheet.png", "scene.json"}
+    scenes = {"sample_00.splat", "sample_00.sog", "sample_00.html"}
+    assert written == videos | scenes | {"photo.png", "sheet.png", "scene.json"}
     assert all(len(imageio.mimread(folder / name, memtest=False)) == 3 for name in videos)
     files = strict_json(folder / "scene.json")["files"]
     assert written - {"scene.json"} == set(files.values())

@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from completesplat.data.hidden_modes import DIFFERENCE
+from completesplat.data.packed.writing import prepare
 from completesplat.data.rendered.drawing import PAINTS
-from completesplat.data.rendered.module import RenderedDataModule
+from completesplat.data.rendered.rendering import RenderedDataModule
 from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS, render_frame
 from completesplat.data.toy.raytracing import trace
@@ -102,15 +103,11 @@ def test_other_data_are_refused(toy_root, tmp_path):
     (folder / "toy.json").write_text(json.dumps(record | {"chances": [1, 0]}))
     with pytest.raises(BadAnnotation, match="chances must be 4 numbers"):
         scenes[0]
-    shutil.rmtree(folder / "red")
+    (folder / "red/frame000001.jpg").unlink()
     with pytest.raises(DataError, match=r"red/frame000001\.jpg"):
-        scenes_of(copy)[0][0]
-    path = copy / "toy_objects/toy.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 0}))
-    with pytest.raises(DataError, match="another version"):
-        scenes_of(copy)
-    path.unlink()
-    with pytest.raises(DataError, match=r"no toy\.json"):
+        scenes[0]
+    shutil.rmtree(folder / "red")
+    with pytest.raises(DataError, match="no test scene has images in each mode, such as red: data toy"):
         scenes_of(copy)
 
 
@@ -145,7 +142,6 @@ def test_what_the_reference_hides_is_what_no_ray_from_its_camera_meets(toy_root:
 def renders(toy_root: Path, tmp_path: Path) -> Path:
     """Root of toy objects in the form of renders: files of every paint are those of every patch."""
     category = shutil.copytree(toy_root / "toy_objects", tmp_path / "root/rendered")
-    (category / "rendered.json").write_text(json.dumps({"hidden": "modes"}))
     for annotations in category.glob("*.jgz"):
         content = gzip.decompress(annotations.read_bytes())
         annotations.write_bytes(gzip.compress(content.replace(b"toy_objects", b"rendered")))
@@ -173,11 +169,11 @@ def test_modes_of_renders_are_the_images_of_every_paint_and_the_true_one_is_what
     assert sorted(errors > 0.1) == [False, True, True, True]
 
 
-def test_renders_without_modes_are_refused(renders: Path) -> None:
-    data = RenderedDataModule(str(renders), image_size=32)
-    (renders / "rendered/rendered.json").write_text('{"hidden": "back"}')
-    with pytest.raises(CompleteSplatError, match="rendered with hidden=back; hidden modes need hidden=modes"):
-        data.hidden_modes(2, 3)
-    (renders / "rendered/rendered.json").unlink()
-    with pytest.raises(DataError, match="as they were rendered, not prepared"):
-        data.hidden_modes(2, 3)
+def test_renders_without_modes_and_prepared_ones_are_refused(renders: Path, tmp_path: Path) -> None:
+    data = RenderedDataModule(str(renders), image_size=32, test_fraction=1.0)
+    store = prepare({"test": data.source("test")}, data.packed_settings(), tmp_path / "store", workers=1)
+    for mode in renders.glob("rendered/*/red"):
+        shutil.rmtree(mode)
+    for each in (data, RenderedDataModule(str(store), image_size=32, test_fraction=1.0)):
+        with pytest.raises(DataError, match=r"images in each mode, such as red: .* with hidden=modes"):
+            each.hidden_modes(2, 3)

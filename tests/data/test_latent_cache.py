@@ -8,7 +8,7 @@ from latent_caches import broken_rooms, rooms, small_autoreconstructor, sound_ro
 from completesplat.data.loading.loader import SceneLoader
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import CachedScene
-from completesplat.training.encoding import encode_training_set
+from completesplat.training.encoding import FrameEncoder, encode_training_set
 
 BOXES = {"probability": 0.7}
 STRENGTHS = ("brightness", "contrast", "saturation", "hue")
@@ -23,7 +23,7 @@ def root(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def cache(root, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("cache")
-    encode_training_set(small_autoreconstructor(), rooms(root), out, progress=False)
+    encode_training_set(FrameEncoder(small_autoreconstructor()), rooms(root), out, progress=False)
     return out
 
 
@@ -73,7 +73,9 @@ def test_batches_are_stacked_items_and_a_resumed_epoch_continues_exactly(root, c
 
 def test_where_few_frames_are_encoded_the_nearest_takes_the_references_place(tmp_path):
     root = sound_rooms(tmp_path / "root")
-    store = encode_training_set(small_autoreconstructor(), rooms(root), tmp_path / "cache", frames=2, progress=False)
+    store = encode_training_set(
+        FrameEncoder(small_autoreconstructor()), rooms(root), tmp_path / "cache", frames=2, progress=False
+    )
     assert {sequence.stored for sequence in store.manifest.sequences} == {(1, 3)}
     from_images = rooms(root).train_dataloader()
     cached = rooms(root, latent_cache=str(tmp_path / "cache")).train_dataloader()
@@ -101,7 +103,7 @@ class Halves(torch.nn.Module):
 
 def test_features_are_given_as_they_were_stored_and_cannot_be_changed(tmp_path):
     root, out = sound_rooms(tmp_path / "root"), tmp_path / "cache"
-    encode_training_set(small_autoreconstructor(), rooms(root), out, conditioning=Halves(), progress=False)
+    encode_training_set(FrameEncoder(small_autoreconstructor(), Halves()), rooms(root), out, progress=False)
     from_images, cached = rooms(root).train_dataloader(), rooms(root, latent_cache=str(out)).train_dataloader()
     expected = Halves()(from_images.dataset[0, 1].scenes.reference.images)
     torch.testing.assert_close(cached.dataset[0, 1].scenes.condition, expected)

@@ -8,14 +8,14 @@ from latent_caches import rooms, small_autoreconstructor, sound_rooms
 
 from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.errors import DataError
-from completesplat.training.encoding import encode_training_set
+from completesplat.training.encoding import FrameEncoder, encode_training_set
 
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("cache")
     data = rooms(sound_rooms(folder / "root"))
-    return encode_training_set(small_autoreconstructor(), data, folder / "store", progress=False).folder
+    return encode_training_set(FrameEncoder(small_autoreconstructor()), data, folder / "store", progress=False).folder
 
 
 @pytest.fixture

@@ -106,7 +106,7 @@ def test_a_page_begins_at_the_reference_camera_and_shows_its_whole_image(tmp_pat
     torch.testing.assert_close(target.norm(), PIVOT.norm())
     torch.testing.assert_close(target[1], PIVOT @ UP / UP.norm())
     assert settings["background"] == {"color": [0.25] * 3}
-    half_of_short_side = torch.tensor(initial["fov"]).div(2).deg2rad().tan() * 9 / 16  # fov: of the longer side
+    half_of_short_side = torch.tensor(initial["fov"]).div(2).deg2rad().tan() * 9 / 20  # fov: of the longer side
     torch.testing.assert_close(half_of_short_side, torch.tensor(25.0).deg2rad().tan())
 
 

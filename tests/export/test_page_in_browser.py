@@ -3,6 +3,7 @@
 import io
 import math
 import shutil
+from contextlib import contextmanager
 
 import pytest
 import torch
@@ -55,14 +56,34 @@ def our_image(view: PageView) -> torch.Tensor:
     return torch.from_numpy(to_pixels(image).copy()).float() / 255
 
 
+@contextmanager
+def opened(path, requests: list[str], options: str = "&noui", width: int = WIDTH, height: int = HEIGHT):
+    with playwright.sync_playwright() as started:
+        swiftshader = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=swiftshader)
+        page = browser.new_context(viewport={"width": width, "height": height}, offline=True).new_page()
+        page.on("request", lambda request: requests.append(request.url))
+        page.goto(f"{path.as_uri()}?noanim&webgl{options}", timeout=180_000)
+        yield page
+        browser.close()
+
+
+def at_rest(page) -> torch.Tensor:
+    """The page when something is drawn and nothing moves any more."""
+    width, height = page.viewport_size["width"], page.viewport_size["height"]
+    screenshot = torch.zeros(height, width, 3)
+    for _ in range(60):
+        page.wait_for_timeout(1000)
+        data = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+        earlier, screenshot = screenshot, torch.tensor(list(data.getdata())).view(height, width, 3) / 255
+        if screenshot.std() > 0.05 and torch.equal(screenshot, earlier):
+            break
+    return screenshot
+
+
 def screenshot(path, requests: list[str], drag: int = 0) -> torch.Tensor:
     """The page at rest, after it was dragged to the right by so many pixels."""
-    with playwright.sync_playwright() as started:
-        options = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=options)
-        page = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT}, offline=True).new_page()
-        page.on("request", lambda request: requests.append(request.url))
-        page.goto(f"{path.as_uri()}?noanim&webgl&noui", timeout=180_000)
+    with opened(path, requests) as page:
         if drag:
             page.locator("canvas").first.wait_for()
             page.wait_for_timeout(5000)
@@ -70,15 +91,22 @@ def screenshot(path, requests: list[str], drag: int = 0) -> torch.Tensor:
             page.mouse.down()
             page.mouse.move(WIDTH / 2 + drag, HEIGHT / 2, steps=8)
             page.mouse.up()
-        screenshot = torch.zeros(HEIGHT, WIDTH, 3)
-        for _ in range(60):
-            page.wait_for_timeout(1000)
-            data = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-            earlier, screenshot = screenshot, torch.tensor(list(data.getdata())).view(HEIGHT, WIDTH, 3) / 255
-            if screenshot.std() > 0.05 and torch.equal(screenshot, earlier):  # something is drawn, and has come to rest
-                break
-        browser.close()
-    return screenshot
+        return at_rest(page)
+
+
+def test_a_phone_shows_all_that_the_photo_shows_and_controls_that_stay(tmp_path, converter):
+    """Balls at the photo's left and right edges."""
+    means = torch.tensor([[1.2, 0.0, 3.0], [-1.2, 0.0, 3.0], [0.0, 0.0, 3.0]])
+    edges = round_gaussians(means, 0.15, 0.99, torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]))
+    view = PageView(REFERENCE, means[2], torch.tensor([0.0, -1.0, 0.0]), 0.25)
+    write_turning_page(tmp_path / "scene.html", edges, view, converter)
+    with opened(tmp_path / "scene.html", [], "", 390, 844) as page:
+        seen = at_rest(page)
+        page.wait_for_timeout(6000)  # after four seconds the viewer would hide them
+        assert page.locator("#settings").is_visible()
+    areas = [((seen - color).abs() < 0.45).all(-1).sum().item() for color in torch.eye(3)]
+    assert min(areas) > 0.9 * max(areas) > 0
+    assert place(seen, torch.eye(3)[1]) < 0.5 < place(seen, torch.eye(3)[0])
 
 
 def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path, converter):
@@ -105,4 +133,4 @@ def place(screenshot: torch.Tensor, color: torch.Tensor) -> float:
     """The mean column, as a share of the width, of what is nearly of this colour."""
     seen = ((screenshot - color).abs() < 0.45).all(-1)
     assert seen.any()
-    return seen.nonzero()[:, 1].float().mean().item() / WIDTH
+    return seen.nonzero()[:, 1].float().mean().item() / screenshot.shape[1]

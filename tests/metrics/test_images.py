@@ -44,7 +44,7 @@ def test_ssim_mirrors_images_at_the_border_and_counts_all_pixels(pair):
         assert ours.item() == pytest.approx(similarity.mean(), abs=1e-5)
         theirs = structural_similarity(t.double().numpy(), p.double().numpy(), use_sample_covariance=False, **settings)
         assert similarity[:, 5:-5, 5:-5].mean() == pytest.approx(theirs, abs=1e-9)
-    assert METRICS["ssim"]["border"] == "mirrored, counted"
+    assert METRICS["completesplat.metrics.images.ssim"]["border"] == "mirrored, counted"
     assert "mean over all pixels, images mirrored at their border" in SSIM_NOTE
     assert "skimage leaves 5 pixels out on every side" in SSIM_NOTE
 

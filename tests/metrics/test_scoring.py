@@ -2,17 +2,21 @@
 
 import math
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 
 import pytest
 import torch
+from torchmetrics.image import PeakSignalNoiseRatio
 
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.image_sets import Inception
-from completesplat.metrics.images import MissingMetrics
+from completesplat.metrics.images import MissingMetrics, psnr, ssim
 from completesplat.metrics.scoring import Evaluation, best_sample, depth_errors, diversity, expected_best_curve
 from completesplat.scene import SceneBatch, Views
+
+OURS = {"psnr": psnr, "ssim": ssim}
+ABSENT = OURS | {"lpips": MissingMetrics("no weights", ("lpips",))}
 
 
 def scenes(batch: int, targets: int, first: int = 0) -> SceneBatch:
@@ -142,11 +146,12 @@ def test_the_best_sample_is_that_of_a_region_for_all_metrics_or_that_of_each_met
     def far_from_0_8(predicted, true):
         return (predicted.amax((1, 2, 3)) - 0.8).abs()
 
-    evaluation = Evaluation(samples=3, perceptual=far_from_0_8, sets={"brightness": Brightness()})
+    chosen = {"metrics": OURS | {"lpips": far_from_0_8}, "sets": {"brightness": Brightness()}}
+    evaluation = Evaluation(samples=3, **chosen)
     evaluation.update_samples("scene", samples, truth)
     alone = []
     for sample in samples:
-        single = Evaluation(perceptual=far_from_0_8, sets={"brightness": Brightness()})
+        single = Evaluation(**chosen)
         single.update("model", sample[None], scenes(1, 2))
         alone.append(single.results()["model"])
     results = evaluation.results()
@@ -189,10 +194,76 @@ def test_sharpness_is_of_novel_views_and_leaves_out_the_objects_silhouette():
 
 def test_missing_metrics_are_named_and_have_no_figure():
     absent = {"inception": MissingMetrics("none here", ("fid", "kid"))}
-    evaluation = Evaluation(perceptual=MissingMetrics("no weights", ("lpips",)), sets=absent)
+    evaluation = Evaluation(metrics=ABSENT, sets=absent)
     evaluation.update("model", torch.full((1, 2, 3, 16, 16), 0.5), scenes(1, 1))
     assert evaluation.missing == {"lpips": "missing: no weights"} | dict.fromkeys(("fid", "kid"), "missing: none here")
     assert set(evaluation.results()["model"]["full"]["novel"]) == {"psnr", "ssim"}
+
+
+class Darker:
+    """A metric of the user's own: the share of the counted pixels that are darker than the truth."""
+
+    higher_is_better, heading, decimals = False, "darker", 1
+
+    def __call__(self, predicted, true, masks):
+        darker = (predicted < true).any(1, keepdim=True) & masks
+        return darker.sum((1, 2, 3)) / masks.sum((1, 2, 3))
+
+
+def darkness(predicted, true):
+    return (true - predicted).mean((1, 2, 3))
+
+
+def test_own_metrics_are_scored_for_each_region_and_view_beside_the_others_which_stay_as_they_are():
+    truth = scenes(1, 2).all_views()[0]  # the object is the upper half
+    samples = torch.full((2, 3, 3, 16, 16), 0.5)
+    samples[0, 1:, :, :4] = 0.4
+    samples[1, 1, :, 8:] = 0.4
+    theirs = PeakSignalNoiseRatio(data_range=1.0)
+    own = {"darker": Darker(), "of_darkness": darkness, "theirs": theirs, "left_out": None}
+    evaluation, plain = Evaluation(samples=2, metrics=OURS | own), Evaluation(samples=2)
+    for each in (evaluation, plain):
+        each.update_samples("scene", samples, truth)
+    results, known = evaluation.results(), plain.results()
+    first, best = results["model"], results["best_of_k_by_metric"]
+    assert first["full"]["novel"]["darker"] == 0.25
+    assert first["object"]["novel"]["darker"] == 0.5
+    assert first["full"]["reference"]["darker"] == 0
+    assert best["full"]["novel"]["darker"] == 0.25  # of both samples
+    assert best["object"]["novel"]["darker"] == 0
+    assert first["full"]["novel"]["of_darkness"] == pytest.approx(0.1 / 4)
+    assert "of_darkness" not in best["full"]["novel"]  # nobody said what is better
+    assert first["full"]["novel"]["theirs"] == pytest.approx(first["full"]["novel"]["psnr"], abs=1e-4)
+    assert theirs.total == 0  # nothing is kept between the scenes
+    for predictor, region, view in product(known, ("full", "object"), ("novel", "reference")):
+        scores = results[predictor][region][view]
+        assert {name: x for name, x in scores.items() if name not in own} == known[predictor][region][view]
+    styles = {name: (style.heading, style.better, style.decimals) for name, style in evaluation.styles.items()}
+    assert styles == {
+        "psnr": ("PSNR", "↑", 2),
+        "ssim": ("SSIM", "↑", 3),
+        "darker": ("darker", "↓", 1),
+        "of_darkness": ("of_darkness", "", 3),
+        "theirs": ("theirs", "↑", 3),
+    }
+
+
+def test_a_metric_without_a_number_has_no_best_sample_and_the_others_keep_theirs():
+    class Undefined(Darker):
+        def __call__(self, predicted, true):
+            return torch.full((3,), math.nan)
+
+    evaluation = Evaluation(samples=2, metrics=OURS | {"darker": Undefined()})
+    evaluation.update_samples("scene", off_by(0.1, 0.01), scenes(1, 2).all_views()[0])
+    results = evaluation.results()
+    assert math.isnan(results["model"]["full"]["novel"]["darker"])
+    assert results["best_of_k_by_metric"]["full"]["novel"].keys() == {"psnr", "ssim"}
+
+
+def test_a_metric_that_gives_no_value_for_each_view_is_refused():
+    evaluation = Evaluation(metrics={"psnr": psnr, "mean": lambda predicted, true: (predicted - true).mean()})
+    with pytest.raises(CompleteSplatError, match=r"evaluation.metrics.mean: its values are \[\], not one .* 2 images"):
+        evaluation.update("model", torch.full((1, 2, 3, 16, 16), 0.5), scenes(1, 1))
 
 
 class Channels(torch.nn.Module):
@@ -228,7 +299,11 @@ def test_a_set_metric_that_fails_or_gives_no_number_is_missing_and_the_others_ar
     [
         ({"samples": 0}, "samples=0: must be at least 1"),
         ({"criterion": "beauty"}, "criterion=beauty: choose one of psnr, ssim"),
-        ({"criterion": "lpips", "perceptual": MissingMetrics("no weights", ("lpips",))}, "criterion=lpips: missing"),
+        ({"criterion": "lpips", "metrics": ABSENT}, "criterion=lpips: missing"),
+        ({"criterion": "mine", "metrics": {"mine": darkness}}, "criterion=mine: the metric needs `higher_is_better`"),
+        ({"metrics": OURS | {"sharpness": darkness}}, "metrics.sharpness: choose another name"),
+        ({"metrics": OURS | {"a/b": darkness}}, "metrics.a/b: choose another name"),
+        ({"metrics": OURS | {"mine": "mine.Mine"}}, "metrics.mine=mine.Mine: give evaluation.metrics.mine._target_"),
     ],
 )
 def test_settings_without_a_meaning_are_refused(settings, reason):

@@ -186,6 +186,20 @@ def test_all_files_have_means_deviations_marks_and_remarks(ablations) -> None:
         np.testing.assert_allclose(deviations, [math.sqrt(0.4375), 0, math.sqrt(0.4375)], atol=1e-12)
 
 
+def test_a_metric_of_the_users_own_is_shown_and_marked_as_its_results_say(sweep) -> None:
+    style = {"heading": "bias", "better": "↓", "decimals": 1}
+    for ablation, bias in {"full": 0.25, "m1": 0.75}.items():
+        path = sweep.scored(f"ablation={ablation}", psnr=20.0) / "metrics.json"
+        metrics = json.loads(path.read_text())
+        metrics["test"]["protocol"] = {"metrics": {"my_bias": {"_target_": "mine.Bias", "style": style}}}
+        metrics["test"]["model"]["full"]["novel"]["my_bias"] = bias
+        path.write_text(json.dumps(metrics))
+    head, _, m1, full, *_ = as_markdown(write_summary(sweep.folder)).splitlines()[2:]
+    assert head.endswith("| all pixels, novel views: bias ↓ |")
+    assert (m1.split("|")[5].strip(), full.split("|")[5].strip()) == ("<ins>0.8</ins>", "**0.2**")
+    assert read_back(sweep.folder).loc["m1", "full_novel_my_bias_mean"] == 0.75
+
+
 def test_a_sweep_without_finished_jobs_says_so(sweep) -> None:
     sweep.add("ablation=m1")
     (sweep.folder / ".submitit").mkdir()

@@ -14,11 +14,17 @@ from support import tiny_generator
 from torch import nn
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.loading.latent_cache import LatentCache
+from completesplat.data.loading.latent_cache import LatentCache, moments
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import CachedScene
 from completesplat.tensors import stack
-from completesplat.training.encoding import check_cache, encode_training_set, fingerprint, moment_sums, moments
+from completesplat.training.encoding import (
+    FrameEncoder,
+    check_cache,
+    encode_training_set,
+    fingerprint,
+    moment_sums,
+)
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +33,9 @@ def root(tmp_path_factory) -> Path:
 
 
 def encode(root: Path, out: Path, model: nn.Module | None = None, **options) -> LatentCache:
-    settings = {"progress": False, **options}
-    data = rooms(root, workers=settings.pop("workers", 0))
-    return encode_training_set(model or small_autoreconstructor(), data, out, **settings)
+    data, networks = rooms(root, workers=options.pop("workers", 0)), ("conditioning", "precision", "device")
+    encoder = FrameEncoder(model or small_autoreconstructor(), **{k: options.pop(k) for k in networks if k in options})
+    return encode_training_set(encoder, data, out, **{"progress": False, **options})
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +97,7 @@ def test_a_draw_from_the_cache_is_the_draw_on_the_fly(tmp_path):
     model = tiny_generator()
     model.set_latent_moments([0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 0.8])
     data = rooms(sound_rooms(tmp_path / "root", image_size=32), image_size=32)
-    store = encode_training_set(model.autoreconstructor, data, tmp_path / "cache", progress=False)
+    store = encode_training_set(FrameEncoder(model.autoreconstructor), data, tmp_path / "cache", progress=False)
     batch: CachedScene = stack([store.scene(name, 2) for name in store.sequences])
     torch.manual_seed(5)
     on_the_fly = model.encode(batch.condition)

@@ -80,8 +80,11 @@ def test_waits_are_seen(pretended_gpu: None) -> None:
         assert len(waits.lines) == 5
 
 
-@pytest.mark.parametrize("precision", ["bf16-mixed", "32-true"])
-@pytest.mark.parametrize("stage", STAGES)
+SLOW = [stage for stage in STAGES if stage.endswith("Muon")]
+
+
+@pytest.mark.parametrize("precision", ["bf16-mixed", pytest.param("32-true", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("stage", [pytest.param(x, marks=pytest.mark.slow if x in SLOW else ()) for x in STAGES])
 def test_nothing_in_a_step_waits(stage: str, precision: str, pretended_gpu: None) -> None:
     """Its forward pass and its optimizer; the backward pass would need a real GPU."""
     config = without_weights(compose_config("plan", *STAGES[stage], "data.image_size=32", *networks(stage)))

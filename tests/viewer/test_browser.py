@@ -15,7 +15,7 @@ from support import LIMIT, tiny_generator, waited_for
 from viewer_scenes import BALLS, SETTINGS, balls_sample
 
 from completesplat.export.formats import write_splat
-from completesplat.geometry.cameras import Cameras
+from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
@@ -24,7 +24,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright is no
 from completesplat.viewer.access import show_status, start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
 from completesplat.viewer.page import Page, Saver, write_viewer_page  # noqa: E402
-from completesplat.viewer.splat_view import SplatView  # noqa: E402
+from completesplat.viewer.splat_view import MARGIN, SplatView  # noqa: E402
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")  # which GitHub's machines have
 pytestmark = [
@@ -113,8 +113,8 @@ def turn(tab, before: np.ndarray) -> np.ndarray:
 
 
 def ours(height: int, width: int, shrink: int) -> np.ndarray:
-    """The balls by our own rasterizer, as the reference camera would see them in a window of this size, all of them."""
-    focal = min(height, width) / 2 / np.tan(np.radians(25))
+    """The balls by our own rasterizer: what the reference camera and the margin around it show in such a window."""
+    focal = min(height, width) / 2 / np.tan(np.radians(25)) / MARGIN
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]) / shrink
     intrinsics[2, 2] = 1
     camera = Cameras(torch.eye(4), intrinsics.float(), (height // shrink, width // shrink))
@@ -150,6 +150,19 @@ def test_the_page_draws_the_splats_as_our_rasterizer_does_and_has_our_title_and_
     assert tab.errors == []
 
 
+def test_a_wide_window_shows_more_than_the_photo_above_and_below(chromium, page):
+    """The balls reach the photo's upper edge."""
+    camera = replace(balls_sample().reference, intrinsics=pinhole(28.0, 64))
+    page.show([replace(balls_sample(), reference=camera)])
+    wide = open_tab(chromium, page.server.address, {"width": 1440, "height": 900})
+    seen = settled(wide)
+    green = abs(seen - 255 * np.array(BALLS["green"][1])).max(-1) < 40
+    assert green.any()
+    assert not green[0].any()
+    wide.close()
+    page.show([balls_sample()])
+
+
 def test_a_phone_shows_the_whole_scene_and_the_panel_when_it_is_wanted(chromium, page):
     phone = open_tab(chromium, page.server.address, {"width": 390, "height": 700})
     button = phone.get_by_role("button", name="Load a file")
@@ -157,7 +170,9 @@ def test_a_phone_shows_the_whole_scene_and_the_panel_when_it_is_wanted(chromium,
     seen = settled(phone)
     assert seen.shape[:2] == (700, 390)
     assert agrees(seen, 1.5)
-    phone.get_by_text("completesplat", exact=True).click()
+    title = phone.get_by_text("completesplat", exact=True)
+    assert "tap for the controls" in title.evaluate("title => getComputedStyle(title, '::after').content")
+    title.click()
     button.wait_for(timeout=1000 * LIMIT)
     assert phone.errors == []
     phone.close()

@@ -4,6 +4,7 @@ import io
 import logging
 import os
 import threading
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,11 +16,13 @@ from PIL import Image
 from support import LIMIT, tiny_generator
 from viewer_scenes import SETTINGS, balls_sample
 
+from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.formats import write_splat
 from completesplat.export.images import to_pixels
 from completesplat.export.mesh import Mesh
 from completesplat.export.ply import read_ply, write_ply
+from completesplat.geometry.cameras import look_at
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
@@ -137,14 +140,28 @@ def test_keys_and_thumbnails_choose_a_sample(page):
     assert thumbnails.content == ""
 
 
-def test_a_thumbnail_is_the_view_of_the_reference_camera(page):
+def test_a_thumbnail_is_a_view_from_behind_where_samples_differ(page):
+    """The camera on the other side of the pivot, which looks back."""
     sample = balls_sample()
     wide = replace(sample.reference, image_size=(64, 96))
     image = page.saver.thumbnail(replace(sample, reference=wide), 48)
     assert image.shape == (32, 48, 3)
-    rendering = ReferenceRasterizer()(sample.gaussians[None], sample.reference[None][None]).over(0.5)
+    behind = look_at(torch.tensor([0.0, 0, 2 * sample.pivot()[2]]), sample.pivot(), torch.tensor([0.0, -1, 0]))
+    camera = replace(sample.reference, world_to_camera=behind)
+    rendering = ReferenceRasterizer()(sample.gaussians[None], camera[None][None]).over(0.5)
     ours = to_pixels(rendering[0, 0]).reshape(32, 2, 32, 2, 3).mean((1, 3))
     assert abs(image[:, :32] - ours).mean() < 6
+
+
+def test_the_photo_of_a_predictions_folder_is_in_the_panel_and_a_damaged_one_refused(page, tmp_path):
+    write_ply(tmp_path / "scene.ply", balls_sample().gaussians)
+    for content, shown in ((png(), True), (None, False), (b"no image", None)):
+        (tmp_path / "photo.png").unlink(missing_ok=True)
+        if content is not None:
+            (tmp_path / "photo.png").write_bytes(content)
+        with nullcontext() if shown is not None else pytest.raises(CompleteSplatError, match=r"photo\.png: not an im"):
+            page.open(tmp_path, "scene")
+        assert ("<img" in page.photo.content) == bool(shown)
 
 
 def test_depth_replaces_colours_and_frusta_stand_at_the_cameras(page):
@@ -180,7 +197,7 @@ def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(comple
     assert "photo.png" in completion.controls.preview.content
     assert completion.page.looking.chosen.options == ("sample 1", "sample 2", "all, side by side")
     assert [sample.finished for sample in seen] == [False, False, True]
-    assert said[0] == "completesplat: drawing from photo.png"
+    assert said[:2] == ["completesplat: reading photo.png", "completesplat: drawing from photo.png"]
     assert said[-1].startswith("completesplat: 2 drawn in ")
     assert not torch.equal(seen[0].gaussians.means, seen[-1].gaussians.means)
 

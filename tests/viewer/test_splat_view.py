@@ -9,10 +9,10 @@ from viewer_scenes import balls, balls_sample
 
 from completesplat.gaussians import merge_gaussians
 from completesplat.geometry.cameras import look_at
-from completesplat.viewer.splat_view import arrangement_of, depth_colored, to_splats
+from completesplat.viewer.splat_view import MARGIN, arrangement_of, depth_colored, to_splats
 
 
-def test_one_sample_is_seen_as_its_reference_camera_sees_it():
+def test_one_sample_is_seen_as_its_reference_camera_sees_it_with_a_margin():
     sample = balls_sample()
     eye = torch.tensor([1.0, -2.0, 0.5])
     pose = look_at(eye, torch.tensor([0.0, 0.0, 4.0]), torch.tensor([0.0, -1.0, 0.0]))
@@ -20,7 +20,7 @@ def test_one_sample_is_seen_as_its_reference_camera_sees_it():
     assert arrangement.position == pytest.approx(eye.numpy(), abs=1e-5)
     direction = (arrangement.look_at - arrangement.position) / arrangement.distance
     assert direction == pytest.approx(pose[2, :3].numpy(), abs=1e-5)
-    assert np.degrees(arrangement.fov) == pytest.approx(50, abs=1e-3)
+    assert np.tan(arrangement.fov / 2) == pytest.approx(MARGIN * np.tan(np.radians(25)))
     assert arrangement.shift(0).tolist() == [0, 0, 0]
 
 

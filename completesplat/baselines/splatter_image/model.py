@@ -47,6 +47,7 @@ OUTPUTS = PARAMETERIZATION.channels
 ORDER_OF_HARMONICS = [[[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]]  # signed permutation of axes; its transpose inverts it
 
 HUB = "szymanowiczs/splatter-image-v1"
+PAGE = f"https://huggingface.co/{HUB}"
 PREFIX = "splatter_image:"
 STATE = "model_state_dict"
 GENERAL, GENERAL_FILE = "objaverse", "model_latest.pth"
@@ -324,15 +325,13 @@ def _local(path: Path) -> Path:
         raise WeightsError(f"{path}: no such file")
     config = _config_beside(models[0])
     if not config.is_file():
-        raise WeightsError(f"{models[0]}: {config.name} is missing beside it; both are at https://huggingface.co/{HUB}")
+        raise WeightsError(f"{models[0]}: {config.name} is missing beside it; both are at {PAGE}")
     return models[0]
 
 
 def _download(name: str) -> Path:
     if not re.fullmatch(r"\w+", name):
-        raise WeightsError(
-            f"{PREFIX}{printable(name, SHORT)}: give NAME of a config_NAME.yaml at https://huggingface.co/{HUB}"
-        )
+        raise WeightsError(f"{PREFIX}{printable(name, SHORT)}: give NAME of a config_NAME.yaml at {PAGE}")
     files = f"config_{name}.yaml", GENERAL_FILE if name == GENERAL else f"model_{name}.pth"
     advice = f"where there is a network, `hf download {HUB} {' '.join(files)} --local-dir DIR` fetches it; "
     advice += f"then give weights=DIR/{files[1]}"

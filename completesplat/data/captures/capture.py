@@ -127,9 +127,8 @@ class CapturedFrame:
         """
         height, width = self.lens.image_size
         with errors_at(require_file(self.image), frame=self.number):
-            if self.mask is not None and not _same_aspect(
-                size := stored_size(self.mask, str(self.mask)), (height, width)
-            ):
+            size = (height, width) if self.mask is None else stored_size(self.mask, str(self.mask))
+            if not _same_aspect(size, (height, width)):
                 raise BadImage(f"has {size[0]} x {size[1]} pixels, its image {height} x {width}", str(self.mask))
             with refused_as_bad(str(self.image)), open_image(self.image, FORMATS) as image:
                 orientation = read_exif(image).get(ORIENTATION)

@@ -104,7 +104,7 @@ class CaptureSetDataModule(ObjectDataModule):
             raise refused[0] if refused else MissingFile("no folders with transforms.json or sparse/0", str(self.root))
         members = self._members(list(captures))
         return {
-            name: CaptureSource({k: captures[k] for k in names}, _all_frames, self.framing, refused)
+            name: CaptureSource({k: captures[k] for k in names}, range, self.framing, refused)
             for name, names in members.items()
         }
 
@@ -114,10 +114,6 @@ class CaptureSetDataModule(ObjectDataModule):
             return read_splits(listed, names)
         objects = split_by_seed({object_of(name): [0] for name in names}, self.seeded)
         return {split: [name for name in names if (object_of(name), 0) in objects[split]] for split in SPLITS}
-
-
-def _all_frames(frames: int) -> list[int]:
-    return list(range(frames))
 
 
 def _capture_folders(root: Path) -> list[Path]:

@@ -56,7 +56,7 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
     lenses = dict(_parsed(_camera_of, read, files[0]))
     with errors_at(files[1]):
         posed = _parsed(partial(_frame_of, lenses=lenses, images=images, masks=masks), read, files[1])
-        missing = sorted(str(frame.image.relative_to(images)) for frame in posed if not isfile(frame.image))
+        missing = sorted(frame.image.relative_to(images).as_posix() for frame in posed if not isfile(frame.image))
         warn_of_missing(files[1], missing, len(posed))
         frames = in_order([fit_lens(frame) for frame in posed if isfile(frame.image)])
     points = np.array(_parsed(lambda row: [float(coordinate) for coordinate in row[1:4]], read, files[2]))

@@ -3,7 +3,7 @@
 import hashlib
 import logging
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -41,7 +41,7 @@ FEWEST_HELD_OUT = 2
 TRANSFORMS = ("transforms.json", "transforms_train.json")  # the second is NeRF's (synthetic)
 # Of COLMAP, nerfstudio, and COLMAP's undistorter.
 MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "dense/*/sparse", "dense/sparse")
-Members = Callable[[int], list[int]]
+Members = Callable[[int], Sequence[int]]
 
 
 def members(hold_out: int, held_out: bool, frames: int) -> list[int]:

@@ -21,17 +21,8 @@ from rich.progress import track
 
 from completesplat.data.captures.capture_set import SPLITS_FILE, read_splits
 from completesplat.data.captures.turn_checks import Turn, examine, write_sheet
+from completesplat.data.images import files
 from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.files import (
-    EIGHT_BIT_MODES,
-    check_sums,
-    image_files,
-    open_image,
-    over_grey,
-    photo_formats,
-    refused_as_bad,
-    save_image,
-)
 from completesplat.data.images.photograph import without_background
 from completesplat.data.validation import (
     BadAnnotation,
@@ -134,7 +125,7 @@ def _folders_of_photos(root: Path) -> dict[str, Path]:
         raise MissingFile("no such folder", str(root))
     folders: dict[str, Path] = {}
     for path in (root, *sorted(root.rglob("*/"))):
-        if image_files(path, photo_formats()) and not {*path.parents} & {*folders.values()}:
+        if files.image_files(path, files.photo_formats()) and not {*path.parents} & {*folders.values()}:
             folders[path.relative_to(root).as_posix() if path != root else root.resolve().name] = path
     if not folders:
         raise MissingFile("no photos there, nor in its folders", str(root))
@@ -153,7 +144,7 @@ def _write_turn(folder: Path, count: int | None, out: Path, settings: TurntableS
         BadImage: photos have several sizes, or a mask is empty or fills its photo.
         DataError: the turn does not close.
     """
-    paths = image_files(folder, photo_formats())
+    paths = files.image_files(folder, files.photo_formats())
     if (fewest := min(len(paths), count or len(paths))) < FEWEST_PHOTOS:
         raise TooFewFrames(f"{fewest} photo{'s'[: fewest != 1]}; a turn needs at least {FEWEST_PHOTOS}")
     places = dict(enumerate(paths)) if count is None else _numbered(paths, count)
@@ -168,15 +159,13 @@ def _write_turn(folder: Path, count: int | None, out: Path, settings: TurntableS
     cameras = _on_circle(angles, settings["elevation"], 2 * focal / height, focal, photos[0][0].width)
     whole = Square(0, 0, photos[0][0].width)
     size = min(128, photos[0][0].width)
-    images, masks = (
-        torch.stack([cut_square(x, whole, size) / 255 for x in part]) for part in zip(*photos, strict=True)
-    )
+    images, masks = (torch.stack([cut_square(x, whole, size) / 255 for x in xs]) for xs in zip(*photos, strict=True))
     turn = examine(images, masks, angles, cameras)
     for kind in ("images", "masks"):
         (out / kind).mkdir(parents=True)
     for position, (image, mask) in zip(positions, photos, strict=True):
-        save_image(image, out / f"images/{position:05d}.jpg", quality=95, subsampling=0)
-        save_image(mask, out / f"masks/{position:05d}.png")
+        files.save_image(image, out / f"images/{position:05d}.jpg", quality=95, subsampling=0)
+        files.save_image(mask, out / f"masks/{position:05d}.png")
     return turn
 
 
@@ -205,21 +194,21 @@ def _numbered(paths: Sequence[Path], count: int) -> dict[int, Path]:
 
 def _read_photo(path: Path, background: str | None) -> Photo:
     """Read a photo, upright and at most 512 pixels wide and high, and find its object."""
-    with refused_as_bad(str(path)):
-        with open_image(path, photo_formats()) as stored:
-            if stored.mode not in EIGHT_BIT_MODES:
+    with files.refused_as_bad(str(path)):
+        with files.open_image(path, files.photo_formats()) as stored:
+            if stored.mode not in files.EIGHT_BIT_MODES:
                 raise ImageError(f"colour mode {stored.mode} is not supported")
-            check_sums(stored, path)
+            files.check_sums(stored, path)
             image = ImageOps.exif_transpose(stored).convert("RGBA")
         image.thumbnail((MOST_SIDE, MOST_SIDE), Image.Resampling.LANCZOS)
         if background is not None:
-            image = over_grey(image, 1.0)
+            image = files.over_grey(image, 1.0)
             image = without_background(image) if background == "remove" else _without_white(image)
         mask = image.getchannel("A")
         share = np.mean(np.asarray(mask) > 127)
         if not 0 < share <= FULL:
             raise ImageError(f"background={background}: its mask {'fills the photo' if share else 'is empty'}")
-        return over_grey(image, 1.0), mask
+        return files.over_grey(image, 1.0), mask
 
 
 def _without_white(image: Image.Image) -> Image.Image:

@@ -2,13 +2,14 @@
 
 import os
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from completesplat.data.co3d.source import CO3DSource
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
 from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
+from completesplat.data.validation import MissingFile
 from completesplat.errors import DataError
 from completesplat.settings.schema import Natural, Positive, Range, Share
 
@@ -28,6 +29,12 @@ class CO3DDataModule(ObjectDataModule):
             the paper for full images).
         **settings: of `ObjectDataModule`.
     """
+
+    record = ""
+    """File of a sequence that tells its mode, for data with hidden modes."""
+
+    chances: ClassVar[Mapping[str, float]] = {}
+    """Probabilities of these modes by name."""
 
     def __init__(
         self,
@@ -93,13 +100,12 @@ class CO3DDataModule(ObjectDataModule):
         splits = {split: members.without(absent, "not downloaded") for split, members in splits.items()}
         return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}
 
-    def written_modes(
-        self, record: str, chances: Mapping[str, float], views: int, spread_views: int
-    ) -> HiddenModeScenes:
-        """Return the test scenes with the modes that were written beside their images; see `HiddenModeScenes`.
-
-        Args:
-            record: name of the record in a sequence's folder.
-        """
-        folder = self.root / self.category
-        return HiddenModeScenes(self.store("test"), lambda name: folder / name / record, chances, views, spread_views)
+    def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
+        """Return the test scenes with the modes that were written beside their images; see `HiddenModeScenes`."""
+        if not self.chances:
+            return super().hidden_modes(views, spread_views)
+        store, folder, first = self.store("test"), self.root / self.category, next(iter(self.chances))
+        if not any((folder / name / first).is_dir() for name in store.names):
+            advice = "data toy writes those of test scenes, data render all with hidden=modes"
+            raise MissingFile(f"no test scene has images in each mode, such as {first}: {advice}", str(folder))
+        return HiddenModeScenes(store, lambda name: folder / name / self.record, self.chances, views, spread_views)

@@ -55,8 +55,9 @@ def decode_image(
     """
     with _loaded(source, file, FORMATS) as (stored, exif):
         image = turn_upright(stored, exif.get(ORIENTATION) if turn else None)
-        if image_size is not None:
-            check_annotated_size(image, image_size)
+        if image_size is not None and image.size != image_size[::-1]:
+            expected = f"its annotation says {image_size[0]} x {image_size[1]}"
+            raise ImageError(f"has {image.height} x {image.width} pixels when upright, {expected}")
         return _eight_bits(image, getattr(stored, "tag_v2", {}), mode)
 
 
@@ -223,13 +224,6 @@ def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterat
             image.load()
             check_sums(image, io.BytesIO(content))
             yield image, read_exif(image)
-
-
-def check_annotated_size(image: Image.Image, annotated: tuple[int, int]) -> None:
-    """Refuse an upright image whose (height, width) differs from its annotation."""
-    if image.size != annotated[::-1]:
-        expected = f"its annotation says {annotated[0]} x {annotated[1]}"
-        raise ImageError(f"has {image.height} x {image.width} pixels when upright, {expected}")
 
 
 def _eight_bits(image: Image.Image, tiff_tags: Mapping[int, object], mode: Literal["RGB", "L"]) -> Image.Image:

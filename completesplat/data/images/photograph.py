@@ -20,23 +20,15 @@ from jaxtyping import Bool, Float
 from PIL import Image, ImageCms
 from torch import Tensor
 
+from completesplat.data.images import files
 from completesplat.data.images.exif import ORIENTATION, Tags, crop_fov, read_exif
-from completesplat.data.images.files import (
-    EIGHT_BIT_MODES,
-    SIXTEEN_BIT_MODES,
-    check_sums,
-    deep_grey,
-    open_image,
-    over_grey,
-    turn_upright,
-)
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.tensors import TensorDataclass
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM")
 SMALLEST_SIDE = 8
 FOVS = 0.1, 179  # degrees; float32 holds neither the focal lengths nor the depths of others
-DEEP_GREY_MODES = (*SIXTEEN_BIT_MODES, "I", "F")
+DEEP_GREY_MODES = (*files.SIXTEEN_BIT_MODES, "I", "F")
 LARGEST_OBJECT = 4096  # pixels; larger ones are reduced before they are padded to a square of unbounded size
 LANCZOS_REACH = 3  # radius of the filter, in pixels of the coarser image
 CUTTER = "u2net"  # rembg's default network has a licence for non-commercial use only
@@ -106,11 +98,11 @@ def _square(
 ) -> tuple[Float[Tensor, "3 size size"], float | None]:
     """Return the resized central or object square, and the central square's EXIF field of view in degrees, if any."""
     file, exif = _loaded(source)
-    seen = turn_upright(file, exif.get(ORIENTATION))
+    seen = files.turn_upright(file, exif.get(ORIENTATION))
     if object_share is None:
         seen = seen.crop(_central_square(*seen.size))
     if remove_background:
-        if seen.mode not in EIGHT_BIT_MODES:
+        if seen.mode not in files.EIGHT_BIT_MODES:
             raise ImageError(f"colour mode {seen.mode} goes without background=remove")
         seen = without_background(_to_srgb(seen, background))
     if object_share is not None:
@@ -126,11 +118,11 @@ def _loaded(source: ImageLike) -> tuple[Image.Image, Tags]:
         _require_content(Path(source))
     elif not isinstance(source, Image.Image):
         raise ImageError(f"{type(source).__name__}: give a file name, a PIL image, an array or a tensor")
-    with nullcontext(source) if isinstance(source, Image.Image) else open_image(source, FORMATS) as file:
+    with nullcontext(source) if isinstance(source, Image.Image) else files.open_image(source, FORMATS) as file:
         if min(file.size) < SMALLEST_SIDE:
             raise ImageError(f"{file.size} pixels; at least {SMALLEST_SIDE} on a side are needed")
         if not isinstance(source, Image.Image):
-            check_sums(file, source)
+            files.check_sums(file, source)
         file.load()
         return file, read_exif(file)
 
@@ -148,7 +140,7 @@ def _require_content(path: Path) -> None:
 
 def _around_object(image: Image.Image, share: float) -> Image.Image | None:
     """Crop the square around the opaque part, which may extend beyond the image; None if all pixels are opaque."""
-    if image.mode not in EIGHT_BIT_MODES or not image.has_transparency_data:
+    if image.mode not in files.EIGHT_BIT_MODES or not image.has_transparency_data:
         return None
     cut_out = image.convert("RGBA")
     alpha = cut_out.getchannel("A")
@@ -191,10 +183,10 @@ def _pixels(image: np.ndarray | Tensor) -> Image.Image:
 def _to_tensor(square: Image.Image, source: Image.Image, size: int, background: float) -> Float[Tensor, "3 size size"]:
     """Convert pixels to sRGB in [0, 1]; `source` is the opened file, because only it has TIFF tags."""
     if square.mode in DEEP_GREY_MODES:
-        grey = Image.fromarray(deep_grey(square, getattr(source, "tag_v2", {})))
+        grey = Image.fromarray(files.deep_grey(square, getattr(source, "tag_v2", {})))
         resized = np.asarray(grey.resize((size, size), Image.Resampling.LANCZOS))
         return torch.from_numpy(resized.clip(0, 1)).expand(3, size, size).contiguous()
-    if square.mode not in EIGHT_BIT_MODES:
+    if square.mode not in files.EIGHT_BIT_MODES:
         raise ImageError(f"colour mode {square.mode} is not supported")
     small = _to_srgb(square, background).resize((size, size), Image.Resampling.LANCZOS)
     return torch.from_numpy(np.array(small)).permute(2, 0, 1).contiguous().float() / 255
@@ -204,7 +196,7 @@ def _to_srgb(square: Image.Image, background: float) -> Image.Image:
     """Composite an image over the background, and convert it from its embedded colour profile, if any, to RGB."""
     profile = square.info.get("icc_profile")
     if square.has_transparency_data:
-        square = over_grey(square, background)
+        square = files.over_grey(square, background)
     if profile:
         # Like image viewers, ignore a damaged profile, or one whose colour model differs from the pixels'.
         with suppress(ImageCms.PyCMSError, OSError):

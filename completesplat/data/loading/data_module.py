@@ -19,9 +19,9 @@ from completesplat.data.loading.augmentation import BoxMasks, CameraJitter, Colo
 from completesplat.data.loading.distributed import batch_per_process, processes
 from completesplat.data.loading.latent_cache import CachedTrainingScenes, LatentCache
 from completesplat.data.loading.loader import EpochSampler, RepeatedEpoch, SceneLoader
-from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
+from completesplat.data.loading.scenes import EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.loading.training_statistics import TypicalCamera, feature_moments, mean_camera, mean_image
-from completesplat.data.loading.view_selection import draw_spread_views, evaluation_views, training_views
+from completesplat.data.loading.view_selection import Choice, draw_spread_views, evaluation_views, training_views
 from completesplat.data.packed.manifest import Scalar, is_packed, settings_must_match
 from completesplat.data.packed.source import PackedSource, local_root
 from completesplat.data.placement import ObjectFraming
@@ -168,9 +168,8 @@ class SceneDataModule(LightningDataModule):
         Raises:
             CompleteSplatError: the alternatives for what the reference image hides are not known.
         """
-        raise CompleteSplatError(
-            "evaluation=hidden_modes needs data whose hidden parts are known: toy objects, or data render hidden=modes"
-        )
+        known = "toy objects, or data render hidden=modes"
+        raise CompleteSplatError(f"evaluation=hidden_modes needs data whose hidden parts are known: {known}")
 
     def check_test(self) -> None:
         """Raise DataError for a test that cannot work, before its model is trained; by default, nothing is checked."""

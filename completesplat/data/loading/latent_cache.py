@@ -1,6 +1,7 @@
 """Latent cache on disk: an Arrow file as in a packed store, with one row for each sequence, used as a training set."""
 
 import json
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -9,20 +10,23 @@ from zlib import crc32
 import numpy as np
 import pyarrow as pa
 import torch
-from jaxtyping import Shaped, UInt32
+from jaxtyping import Float, Shaped, UInt32
 
 from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import TrainingScenes
 from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, read_as
 from completesplat.data.packed.source import OpenShard
+from completesplat.data.packed.writing import UNFINISHED
 from completesplat.data.sequences import SequenceSource
 from completesplat.data.validation import BadAnnotation, ChangedFile, MissingFile, UnreadableFile, require_file
 from completesplat.errors import CompleteSplatError, DataError, errors_at
-from completesplat.files import write_text
+from completesplat.files import atomic_path, write_text
 from completesplat.scene import CachedScene
+from completesplat.version import __version__
 
 HEADER: dict[str, str | int] = {"format": 5, "kind": "latent_cache"}
 Rows = dict[str, Shaped[np.ndarray, "frame ..."]]
+Sums = Float[np.ndarray, "3 channel"]
 PRECISIONS = {"float32": pa.float32(), "float16": pa.float16()}
 FILE = "latents.arrow"
 ARRAYS = ("mean", "log_variance", "condition")
@@ -77,12 +81,6 @@ class LatentCacheManifest:
     sha256: str = NO_SUM
 
 
-def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
-    """Write the manifest, which marks the store as finished."""
-    text = json.dumps({**HEADER, **asdict(manifest)}, indent=2, allow_nan=False) + "\n"
-    write_text(root / MANIFEST, text.replace(NO_SUM, sha256(text.encode()).hexdigest()))
-
-
 def latent_schema(origin: Origin) -> pa.Schema:
     """Return the columns of a store. Each has one list for each sequence, of the values of all its stored frames."""
     encodings = pa.large_list(PRECISIONS[origin.precision])
@@ -100,10 +98,44 @@ def frame_checksums(rows: Rows) -> UInt32[np.ndarray, " frame"]:
     return checksums
 
 
-def latent_row(name: str, rows: Rows, schema: pa.Schema) -> pa.RecordBatch:
-    columns = [*(rows[array].reshape(-1) for array in ARRAYS), frame_checksums(rows)]
-    lists = [pa.LargeListArray.from_arrays(pa.array([0, len(x)], pa.int64()), pa.array(x)) for x in columns]
-    return pa.RecordBatch.from_arrays([pa.array([name]), *lists], schema=schema)
+def moments(sums: Sums) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return mean and standard deviation of each channel; Var[h] = E[mean^2] + E[variance] - E[mean]^2."""
+    count, total, squares = sums
+    mean = total / count
+    return tuple(mean.tolist()), tuple(np.sqrt(squares / count - np.square(mean)).tolist())
+
+
+def write_cache(
+    folder: Path, origin: Origin, batches: Iterable[tuple[Rows, Sums]], sequences: Sequence[CachedSequence]
+) -> None:
+    """Write the rows of all sequences, then the manifest, which marks the store as finished.
+
+    Args:
+        batches: at least one batch of the sequences' stored frames, in their order, each with its moment sums.
+    """
+    total, written, schema, waiting = np.zeros(()), 0, latent_schema(origin), Rows()
+    with (
+        atomic_path(folder / FILE, f"{FILE}{UNFINISHED}") as unfinished,
+        unfinished.open("wb") as file,
+        pa.ipc.new_stream(file, schema) as writer,
+    ):
+        for rows, sums in batches:
+            total = total + sums
+            waiting = {name: np.concatenate([waiting.get(name, x[:0]), x]) for name, x in rows.items()}
+            for sequence in sequences[written:]:
+                count = len(sequence.stored)
+                if len(waiting["mean"]) < count:
+                    break
+                complete = {name: np.ascontiguousarray(values[:count]) for name, values in waiting.items()}
+                columns = [*(complete[array].reshape(-1) for array in ARRAYS), frame_checksums(complete)]
+                lists = [pa.LargeListArray.from_arrays(pa.array([0, len(x)], pa.int64()), pa.array(x)) for x in columns]
+                writer.write_batch(pa.RecordBatch.from_arrays([pa.array([sequence.name]), *lists], schema=schema))
+                waiting = {name: values[count:] for name, values in waiting.items()}
+                written += 1
+    shapes, size = {name: rows.shape[1:] for name, rows in waiting.items()}, (folder / FILE).stat().st_size
+    manifest = LatentCacheManifest(__version__, origin, *moments(total), shapes, tuple(sequences), size)
+    text = json.dumps({**HEADER, **asdict(manifest)}, indent=2, allow_nan=False) + "\n"
+    write_text(folder / MANIFEST, text.replace(NO_SUM, sha256(text.encode()).hexdigest()))
 
 
 class LatentCache:
@@ -207,9 +239,8 @@ class CachedTrainingScenes(TrainingScenes):
 
     def __post_init__(self) -> None:
         if self.box_masks is not None and not self.cache.holds_images:
-            raise CompleteSplatError(
-                "data.box_masks cannot hide parts of encoded features: use data.latent_cache=null, or encode images"
-            )
+            advice = "use data.latent_cache=null, or encode images"
+            raise CompleteSplatError(f"data.box_masks cannot hide parts of encoded features: {advice}")
 
     def draw(self, name: str, epoch: int, rng: np.random.Generator) -> CachedScene:
         """Draw a random reference frame of the sequence `name` and return its encoding."""

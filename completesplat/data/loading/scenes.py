@@ -12,15 +12,13 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from completesplat.data.loading.distributed import processes
-from completesplat.data.loading.view_selection import item_generator
+from completesplat.data.loading.view_selection import Choice, item_generator
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.errors import DataError, errors_at
 from completesplat.scene import CachedScene, SceneBatch, Views
 from completesplat.tensors import stack
 
 ATTEMPTS = 10  # Number of items that are tried before none is returned.
-
-Choice = tuple[int, list[int]]  # reference, targets
 
 
 class LoadedScenes(NamedTuple):

@@ -6,6 +6,8 @@ import numpy as np
 
 from completesplat.errors import CompleteSplatError
 
+Choice = tuple[int, list[int]]  # reference, targets
+
 
 @dataclass(frozen=True)
 class GrowingGap:
@@ -35,7 +37,7 @@ def item_generator(seed: int, epoch: int, index: int) -> np.random.Generator:
     return np.random.default_rng([seed, epoch, index])
 
 
-def training_views(frames: int, targets: int, rng: np.random.Generator) -> tuple[int, list[int]]:
+def training_views(frames: int, targets: int, rng: np.random.Generator) -> Choice:
     """Draw a random reference and `targets` other frames at any baseline (Splatter Image, `scene/co3d.py:231`).
 
     The sequence needs at least two frames. Targets repeat only if it is too short.
@@ -54,13 +56,13 @@ def spread_around(frames: int, reference: int, count: int) -> list[int]:
     return places
 
 
-def draw_spread_views(frames: int, targets: int, rng: np.random.Generator) -> tuple[int, list[int]]:
+def draw_spread_views(frames: int, targets: int, rng: np.random.Generator) -> Choice:
     """Draw a random reference; return it and `targets` frames all around it (`spread_around`) in random order."""
     reference = int(rng.integers(frames))
     return reference, rng.permutation(spread_around(frames, reference, targets)).tolist()
 
 
-def evaluation_views(frames: int, targets: int | None) -> tuple[int, list[int]]:
+def evaluation_views(frames: int, targets: int | None) -> Choice:
     """Return the first frame as reference, and all others or at most `targets` evenly spaced ones as targets."""
     others = np.arange(1, frames)
     if targets is not None and targets < len(others):
@@ -68,9 +70,7 @@ def evaluation_views(frames: int, targets: int | None) -> tuple[int, list[int]]:
     return 0, others.tolist()
 
 
-def nearby_views(
-    frames: int, targets: int, min_gap: int, max_gap: int, rng: np.random.Generator
-) -> tuple[int, list[int]]:
+def nearby_views(frames: int, targets: int, min_gap: int, max_gap: int, rng: np.random.Generator) -> Choice:
     """Draw a random reference and `targets` random frames that are `min_gap` to `max_gap` frames before or after it.
 
     Only frames that have such a neighbour can be the reference. The sequence needs at least two frames; if it is too
@@ -83,7 +83,7 @@ def nearby_views(
     return reference, np.resize(rng.permutation(positions[(gap >= nearest) & (gap <= max_gap)]), targets).tolist()
 
 
-def evaluation_views_within(frames: int, targets: int, gap: int) -> tuple[int, list[int]]:
+def evaluation_views_within(frames: int, targets: int, gap: int) -> Choice:
     """Return the first frame as reference and `targets` evenly spaced frames, the last one `gap` frames after it.
 
     In a shorter sequence the last target is the last frame. Targets repeat if there are too few frames.

@@ -154,8 +154,7 @@ def prepare(
     codec: str = "bmp",
     sequences_per_shard: int = 32,
     workers: int | None = None,
-    on_bad: OnBad = "skip",
-    max_bad_fraction: float = 0.1,
+    policy: tuple[OnBad, float] = ("skip", 0.1),
     progress: bool = True,
 ) -> Path:
     """Write sequences into a packed store. Its bytes depend on the input only, not on the number of workers.
@@ -166,7 +165,7 @@ def prepare(
         codec: image codec, a key of `CODECS`: "bmp" (fastest) and "png" (smaller) are lossless, "jpeg" is not.
         sequences_per_shard: the default gives a few hundred MB at 128 x 128 pixels and 200 frames.
         workers: processes; None: one for each core.
-        on_bad: "skip" and record unreadable frames and sequences, up to `max_bad_fraction` of each; or "raise".
+        policy: "skip" and record unreadable frames and sequences, up to this share of each; or "raise".
 
     Raises:
         DataError: the folder holds something else, or too much is unreadable.
@@ -174,6 +173,7 @@ def prepare(
     """
     if codec not in CODECS:
         raise CompleteSplatError(f"codec={codec}: choose one of {', '.join(CODECS)}")
+    on_bad, max_bad_fraction = policy
     writer = ShardWriter({split: sources[split] for split in sorted(sources, key=SPLITS.index)}, out, codec, on_bad)
     plans = _plans(writer.sources, sequences_per_shard)
     _claim(out, _plan(writer, settings, plans))
@@ -185,19 +185,14 @@ def prepare(
     # The old manifest may be wrong until it is written again.
     for path in (out / MANIFEST, *out.glob(f"*{UNFINISHED}")):
         path.unlink(missing_ok=True)
-    if on_bad == "raise":
-        _raise_first(writer.sources.values())
+    bad = [error for source in writer.sources.values() for error in source.refused]
+    if bad and on_bad == "raise":
+        raise bad[0]
     if missing:
         records |= _write_shards(writer, missing, workers, progress)
     splits = {split: _split(split, source, records.values()) for split, source in writer.sources.items()}
     _finish(PackedManifest(codec, dict(settings), splits), out, max_bad_fraction)
     return out
-
-
-def _raise_first(sources: Iterable[SequenceSource]) -> None:
-    for source in sources:
-        for error in source.refused:
-            raise error
 
 
 def _write_shards(

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from completesplat.data.loading.scenes import Choice
+from completesplat.data.loading.view_selection import Choice
 from completesplat.data.sequences import PosedSequence, SequenceSource, first_names
 from completesplat.data.validation import BadAnnotation, read_json, read_text
 from completesplat.errors import DataError, errors_at

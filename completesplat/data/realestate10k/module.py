@@ -11,8 +11,8 @@ import torch
 
 from completesplat.data.images.crop import Square, principal_square
 from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.data.loading.scenes import Choice, EvaluationScenes
-from completesplat.data.loading.view_selection import GrowingGap, evaluation_views_within, nearby_views
+from completesplat.data.loading.scenes import EvaluationScenes
+from completesplat.data.loading.view_selection import Choice, GrowingGap, evaluation_views_within, nearby_views
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.realestate10k.clips import ChunkedClips, Clip, TextClips
 from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys

@@ -1,17 +1,18 @@
-"""Renders of a folder of meshes: list of objects, jobs of worker processes, continuation, broken meshes."""
+"""Renders of a folder of meshes: list of objects, jobs of worker processes, broken meshes, data module."""
 
 import json
 import logging
 import math
 import os
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event
-from typing import Annotated, Any, NamedTuple, Unpack
+from typing import Annotated, Any, ClassVar, NamedTuple, Unpack
 from urllib.parse import unquote
 
 import numpy as np
@@ -20,20 +21,13 @@ from jaxtyping import Float
 from PIL import Image
 from rich.progress import track
 
+from completesplat.data.co3d import writing
 from completesplat.data.co3d.annotations import viewpoint
-from completesplat.data.co3d.writing import (
-    FOLDERS,
-    Annotation,
-    is_written,
-    sequence_annotation,
-    write_annotations,
-    write_frame,
-    write_points,
-)
+from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.hidden_modes import in_mode
 from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
-from completesplat.data.rendered.drawing import RenderSettings, check_surroundings, draw_rendered_scene
+from completesplat.data.rendered.drawing import PAINTS, RenderSettings, check_surroundings, draw_rendered_scene
 from completesplat.data.validation import MissingFile, UnreadableFile, read_points
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import atomic_folder, folder_names, write_text
@@ -44,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 CATEGORY = "rendered"
 DESCRIPTION, OBJECT, BROKEN = "rendered.json", "object.json", "broken.json"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 SUFFIXES = ("glb", "gltf", "obj", "ply", "stl", "fbx", "usd", "usda", "usdc", "usdz")
 MOST_POINTS = 20_000
 SKY = 1e9  # Cycles has 1e10 where no surface is
@@ -70,7 +64,7 @@ class BrokenMesh(Exception):
 
 
 def find_meshes(folder: Path) -> list[Asset]:
-    """List the mesh files below a folder by path; a sequence is named after its file's path.
+    """List the mesh files below a folder by path; a sequence is named after its file's path without suffix, if unique.
 
     Raises:
         MissingFile: the folder does not exist or has no mesh.
@@ -81,7 +75,10 @@ def find_meshes(folder: Path) -> list[Asset]:
     if not paths:
         raise MissingFile(f"no meshes there ({', '.join(SUFFIXES)})", str(folder))
     relative = [path.relative_to(folder).as_posix() for path in paths]
-    return [Asset(*mesh) for mesh in zip(folder_names(relative), relative, paths, strict=True)]
+    objects = [path.removesuffix(Path(path).suffix) for path in relative]
+    count = Counter(objects)
+    names = folder_names(name if count[name] == 1 else path for name, path in zip(objects, relative, strict=True))
+    return [Asset(*mesh) for mesh in zip(names, relative, paths, strict=True)]
 
 
 def check_named_files(mesh: Path, root: Path) -> None:
@@ -181,7 +178,7 @@ def render(
     program, category = find_blender(blender), out / CATEGORY
     objects = objects or procedural_objects(program, str(factory), count)
     parameters = {"format": FORMAT_VERSION, **settings}
-    if not is_written(category / DESCRIPTION, parameters):
+    if not writing.is_written(category / DESCRIPTION, parameters):
         with atomic_folder(category) as unfinished:
             (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
     waiting = [asset for asset in objects if not (category / asset.name).exists()]
@@ -201,7 +198,7 @@ def _write_lists(category: Path, broken: dict[str, str]) -> None:
     if not records:
         raise DataError(f"none of {len(broken)} objects can be rendered: {next(iter(broken.values()))}", str(category))
     frames = [frame for record in records for frame in record["frames"]]
-    write_annotations(category, frames, [record["sequence"] for record in records])
+    writing.write_annotations(category, frames, [record["sequence"] for record in records])
     logger.info("%d objects in %s, %d left out", len(records), category, len(broken))
 
 
@@ -262,15 +259,15 @@ def _write_object(
 
 def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Cameras]) -> dict[str, Any]:
     """Write images, masks, depths and points from the files of Blender; return the annotations."""
-    for kind in FOLDERS:
+    for kind in writing.FOLDERS:
         (folder / kind).mkdir()
-    frames, points, colors = list[Annotation](), [], []
+    frames, points, colors = list[writing.Annotation](), [], []
     for number, camera in enumerate(cameras):
         image = _pixels(files / f"{number:04d}.png")
         depth, seen, coverage = np.moveaxis(np.load(files / f"{number:04d}.npy"), -1, 0)
         depth[depth > SKY] = 0
         place = CATEGORY, name, number
-        frames.append(write_frame(folder, place, image, coverage, depth, _viewpoint(camera)))
+        frames.append(writing.write_frame(folder, place, image, coverage, depth, _viewpoint(camera)))
         pixels = pixel_centers(*camera.image_size, dtype=torch.float64)[torch.from_numpy(seen == 1)]
         points.append(unproject(camera, pixels, torch.from_numpy(depth[seen == 1]).double()).numpy())
         colors.append(to_uint8(image[seen == 1]))
@@ -278,8 +275,8 @@ def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Came
     if not step:
         raise BrokenMesh("no image shows it")
     cloud = np.concatenate(points)[::step]
-    write_points(folder / "pointcloud.ply", cloud, np.concatenate(colors)[::step])
-    return {"frames": frames, "sequence": sequence_annotation(CATEGORY, name, len(cloud))}
+    writing.write_points(folder / "pointcloud.ply", cloud, np.concatenate(colors)[::step])
+    return {"frames": frames, "sequence": writing.sequence_annotation(CATEGORY, name, len(cloud))}
 
 
 def _write_modes(folder: Path, modes: Sequence[str], files: Path) -> None:
@@ -299,3 +296,16 @@ def _viewpoint(camera: Cameras) -> dict[str, object]:
     matrix, intrinsics = camera.world_to_camera.numpy(), camera.intrinsics.numpy()
     focal, center = intrinsics.diagonal()[:2] / half, 1 - intrinsics[:2, 2] / half
     return viewpoint(matrix[:3, :3], matrix[:3, 3], focal.tolist(), center.tolist())
+
+
+class RenderedDataModule(CO3DDataModule):
+    """`CO3DDataModule` of objects that `render` wrote below `root`, split by seed."""
+
+    record = OBJECT
+    chances: ClassVar = {name: paint.chance for name, paint in PAINTS.items()}
+
+    def __init__(self, root: str, **settings: Any) -> None:
+        super().__init__(root, CATEGORY, subset=None, **settings)
+
+    def describe(self) -> dict[str, str | None]:
+        return super().describe() | {"data_set": CATEGORY}

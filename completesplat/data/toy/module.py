@@ -4,13 +4,11 @@ from pathlib import Path
 from typing import Any
 
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS
-from completesplat.data.toy.writing import DESCRIPTION, FORMAT_VERSION, ROOMS, SUBSET, DataSetSize, write
-from completesplat.data.validation import MissingFile, field, read_json
-from completesplat.errors import DataError, errors_at
+from completesplat.data.toy.writing import DESCRIPTION, ROOMS, SUBSET, DataSetSize, write
+from completesplat.data.validation import MissingFile
 from completesplat.settings.schema import Natural, Positive, Side
 
 OWN_PLACE = Path("outputs/data")
@@ -39,6 +37,8 @@ class ToyObjectsDataModule(CO3DDataModule):
     depth range that it was trained with.
     """
 
+    record, chances = DESCRIPTION, dict.fromkeys(PATCH_COLORS, 1 / len(PATCH_COLORS))
+
     def __init__(
         self,
         root: str,
@@ -61,20 +61,6 @@ class ToyObjectsDataModule(CO3DDataModule):
     def prepare_data(self) -> None:
         """Write the scenes if there are none."""
         _provide(self.category.removeprefix("toy_"), self.root, self.make, self.making)
-
-    def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
-        """Return the test scenes with all possible colours of the patch on the back.
-
-        Raises:
-            DataError: the toy objects are of another version, or prepared data.
-        """
-        description = self.root / self.category / DESCRIPTION
-        if not description.is_file():
-            raise DataError(f"no {DESCRIPTION}: hidden modes need toy objects as they were written", str(description))
-        with errors_at(description):
-            if field(read_json(description), "format", int) != FORMAT_VERSION:
-                raise DataError("of another version: write the toy objects again into another folder")
-        return self.written_modes(DESCRIPTION, dict.fromkeys(PATCH_COLORS, 1 / len(PATCH_COLORS)), views, spread_views)
 
 
 class ToyRoomsDataModule(RE10KDataModule):

@@ -96,20 +96,18 @@ def path_below(root: Path, relative: str) -> Path:
         OutsidePath: the path is empty, has `..`, a drive, scheme or NUL, or it or a link leads out.
     """
     path, windows = PurePath(relative.replace("\\", "/")), PureWindowsPath(relative)
-    absolute = path.is_absolute() or windows.drive
+    absolute, shown = path.is_absolute() or windows.drive, printable(repr(relative), SHORT)
     if not path.parts or ".." in path.parts or any(text in relative for text in ("\0", "://")):
-        raise OutsidePath(f"leads outside of {root}, or nowhere: {printable(repr(relative), SHORT)}")
+        raise OutsidePath(f"leads outside of {root}, or nowhere: {shown}")
     try:
         # `realpath` also accepts a path that does not exist, and one whose links form a ring.
         real_root, real_path = os.path.realpath(root), os.path.realpath(root / path)
     except ValueError:
-        raise OutsidePath(f"characters that no file name has: {printable(repr(relative), SHORT)}") from None
+        raise OutsidePath(f"characters that no file name has: {shown}") from None
     if windows.drive or os.path.commonpath([real_root, real_path]) != real_root:
         if absolute and not os.path.lexists(path):
-            raise OutsidePath(
-                f"a path of another machine; make it relative to {root}: {printable(repr(relative), SHORT)}"
-            )
-        raise OutsidePath(f"leads outside of {root}: {printable(repr(relative), SHORT)} is {real_path}")
+            raise OutsidePath(f"a path of another machine; make it relative to {root}: {shown}")
+        raise OutsidePath(f"leads outside of {root}: {shown} is {real_path}")
     return root / (os.path.relpath(real_path, real_root) if absolute else path)
 
 

@@ -1,6 +1,6 @@
 """Check of a whole data set: numbers of usable sequences and frames, and reasons for those that are not usable."""
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -84,9 +84,11 @@ def check(
             sequences += batch
             bar.advance(task, len(batch))
     refused += [error for sequence in sequences for error in sequence.refused]
-    refused += _too_short(sequences, {error.sequence for error in refused})
+    explained = {error.sequence for error in refused}
+    short = [s for s in sequences if len(s.usable) < FEWEST_FRAMES and s.name not in explained]
+    refused += [TooFewFrames(f"{len(s.usable)} usable, 2 are needed", sequence=s.name) for s in short]
     unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in refused}
-    usable = {split: [sequence.usable_in(split) for sequence in sequences] for split in sources}
+    usable = {split: [s.usable & s.frames.get(split, set()) for s in sequences] for split in sources}
     names = {split: source.names for split, source in sources.items()}
     return AuditReport(
         **_numbers([sequence.usable for sequence in sequences]),
@@ -102,11 +104,6 @@ def _source_errors(source: SequenceSource) -> list[DataError]:
     for reason, names in source.left_out.items():
         errors += [ExcludedSequence(reason, sequence=name) for name in names]
     return [*errors, *source.verify()]
-
-
-def _too_short(sequences: Sequence["_Sequence"], explained: Set[str | None]) -> list[DataError]:
-    short = [s for s in sequences if len(s.usable) < FEWEST_FRAMES and s.name not in explained]
-    return [TooFewFrames(f"{len(s.usable)} usable, 2 are needed", sequence=s.name) for s in short]
 
 
 def show_findings(findings: AuditReport) -> None:
@@ -136,9 +133,6 @@ class _Sequence:
     frames: dict[str, set[int]] = field(default_factory=dict)
     usable: set[int] = field(default_factory=set)
     refused: list[DataError] = field(default_factory=list)
-
-    def usable_in(self, split: str) -> set[int]:
-        return self.usable & self.frames.get(split, set())
 
 
 def _batches(sources: Sources) -> list[_Batch]:

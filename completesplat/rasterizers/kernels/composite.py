@@ -9,34 +9,15 @@ from llvmlite import ir
 from numba.core import types
 
 from completesplat.rasterizers.kernels import array_layout as layout
+from completesplat.rasterizers.kernels import simd
 from completesplat.rasterizers.kernels.compilation import helper, kernel
-from completesplat.rasterizers.kernels.simd import (
-    F32,
-    I32,
-    I64,
-    INTEGERS_IR,
-    LANES,
-    VECTOR,
-    address,
-    any_lane,
-    exp2,
-    keep,
-    lane_constant,
-    lane_sums,
-    load,
-    lowest_bit,
-    splat,
-    square_root,
-    store,
-    vector_function,
-)  # fmt: skip
 
 Array = np.ndarray
 
 # State of a block. Forward: transmittance, red, green, blue, depth, alpha. Backward: transmittance, sum behind, and
 # gradients of red, green, blue, depth.
 STATE_VECTORS = 6
-reached_flag = lane_constant([lane == layout.REACHED for lane in range(LANES)])
+reached_flag = simd.lane_constant([lane == layout.REACHED for lane in range(simd.LANES)])
 BLOCK = layout.BLOCK
 SLACK = np.float32(layout.SLACK)
 WORD_BITS = 64
@@ -47,16 +28,16 @@ BIT, TWO_BITS = np.uint64(1), np.uint64(2)
 # In px; extends the choice of blocks against rounding. The test at the pixel itself decides.
 MARGIN = np.float32(0.01)
 
-ROWS_AT_ONCE = LANES // 2  # in `row_spans`
+ROWS_AT_ONCE = simd.LANES // 2  # in `row_spans`
 
 # Pixel centres relative to the block's corner.
-lane_x = lane_constant([lane % BLOCK + 0.5 for lane in range(LANES)])
-lane_y = lane_constant([lane // BLOCK + 0.5 for lane in range(LANES)])
+lane_x = simd.lane_constant([lane % BLOCK + 0.5 for lane in range(simd.LANES)])
+lane_y = simd.lane_constant([lane // BLOCK + 0.5 for lane in range(simd.LANES)])
 # For the left ends of block rows, then for the right ends: top pixel row, direction, and limits of the pixel column.
-row_tops = lane_constant([lane % ROWS_AT_ONCE * BLOCK + 0.5 for lane in range(LANES)])
-side = lane_constant([-1] * ROWS_AT_ONCE + [1] * ROWS_AT_ONCE)
-is_left = lane_constant([1] * ROWS_AT_ONCE + [0] * ROWS_AT_ONCE)
-lowest_pixel = lane_constant([0] * ROWS_AT_ONCE + [-BLOCK] * ROWS_AT_ONCE)
+row_tops = simd.lane_constant([lane % ROWS_AT_ONCE * BLOCK + 0.5 for lane in range(simd.LANES)])
+side = simd.lane_constant([-1] * ROWS_AT_ONCE + [1] * ROWS_AT_ONCE)
+is_left = simd.lane_constant([1] * ROWS_AT_ONCE + [0] * ROWS_AT_ONCE)
+lowest_pixel = simd.lane_constant([0] * ROWS_AT_ONCE + [-BLOCK] * ROWS_AT_ONCE)
 
 
 @kernel
@@ -88,7 +69,7 @@ def composite(
     begin(first_row, end_row, columns, height, width, state)
     if gradients is not None and places is not None:
         flat_gradients = gradients.reshape(-1)
-        store(flat_gradients, 0, splat(ZERO))
+        simd.store(flat_gradients, 0, simd.splat(ZERO))
         places[:] = 0
         read_images(first_row, end_row, columns, state, color, depth, alpha, grad_color, grad_depth, grad_alpha)
     blocks_left = open_all_blocks(open_words, end_row - first_row, columns)
@@ -103,7 +84,7 @@ def composite(
         red, green, blue = records[j, layout.RED], records[j, layout.GREEN], records[j, layout.BLUE]
         z = records[j, layout.DEPTH]
         reached = False
-        zero = splat(ZERO)
+        zero = simd.splat(ZERO)
         sum_red, sum_green, sum_blue, sum_z = zero, zero, zero, zero
         sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv = zero, zero, zero, zero, zero, zero
         for row in range(top, bottom + 1):
@@ -118,42 +99,42 @@ def composite(
                 reached = True
                 u_row, v, exponent_row = row_terms(records, j, row)
                 while mask != 0:
-                    column = (word << WORD_SHIFT) + lowest_bit(mask)
+                    column = (word << WORD_SHIFT) + simd.lowest_bit(mask)
                     mask &= mask - BIT
-                    offset = ((row - first_row) * columns + column) * (STATE_VECTORS * LANES)
+                    offset = ((row - first_row) * columns + column) * (STATE_VECTORS * simd.LANES)
                     u = u_row + column_offset(records, j, column)
                     value, opacity = alpha_at(exponent_row - u * u, log2_min_alpha, max_alpha)
                     transmittance = state_vector(state, offset, 0)
                     weight, behind, passes = attenuate(transmittance, opacity, min_transmittance)
-                    store(state, offset, behind)
+                    simd.store(state, offset, behind)
                     if gradients is None:
-                        store(state, offset + LANES, state_vector(state, offset, 1) + weight * red)
-                        store(state, offset + 2 * LANES, state_vector(state, offset, 2) + weight * green)
-                        store(state, offset + 3 * LANES, state_vector(state, offset, 3) + weight * blue)
-                        store(state, offset + 4 * LANES, state_vector(state, offset, 4) + weight * z)
-                        store(state, offset + 5 * LANES, state_vector(state, offset, 5) + weight)
+                        simd.store(state, offset + simd.LANES, state_vector(state, offset, 1) + weight * red)
+                        simd.store(state, offset + 2 * simd.LANES, state_vector(state, offset, 2) + weight * green)
+                        simd.store(state, offset + 3 * simd.LANES, state_vector(state, offset, 3) + weight * blue)
+                        simd.store(state, offset + 4 * simd.LANES, state_vector(state, offset, 4) + weight * z)
+                        simd.store(state, offset + 5 * simd.LANES, state_vector(state, offset, 5) + weight)
                     else:
                         grad_red, grad_green = state_vector(state, offset, 2), state_vector(state, offset, 3)
                         grad_blue, grad_z = state_vector(state, offset, 4), state_vector(state, offset, 5)
                         grad_value = grad_red * red + grad_green * green + grad_blue * blue + grad_z * z
                         sum_behind = state_vector(state, offset, 1) - weight * grad_value
-                        store(state, offset + LANES, sum_behind)
+                        simd.store(state, offset + simd.LANES, sum_behind)
                         grad_opacity = transmittance * grad_value - sum_behind / (ONE - opacity)
                         # s = -dL/dsigma = alpha dL/dalpha; the clamp at max_alpha has no gradient.
-                        s = keep(passes & (value <= max_alpha), opacity * grad_opacity)
+                        s = simd.keep(passes & (value <= max_alpha), opacity * grad_opacity)
                         sum_red, sum_green = sum_red + weight * grad_red, sum_green + weight * grad_green
                         sum_blue, sum_z = sum_blue + weight * grad_blue, sum_z + weight * grad_z
                         su, sv = s * u, s * v
                         sum_s, sum_su, sum_sv = sum_s + s, sum_su + su, sum_sv + sv
                         sum_suu, sum_suv, sum_svv = sum_suu + su * u, sum_suv + su * v, sum_svv + sv * v
-                    if not any_lane(behind > ZERO):
+                    if not simd.any_lane(behind > ZERO):
                         close_block(open_words, row - first_row, column)
                         blocks_left -= 1
         written += reached
         if gradients is not None and places is not None and reached:
             moments = (sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv)
-            sums = lane_sums((sum_red, sum_green, sum_blue, sum_z) + moments)  # noqa: RUF005
-            store(flat_gradients, written * layout.GRADIENT_WIDTH, sums + reached_flag())
+            sums = simd.lane_sums((sum_red, sum_green, sum_blue, sum_z) + moments)  # noqa: RUF005
+            simd.store(flat_gradients, written * layout.GRADIENT_WIDTH, sums + reached_flag())
             places[integers[j, layout.INDEX]] = written
     if gradients is None:
         write_images(first_row, end_row, columns, state, color, depth, alpha)
@@ -163,10 +144,10 @@ def composite(
 def begin(first_row, end_row, columns, height, width, state):
     for row in range(first_row, end_row):
         for column in range(columns):
-            offset = ((row - first_row) * columns + column) * (STATE_VECTORS * LANES)
+            offset = ((row - first_row) * columns + column) * (STATE_VECTORS * simd.LANES)
             open_pixels(row, column, height, width, state, offset)
             for vector in range(1, STATE_VECTORS):
-                store(state, offset + vector * LANES, splat(ZERO))
+                simd.store(state, offset + vector * simd.LANES, simd.splat(ZERO))
 
 
 @helper
@@ -176,7 +157,7 @@ def write_images(first_row, end_row, columns, state, color, depth, alpha):
     flat_color, flat_depth, flat_alpha = color.reshape(-1), depth.reshape(-1), alpha.reshape(-1)
     for row in range(first_row, end_row):
         for column in range(columns):
-            block = ((row - first_row) * columns + column) * (STATE_VECTORS * LANES)
+            block = ((row - first_row) * columns + column) * (STATE_VECTORS * simd.LANES)
             corner = (row * width + column) * BLOCK
             if is_whole(row, column, height, width):
                 for channel in range(3):
@@ -184,14 +165,14 @@ def write_images(first_row, end_row, columns, state, color, depth, alpha):
                 store_block(flat_depth, corner, width, state_vector(state, block, 4))
                 store_block(flat_alpha, corner, width, state_vector(state, block, 5))
                 continue
-            for lane in range(LANES):
+            for lane in range(simd.LANES):
                 if is_inside(row, column, lane, height, width):
                     pixel = corner + lane // BLOCK * width + lane % BLOCK
                     for channel in range(3):
-                        flat_color[channel * plane + pixel] = state[block + (1 + channel) * LANES + lane]
+                        flat_color[channel * plane + pixel] = state[block + (1 + channel) * simd.LANES + lane]
                     flat_depth[pixel], flat_alpha[pixel] = (
-                        state[block + 4 * LANES + lane],
-                        state[block + 5 * LANES + lane],
+                        state[block + 4 * simd.LANES + lane],
+                        state[block + 5 * simd.LANES + lane],
                     )
 
 
@@ -204,7 +185,7 @@ def read_images(first_row, end_row, columns, state, color, depth, alpha, grad_co
     colors, depths, alphas = grad_color.reshape(-1), grad_depth.reshape(-1), grad_alpha.reshape(-1)
     for row in range(first_row, end_row):
         for column in range(columns):
-            block = ((row - first_row) * columns + column) * (STATE_VECTORS * LANES)
+            block = ((row - first_row) * columns + column) * (STATE_VECTORS * simd.LANES)
             corner = (row * width + column) * BLOCK
             if is_whole(row, column, height, width):
                 red, green = load_block(colors, corner, width), load_block(colors, plane + corner, width)
@@ -214,21 +195,21 @@ def read_images(first_row, end_row, columns, state, color, depth, alpha, grad_co
                 total = total + blue * load_block(flat_color, 2 * plane + corner, width)
                 total = total + z * load_block(flat_depth, corner, width)
                 through = ONE - load_block(flat_alpha, corner, width)
-                store(state, block + LANES, total - load_block(alphas, corner, width) * through)
-                store(state, block + 2 * LANES, red)
-                store(state, block + 3 * LANES, green)
-                store(state, block + 4 * LANES, blue)
-                store(state, block + 5 * LANES, z)
+                simd.store(state, block + simd.LANES, total - load_block(alphas, corner, width) * through)
+                simd.store(state, block + 2 * simd.LANES, red)
+                simd.store(state, block + 3 * simd.LANES, green)
+                simd.store(state, block + 4 * simd.LANES, blue)
+                simd.store(state, block + 5 * simd.LANES, z)
                 continue
-            for lane in range(LANES):
+            for lane in range(simd.LANES):
                 if is_inside(row, column, lane, height, width):
                     pixel = corner + lane // BLOCK * width + lane % BLOCK
                     red, green, blue = colors[pixel], colors[plane + pixel], colors[2 * plane + pixel]
                     total = red * flat_color[pixel] + green * flat_color[plane + pixel]
                     total = total + blue * flat_color[2 * plane + pixel] + depths[pixel] * flat_depth[pixel]
-                    state[block + LANES + lane] = total - alphas[pixel] * (ONE - flat_alpha[pixel])
-                    state[block + 2 * LANES + lane], state[block + 3 * LANES + lane] = red, green
-                    state[block + 4 * LANES + lane], state[block + 5 * LANES + lane] = blue, depths[pixel]
+                    state[block + simd.LANES + lane] = total - alphas[pixel] * (ONE - flat_alpha[pixel])
+                    state[block + 2 * simd.LANES + lane], state[block + 3 * simd.LANES + lane] = red, green
+                    state[block + 4 * simd.LANES + lane], state[block + 5 * simd.LANES + lane] = blue, depths[pixel]
 
 
 @helper
@@ -286,7 +267,7 @@ def row_spans(records, j, log2_min_alpha, top, bottom, width, spans):
         high = min(low + np.float32(BLOCK - 1), extent)
         y = min(max(extreme_y, max(low, -extent)), high)
         scaled = y * records[j, layout.V]
-        half_width = square_root(max(reach - scaled * scaled, ZERO))
+        half_width = simd.square_root(max(reach - scaled * scaled, ZERO))
         end = y * records[j, layout.SHEAR] + half_width * stretch + start
         store_blocks(spans, span_offset(row - top), min(max(end, lowest), highest))
 
@@ -315,8 +296,8 @@ def column_offset(records, j, column):
 @helper
 def alpha_at(exponent, log2_min_alpha, max_alpha):
     """Return 2^exponent, and alpha: the same clamped from above, and zero below the threshold."""
-    value = exp2(exponent)
-    return value, keep(exponent >= log2_min_alpha, min(value, max_alpha))
+    value = simd.exp2(exponent)
+    return value, simd.keep(exponent >= log2_min_alpha, min(value, max_alpha))
 
 
 @helper
@@ -325,52 +306,52 @@ def attenuate(transmittance, alpha, min_transmittance):
     weight = transmittance * alpha
     behind = transmittance - weight
     passes = behind > min_transmittance
-    return keep(passes, weight), keep(passes, behind), passes
+    return simd.keep(passes, weight), simd.keep(passes, behind), passes
 
 
 @helper
 def open_pixels(row, column, height, width, state, offset):
     """Set a new block's transmittances: 1, but 0 for lanes outside the image, which must not keep the block open."""
     if is_whole(row, column, height, width):
-        store(state, offset, splat(ONE))
+        simd.store(state, offset, simd.splat(ONE))
         return
-    for lane in range(LANES):
+    for lane in range(simd.LANES):
         state[offset + lane] = ONE if is_inside(row, column, lane, height, width) else ZERO
 
 
 @helper
 def state_vector(state, offset, channel):
-    return load(state, offset + channel * LANES)
+    return simd.load(state, offset + channel * simd.LANES)
 
 
-@vector_function(types.void)
+@simd.vector_function(types.void)
 def store_blocks(builder, array, offset, vector):
     """Store the block numbers of pixels, truncated to integers, in a flat int32 array."""
-    places = ir.Constant(INTEGERS_IR, [layout.BLOCK_SHIFT] * LANES)
-    blocks = builder.ashr(builder.fptosi(vector, INTEGERS_IR), places)
-    builder.store(blocks, address(builder, array, offset, INTEGERS_IR), align=4)
+    places = ir.Constant(simd.INTEGERS_IR, [layout.BLOCK_SHIFT] * simd.LANES)
+    blocks = builder.ashr(builder.fptosi(vector, simd.INTEGERS_IR), places)
+    builder.store(blocks, simd.address(builder, array, offset, simd.INTEGERS_IR), align=4)
 
 
-@vector_function(VECTOR)
+@simd.vector_function(simd.VECTOR)
 def load_block(builder, array, corner, width):
     """Load 4 x 4 pixels, row-major, of a flat image of this width, from the one at `corner` on."""
     rows = [builder.load(row, align=4) for row in _block_rows(builder, array, corner, width)]
     return _joined(builder, _joined(builder, *rows[:2]), _joined(builder, *rows[2:]))
 
 
-@vector_function(types.void)
+@simd.vector_function(types.void)
 def store_block(builder, array, corner, width, vector):
     """Store 4 x 4 pixels as `load_block` reads them."""
     for y, row in enumerate(_block_rows(builder, array, corner, width)):
-        lanes = ir.Constant(ir.VectorType(I32, BLOCK), [y * BLOCK + x for x in range(BLOCK)])
+        lanes = ir.Constant(ir.VectorType(simd.I32, BLOCK), [y * BLOCK + x for x in range(BLOCK)])
         builder.store(builder.shuffle_vector(vector, vector, lanes), row, align=4)
 
 
 def _block_rows(builder, array, corner, width):
-    firsts = [builder.add(corner, builder.mul(width, ir.Constant(I64, y))) for y in range(BLOCK)]
-    return [address(builder, array, first, ir.VectorType(F32, BLOCK)) for first in firsts]
+    firsts = [builder.add(corner, builder.mul(width, ir.Constant(simd.I64, y))) for y in range(BLOCK)]
+    return [simd.address(builder, array, first, ir.VectorType(simd.F32, BLOCK)) for first in firsts]
 
 
 def _joined(builder, a, b):
     lanes = list(range(2 * a.type.count))
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(simd.I32, len(lanes)), lanes))

@@ -184,10 +184,8 @@ class Drawing:
 
     def draw(self) -> RenderedImages:
         """Project and composite every view."""
-        shape = (self.scenes, self.views)
-        images = RenderedImages(
-            *(np.empty((*shape, channels, self.height, self.width), np.float32) for channels in (3, 1, 1))
-        )
+        shapes = [(self.scenes, self.views, channels, self.height, self.width) for channels in (3, 1, 1)]
+        images = RenderedImages(*(np.empty(shape, np.float32) for shape in shapes))
         parallel(self._prepare, self.scenes)
         for start in range(0, self.scenes * self.views, self.held or 1):
             number = min(self.held, self.scenes * self.views - start)

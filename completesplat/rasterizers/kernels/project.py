@@ -7,53 +7,9 @@ from llvmlite import ir
 from numba.core import types
 
 from completesplat.rasterizers.kernels import array_layout as layout
+from completesplat.rasterizers.kernels import projection, simd
 from completesplat.rasterizers.kernels.compilation import helper, kernel
-from completesplat.rasterizers.kernels.projection import (
-    LN2,
-    ONE,
-    TWO,
-    ZERO,
-    Array,
-    camera_point,
-    covariance_2d,
-    image_jacobian,
-    lane_gaussians,
-    lane_sums_of_view,
-    load_nine,
-    rotation_matrix,
-    row_times_matrix,
-    unit_quaternion,
-    view_gradients,
-)  # fmt: skip
-from completesplat.rasterizers.kernels.simd import (
-    I32,
-    I64,
-    INTEGERS_IR,
-    LANES,
-    VECTOR,
-    VECTOR_IR,
-    add_each,
-    address,
-    all_within,
-    any_lane,
-    choose,
-    columns,
-    gather,
-    in_every_lane,
-    keep_each,
-    load,
-    narrow,
-    scatter,
-    splat,
-    square_root,
-    store,
-    store_columns,
-    transposed,
-    unpack,
-    vector_function,
-    widen,
-    zeros,
-)  # fmt: skip
+from completesplat.rasterizers.kernels.projection import LN2, ONE, TWO, ZERO, Array
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
 
 HALF = np.float64(0.5)
@@ -67,9 +23,9 @@ SMALLEST_DEPTH_BITS = np.float64(2.0**-126).view(np.int64)
 DROPPED_BITS = 8 + 52 - PASSES * RADIX_BITS
 # Columns of the sums over views, after which the chain rule continues for each Gaussian separately.
 COLOR, LOG_OPACITY, MEAN, ROOT, REACHED, TOTALS = 0, 3, 4, 7, 16, 17
-no_totals = zeros(TOTALS)
-gather_one, gather_three, gather_four = gather(1), gather(3), gather(4)
-one_column, four_columns = columns(1), columns(4)
+no_totals = simd.zeros(TOTALS)
+gather_one, gather_three, gather_four = simd.gather(1), simd.gather(3), simd.gather(4)
+one_column, four_columns = simd.columns(1), simd.columns(4)
 
 
 @kernel
@@ -86,17 +42,17 @@ def prepare(
         visible = log2_opacity >= log2_min_alpha and opacities[i] <= LARGEST_FLOAT32
         prepared[layout.LOG2_OPACITY_AND_COLOR, i] = log2_opacity
         prepared[layout.REACH, i] = log2_opacity - log2_min_alpha + layout.SLACK if visible else -ONE
-    for start in range(0, count, LANES):
+    for start in range(0, count, simd.LANES):
         mean = gather_three(means.reshape(-1), 3, 0, start, count)
         quaternion, scale = lane_shapes(quaternions, scales, start, count)
         color = gather_three(colors.reshape(-1), 3, 0, start, count)
-        w, x, y, z, _ = unit_quaternion(widen(quaternion))
-        root = narrow(scaled_columns(rotation_matrix(w, x, y, z), widen(scale)))
-        store_columns(flat, stride, layout.MEAN * stride + start, mean + root)
-        store_columns(flat, stride, (layout.LOG2_OPACITY_AND_COLOR + 1) * stride + start, color)
-        finite = all_within(mean + quaternion + scale + color, LARGEST_FLOAT32)
+        w, x, y, z, _ = projection.unit_quaternion(simd.widen(quaternion))
+        root = simd.narrow(scaled_columns(projection.rotation_matrix(w, x, y, z), simd.widen(scale)))
+        simd.store_columns(flat, stride, layout.MEAN * stride + start, mean + root)
+        simd.store_columns(flat, stride, (layout.LOG2_OPACITY_AND_COLOR + 1) * stride + start, color)
+        finite = simd.all_within(mean + quaternion + scale + color, LARGEST_FLOAT32)
         place = layout.REACH * stride + start
-        store(flat, place, choose(finite, load(flat, place), -ONE))
+        simd.store(flat, place, simd.choose(finite, simd.load(flat, place), -ONE))
 
 
 @helper
@@ -132,41 +88,43 @@ def project(
         The number of visible Gaussians.
     """
     count = 0
-    rotation = load_nine(camera, layout.ROTATION)
+    rotation = projection.load_nine(camera, layout.ROTATION)
     flat, stride = prepared.reshape(-1), prepared.shape[1]
     unsorted_flat, depths = unsorted.reshape(-1), keys[0].view(np.float64)
-    for start in range(0, stride, LANES):
-        mean, root = lane_gaussians(prepared, start)
-        (reach,) = widen(one_column(flat, stride, layout.REACH * stride + start))
-        x, y, z = camera_point(camera, rotation, widen(mean))
+    for start in range(0, stride, simd.LANES):
+        mean, root = projection.lane_gaussians(prepared, start)
+        (reach,) = simd.widen(one_column(flat, stride, layout.REACH * stride + start))
+        x, y, z = projection.camera_point(camera, rotation, simd.widen(mean))
         inside = (reach > ZERO) & (z > near_plane) & (z <= LARGEST_FLOAT32)
-        if not any_lane(inside):
+        if not simd.any_lane(inside):
             continue
         inverse_z = ONE / z
         slope_x, slope_y = x * inverse_z, y * inverse_z
         center_x = camera[layout.FOCAL_X] * slope_x + camera[layout.PRINCIPAL_X]
         center_y = camera[layout.FOCAL_Y] * slope_y + camera[layout.PRINCIPAL_Y]
-        row_x, row_y = image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
-        wide = widen(root)
-        xx, xy, yy, determinant = covariance_2d(row_times_matrix(row_x, wide), row_times_matrix(row_y, wide), blur)
+        row_x, row_y = projection.image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
+        wide = simd.widen(root)
+        xx, xy, yy, determinant = projection.covariance_2d(
+            projection.row_times_matrix(row_x, wide), projection.row_times_matrix(row_y, wide), blur
+        )
         # sigma = ln(2) * reach is an ellipse with these half extents.
-        extent_x, extent_y = square_root(TWO * LN2 * reach * xx), square_root(TWO * LN2 * reach * yy)
+        extent_x, extent_y = simd.square_root(TWO * LN2 * reach * xx), simd.square_root(TWO * LN2 * reach * yy)
         top, bottom = max(center_y - extent_y + HALF, 0.0), min(center_y + extent_y - HALF, height - ONE)
-        inside = inside & all_within((center_x, center_y, xx, yy), LARGEST_PROJECTION) & (top < bottom + ONE)
+        inside = inside & simd.all_within((center_x, center_y, xx, yy), LARGEST_PROJECTION) & (top < bottom + ONE)
         inside = inside & (center_x + extent_x >= HALF) & (center_x - extent_x <= width - HALF)
         inverse_yy = ONE / yy
-        inverse_u = square_root(TWO * LN2 * determinant * inverse_yy)
+        inverse_u = simd.square_root(TWO * LN2 * determinant * inverse_yy)
         # In the order of the records' columns.
-        shape = narrow((center_x, center_y, ONE / inverse_u, xy * inverse_yy, square_root(reach) / extent_y))
+        shape = simd.narrow((center_x, center_y, ONE / inverse_u, xy * inverse_yy, simd.square_root(reach) / extent_y))
         opacity_and_color = four_columns(flat, stride, layout.LOG2_OPACITY_AND_COLOR * stride + start)
-        extents = narrow((z, inverse_u, xy / xx * extent_x, extent_y))
-        rest = (packed_blocks(top, bottom), index_bits(start), splat(ZERO))
+        extents = simd.narrow((z, inverse_u, xy / xx * extent_x, extent_y))
+        rest = (packed_blocks(top, bottom), index_bits(start), simd.splat(ZERO))
         count = append(inside, shape + opacity_and_color + extents + rest, unsorted_flat, z, depths, count)
     radix_sort(depths, keys, order, count)
     records_flat = records.reshape(-1)
     for j in range(count):
         source = np.int64(order[PASSES % 2, j]) * layout.RECORD_WIDTH
-        store(records_flat, j * layout.RECORD_WIDTH, load(unsorted_flat, source))
+        simd.store(records_flat, j * layout.RECORD_WIDTH, simd.load(unsorted_flat, source))
     return count
 
 
@@ -201,32 +159,33 @@ def radix_sort(depths, keys, order, count):
             order[target, position] = order[source, i]
 
 
-@vector_function(VECTOR)
+@simd.vector_function(simd.VECTOR)
 def packed_blocks(builder, first, last):
     """Return, as the bits of int32, the block of each first pixel, and that of each last pixel shifted up."""
-    block_shift, half_word = (ir.Constant(INTEGERS_IR, [bits] * LANES) for bits in (layout.BLOCK_SHIFT, 16))
-    low, high = (builder.ashr(builder.fptosi(pixel, INTEGERS_IR), block_shift) for pixel in (first, last))
-    return builder.bitcast(builder.or_(low, builder.shl(high, half_word)), VECTOR_IR)
+    block_shift, half_word = (ir.Constant(simd.INTEGERS_IR, [bits] * simd.LANES) for bits in (layout.BLOCK_SHIFT, 16))
+    low, high = (builder.ashr(builder.fptosi(pixel, simd.INTEGERS_IR), block_shift) for pixel in (first, last))
+    return builder.bitcast(builder.or_(low, builder.shl(high, half_word)), simd.VECTOR_IR)
 
 
-@vector_function(VECTOR)
+@simd.vector_function(simd.VECTOR)
 def index_bits(builder, start):
     """Return start, ..., start + 15 as the bits of int32."""
-    first = in_every_lane(builder, builder.trunc(start, I32))
-    return builder.bitcast(builder.add(first, ir.Constant(INTEGERS_IR, list(range(LANES)))), VECTOR_IR)
+    first = simd.in_every_lane(builder, builder.trunc(start, simd.I32))
+    return builder.bitcast(builder.add(first, ir.Constant(simd.INTEGERS_IR, list(range(simd.LANES)))), simd.VECTOR_IR)
 
 
-@vector_function(types.int64)
+@simd.vector_function(types.int64)
 def append(builder, mask, vectors, rows, vector, numbers, count):
     """Append lane i of 16 vectors as a row to a flat array, and lane i of `vector` to `numbers`, for i in the mask.
 
     Return the new number of rows. One row beyond them is overwritten.
     """
-    for lane, row in enumerate(transposed(builder, unpack(builder, vectors))):
-        place = ir.Constant(I32, lane)
-        builder.store(row, address(builder, rows, builder.mul(count, ir.Constant(I64, LANES)), VECTOR_IR), align=4)
+    for lane, row in enumerate(simd.transposed(builder, simd.unpack(builder, vectors))):
+        place = ir.Constant(simd.I32, lane)
+        first = builder.mul(count, ir.Constant(simd.I64, simd.LANES))
+        builder.store(row, simd.address(builder, rows, first, simd.VECTOR_IR), align=4)
         builder.store(builder.extract_element(vector, place), builder.gep(numbers, [count], inbounds=True))
-        count = builder.add(count, builder.zext(builder.extract_element(mask, place), I64))
+        count = builder.add(count, builder.zext(builder.extract_element(mask, place), simd.I64))
     return count
 
 
@@ -243,43 +202,43 @@ def project_backward(
         gradients, places: [view band row 16] and [view band lane], written by `composite`.
         first: a multiple of 16.
     """
-    for start in range(first, last, LANES):
+    for start in range(first, last, simd.LANES):
         sums = sum_views(prepared, cameras, blur, gradients, places, start)
         reached = sums[REACHED] > ZERO
         quaternion, scale = lane_shapes(quaternions, scales, start, last)
         opacity = gather_one(opacities, 1, 0, start, last)
-        grad_root = widen(sums[ROOT:REACHED])
-        grad_quaternion, grad_scale = root_backward(widen(quaternion), widen(scale), grad_root)
-        (grad_log_opacity,) = widen(sums[LOG_OPACITY:MEAN])
-        grad_opacity = narrow((grad_log_opacity / widen(opacity)[0],))
-        scatter(grad_colors.reshape(-1), start, last, sums[COLOR:LOG_OPACITY])
-        scatter(grad_means.reshape(-1), start, last, sums[MEAN:ROOT])
-        scatter(grad_opacities, start, last, keep_each(reached, grad_opacity))
-        scatter(grad_quaternions.reshape(-1), start, last, keep_each(reached, narrow(grad_quaternion)))
-        scatter(grad_scales.reshape(-1), start, last, keep_each(reached, narrow(grad_scale)))
+        grad_root = simd.widen(sums[ROOT:REACHED])
+        grad_quaternion, grad_scale = root_backward(simd.widen(quaternion), simd.widen(scale), grad_root)
+        (grad_log_opacity,) = simd.widen(sums[LOG_OPACITY:MEAN])
+        grad_opacity = simd.narrow((grad_log_opacity / simd.widen(opacity)[0],))
+        simd.scatter(grad_colors.reshape(-1), start, last, sums[COLOR:LOG_OPACITY])
+        simd.scatter(grad_means.reshape(-1), start, last, sums[MEAN:ROOT])
+        simd.scatter(grad_opacities, start, last, simd.keep_each(reached, grad_opacity))
+        simd.scatter(grad_quaternions.reshape(-1), start, last, simd.keep_each(reached, simd.narrow(grad_quaternion)))
+        simd.scatter(grad_scales.reshape(-1), start, last, simd.keep_each(reached, simd.narrow(grad_scale)))
 
 
 @helper
 def sum_views(prepared, cameras, blur, gradients, places, start):
-    mean, root = lane_gaussians(prepared, start)
+    mean, root = projection.lane_gaussians(prepared, start)
     results = no_totals()
     for view in range(cameras.shape[0]):
-        sums = lane_sums_of_view(gradients[view], places[view], start)
+        sums = projection.lane_sums_of_view(gradients[view], places[view], start)
         mask = sums[layout.REACHED] > ZERO
-        if not any_lane(mask):
+        if not simd.any_lane(mask):
             continue
-        grad_mean, grad_root = view_gradients(mean, root, cameras[view], blur, sums)
+        grad_mean, grad_root = projection.view_gradients(mean, root, cameras[view], blur, sums)
         parts = (sums[0], sums[1], sums[2], sums[layout.SUM_S]) + grad_mean + grad_root + (sums[layout.REACHED],)  # noqa: RUF005
         # Lanes that are not reached may hold any value, even NaN.
-        results = add_each(results, keep_each(mask, parts))
+        results = simd.add_each(results, simd.keep_each(mask, parts))
     return results
 
 
 @helper
 def root_backward(quaternion, scale, n):
     """Return the gradients of quaternion and scale from the gradient n of root = R(q / |q|) diag(scale)."""
-    w, x, y, z, inverse_norm = unit_quaternion(quaternion)
-    rotation = rotation_matrix(w, x, y, z)
+    w, x, y, z, inverse_norm = projection.unit_quaternion(quaternion)
+    rotation = projection.rotation_matrix(w, x, y, z)
     grad_scale = (
         rotation[0] * n[0] + rotation[3] * n[3] + rotation[6] * n[6],
         rotation[1] * n[1] + rotation[4] * n[4] + rotation[7] * n[7],

@@ -18,9 +18,8 @@ VECTOR_IR, INTEGERS_IR = ir.VectorType(F32, LANES), ir.VectorType(I32, LANES)
 # x + 1.5 * 2^23 has its last bit at 1, so it is rounded to an integer, which sits in the low bits of the sum.
 _ROUNDING_SHIFT = 1.5 * 2**23
 _ROUNDING_BITS = int(np.float32(_ROUNDING_SHIFT).view(np.int32))
-_EXP2_POLYNOMIAL = (
-    np.polynomial.Chebyshev.interpolate(np.exp2, 5, domain=[-0.5, 0.5]).convert(kind=np.polynomial.Polynomial).coef
-)
+_EXP2 = np.polynomial.Chebyshev.interpolate(np.exp2, 5, domain=[-0.5, 0.5])
+_EXP2_POLYNOMIAL = _EXP2.convert(kind=np.polynomial.Polynomial).coef
 
 
 class LanesType(types.Type):

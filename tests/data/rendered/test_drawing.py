@@ -11,6 +11,7 @@ from support import write_capture
 
 from completesplat.data.captures.transforms_json import read_cameras, read_transforms
 from completesplat.data.rendered.drawing import PAINTS, draw_back, draw_cameras, draw_light, draw_surface, room_size
+from completesplat.data.rendered.rendering import find_meshes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.tensors import stack
@@ -135,3 +136,10 @@ def test_paints_have_their_chances_and_no_face_of_the_unit_ball_that_the_first_c
     seen = (normals * (first.centers - points)).sum(-1) > 0
     assert not (away & seen).any()
     assert (away | seen).double().mean() > 0.75  # most of what is not seen is painted
+
+
+def test_an_objects_folder_has_its_name_without_the_suffix_unless_another_file_has_that_name(tmp_path):
+    (tmp_path / "x").mkdir()
+    for name in ("x/box0.obj", "a.b.glb", "a.b.obj", "lamp.GLB"):
+        (tmp_path / name).touch()
+    assert [mesh.name for mesh in find_meshes(tmp_path)] == ["a.b.glb", "a.b.obj", "lamp", "x_box0"]

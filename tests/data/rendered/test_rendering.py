@@ -21,10 +21,8 @@ from completesplat.data.co3d.annotations import read_frames
 from completesplat.data.images.files import read_depth
 from completesplat.data.rendered.blender import find_blender
 from completesplat.data.rendered.drawing import PAINTS
-from completesplat.data.rendered.module import RenderedDataModule
-from completesplat.data.rendered.rendering import render
+from completesplat.data.rendered.rendering import RenderedDataModule, render
 from completesplat.errors import CompleteSplatError
-from completesplat.files import folder_names
 from completesplat.geometry.cameras import Cameras, look_at, pixel_rays, project
 
 pytestmark = pytest.mark.blender
@@ -97,7 +95,7 @@ def saddles(path: Path) -> np.ndarray:
 
 
 def test_the_corners_of_a_checker_cube_are_where_the_cameras_project_them(cube):
-    for frame, camera in zip(frames_of(cube, "cube.obj"), off_center(240, 180), strict=True):
+    for frame, camera in zip(frames_of(cube, "cube"), off_center(240, 180), strict=True):
         assert torch.allclose(frame.camera.world_to_camera, camera.world_to_camera, atol=1e-9)
         assert torch.allclose(frame.camera.intrinsics, camera.intrinsics, atol=1e-6)
         expected, found = crossings(frame.camera), saddles(frame.image)
@@ -107,7 +105,7 @@ def test_the_corners_of_a_checker_cube_are_where_the_cameras_project_them(cube):
 
 
 def test_depth_and_mask_are_those_of_rays_through_the_pixel_centers(cube):
-    for frame in frames_of(cube, "cube.obj"):
+    for frame in frames_of(cube, "cube"):
         camera = frame.camera
         rays = pixel_rays(camera) @ camera.camera_to_world[:3, :3].mT
         bounds = torch.stack([(sign * HALF - camera.centers) / rays for sign in (-1, 1)])
@@ -123,7 +121,7 @@ def test_depth_and_mask_are_those_of_rays_through_the_pixel_centers(cube):
 
 
 def test_place_and_scale_of_the_mesh_are_kept(cube):
-    record = strict_json(cube / "rendered/cube.obj/object.json")
+    record = strict_json(cube / "rendered/cube/object.json")
     assert record["source"] == "cube.obj"
     assert record["scale"] == pytest.approx(HALF / 3, rel=1e-5)
     assert record["center"] == pytest.approx([50, 10, 20], abs=1e-4)  # OBJ's y axis becomes z
@@ -148,13 +146,13 @@ def reasons(tmp_path: Path) -> dict[str, str]:
         **{f"bad.{suffix}": imported for suffix in ("glb", "fbx", "usd", "stl")},
         "bad.ply": "not a point cloud",
         "bad.obj": "no faces",
-        "texture.gltf": "its texture gone.png is missing",
-        "material.obj": "its material file gone.mtl is missing",
+        "texture": "its texture gone.png is missing",
+        "material": "its material file gone.mtl is missing",
         "nan.obj": "it has vertices that are not finite",
         "nan.usda": "it has vertices that are not finite",
         "nan.ply": "it has vertices that are not finite",
-        "point.obj": "all its vertices are in one place",
-        "huge.glb": "2,000 MB, more than max_megabytes=500",
+        "point": "all its vertices are in one place",
+        "huge": "2,000 MB, more than max_megabytes=500",
     }
 
 
@@ -166,7 +164,7 @@ def test_broken_meshes_are_reported_and_left_out(tmp_path, caplog):
     assert broken.keys() == expected.keys()
     assert {name: broken[name] for name in broken if expected[name] not in broken[name]} == {}
     assert all("\n" not in reason and len(reason) < 200 for reason in broken.values())
-    assert [path.name for path in category.iterdir() if path.is_dir()] == ["sub_good.obj"]
+    assert [path.name for path in category.iterdir() if path.is_dir()] == ["sub_good"]
     # What is put right is rendered the next time.
     meshes.write_cube(tmp_path / "meshes/bad.obj")
     render(str(tmp_path / "meshes"), out=tmp_path / "data", **QUICK)
@@ -219,8 +217,8 @@ def test_images_do_not_depend_on_the_other_meshes_or_on_the_number_of_workers(cu
     meshes.write_cube(tmp_path / "meshes/1/cube.obj", half=2)
     meshes.write_cube(tmp_path / "meshes/cube.obj", half=2)
     category = render(str(tmp_path / "meshes"), out=tmp_path / "data", **QUICK | {"workers": 2})
-    assert contents(category / "1_cube.obj") == contents(cubes / "data/rendered/1_cube.obj")
-    images = [(category / name / "images/frame000001.jpg").read_bytes() for name in ("1_cube.obj", "cube.obj")]
+    assert contents(category / "1_cube") == contents(cubes / "data/rendered/1_cube")
+    images = [(category / name / "images/frame000001.jpg").read_bytes() for name in ("1_cube", "cube")]
     assert images[0] != images[1]
 
 
@@ -254,7 +252,7 @@ def test_surroundings_show_the_textures_of_a_folder_and_walls_hide_the_sky(tmp_p
     Image.new("RGB", (8, 8), (200, 0, 0)).save(tmp_path / "red/red.png")
     red, settings = str(tmp_path / "red"), QUICK | {"cameras": "hemisphere"}
     category = render(str(tmp_path / "meshes"), out=tmp_path / "data", **settings | {"floor": red, "wall": red})
-    folder = category / folder_names(["cube.obj"])[0]
+    folder = category / "cube"
     for image, mask in zip(sorted(folder.glob("images/*")), sorted(folder.glob("masks/*")), strict=True):
         pixels = np.asarray(Image.open(image)).astype(float)[np.asarray(Image.open(mask)) == 0]
         assert (pixels[:, 0] > 1.5 * pixels[:, 1:].max(axis=1)).mean() > 0.98
@@ -266,7 +264,7 @@ def test_an_environment_map_lights_object_and_sky(tmp_path):
     (tmp_path / "sky.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 4\n" + 8 * green)
     settings = QUICK | {"light": str(tmp_path / "sky.hdr"), "floor": "none"}
     category = render(str(tmp_path / "meshes"), out=tmp_path / "data", **settings)
-    for image in (category / "cube.obj/images").iterdir():
+    for image in (category / "cube/images").iterdir():
         pixels = np.asarray(Image.open(image)).astype(float)
         bright = pixels[pixels.max(axis=-1) > 60]
         assert len(bright) > 300
@@ -279,7 +277,7 @@ def test_paint_of_the_back_changes_its_pixels_from_behind_and_none_from_the_fron
     folders = {}
     for hidden in ("none", "back", "modes"):
         category = render(str(tmp_path / "meshes"), out=tmp_path / hidden, **settings | {"hidden": hidden})
-        folders[hidden] = category / "cube.obj"
+        folders[hidden] = category / "cube"
     plain, back, modes = folders.values()
     drawn = strict_json(modes / "object.json")["hidden"]
     assert strict_json(plain / "object.json")["hidden"] is None

@@ -74,11 +74,11 @@ def test_a_speck_far_from_the_mesh_is_left_out_and_a_vertex_without_faces_has_no
     speck = "v 25 0 0\nv 25.001 0 0\nv 25 0.001 0\nf 9/1 10/2 11/3\nv 0 900 0\n"
     cube.write_text(cube.read_text() + speck)
     render(str(tmp_path / "meshes"), out=tmp_path / "both", **QUICK)
-    assert "cube.obj: 1 stray faces are left out, far from 99 % of its surface" in caplog.text
-    alone, both = (strict_json(tmp_path / name / "rendered/cube.obj/object.json") for name in ("alone", "both"))
+    assert "cube: 1 stray faces are left out, far from 99 % of its surface" in caplog.text
+    alone, both = (strict_json(tmp_path / name / "rendered/cube/object.json") for name in ("alone", "both"))
     assert (alone["left_out"], both["left_out"]) == (0, 1)
     assert both["scale"] == pytest.approx(1 / np.sqrt(3))
-    clouds = [read_vertices(tmp_path / name / "rendered/cube.obj/pointcloud.ply", "xyz") for name in ("alone", "both")]
+    clouds = [read_vertices(tmp_path / name / "rendered/cube/pointcloud.ply", "xyz") for name in ("alone", "both")]
     assert (clouds[0] == clouds[1]).all()
 
 
@@ -90,6 +90,6 @@ def test_a_thin_part_that_reaches_far_stays(tmp_path):
     pole = "v 0 1 0\nv 0.02 1 0\nv 0.02 4 0\nv 0 4 0\nf 9/1 10/2 11/3 12/4\n"
     cube.write_text(cube.read_text() + pole)
     render(str(tmp_path / "meshes"), out=tmp_path / "data", **QUICK)
-    record = strict_json(tmp_path / "data/rendered/cube.obj/object.json")
+    record = strict_json(tmp_path / "data/rendered/cube/object.json")
     assert record["left_out"] == 0
     assert record["center"] == pytest.approx([0, 0, 1.5], abs=1e-6)

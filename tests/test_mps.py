@@ -1,0 +1,65 @@
+"""What a Mac's GPU computes, on a device that stands in for it: no test has run on a true one."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from fake_mps import MPS, FakeMPS
+from support import round_gaussians
+
+from completesplat.baselines.fitting import scale_of_copies
+from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.metrics.image_sets import frechet_distance, kernel_distance
+from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
+from completesplat.rasterizers.tiled import TiledRasterizer
+
+
+def test_the_device_that_stands_in_refuses_what_mps_refuses():
+    with FakeMPS():
+        there = torch.ones(2).to("mps") * torch.arange(2, device="mps")
+        assert there.device == MPS
+        assert there.cpu().device.type == "cpu"
+        with pytest.raises(TypeError, match="float64"):
+            there.double()
+        with pytest.raises(RuntimeError, match="same device"):
+            there + torch.ones(2)
+        with pytest.raises(TypeError, match="numpy"):
+            there.numpy()
+
+
+def test_the_tiled_rasterizer_draws_gaussians_of_mps_on_the_cpu_with_their_gradients():
+    gaussians = round_gaussians(torch.tensor([[0.1, 0, 2.0], [-0.2, 0.1, 3.0]]), 0.2, 0.8, 0.6)[None]
+    cameras = Cameras(torch.eye(4)[None, None], pinhole(50, 16)[None, None], (16, 16))
+    expected = TiledRasterizer()(gaussians, cameras)
+    means = gaussians.means.clone().requires_grad_()
+    with FakeMPS():
+        color = TiledRasterizer()(replace(gaussians, means=means).to("mps"), cameras.to("mps")).color
+        assert color.device == MPS
+        torch.testing.assert_close(color.cpu(), expected.color, rtol=0, atol=0)
+    (gradient,) = torch.autograd.grad(color.as_subclass(torch.Tensor).square().sum(), means)
+    assert gradient.abs().max() > 0
+
+
+@pytest.mark.parametrize("score", [energy_score, crps, lambda *values: rank_histogram(*values).tolist()])
+def test_scores_of_samples_on_mps_are_those_on_the_cpu(score):
+    samples, truth = torch.rand(5, 12), torch.rand(12)
+    expected = score(samples, truth)
+    with FakeMPS():
+        assert score(samples.to("mps"), truth.to("mps")) == expected
+
+
+@pytest.mark.parametrize("distance", [frechet_distance, kernel_distance])
+def test_distances_of_sets_on_mps_are_those_on_the_cpu(distance):
+    first, second = torch.rand(9, 4), torch.rand(9, 4)
+    expected = distance(first, second)
+    with FakeMPS():
+        assert distance(first.to("mps"), second.to("mps")) == pytest.approx(expected)
+
+
+def test_copies_of_gaussians_on_mps_are_scaled_as_on_the_cpu():
+    opacities, copies = torch.tensor([0.3, 0.9]), torch.tensor([2, 5])
+    expected = scale_of_copies(opacities, copies)
+    with FakeMPS():
+        scales = scale_of_copies(opacities.to("mps"), copies.to("mps"))
+        assert scales.device == MPS
+        torch.testing.assert_close(scales.cpu(), expected)
