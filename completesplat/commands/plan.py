@@ -6,7 +6,7 @@ import math
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -24,9 +24,6 @@ from completesplat.data.loading.data_module import MOST_WORKERS
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
 from completesplat.files import write_json
-from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras
-from completesplat.rasterizers import Rendering
 from completesplat.results.tables import Table, records_table, show
 from completesplat.scene import Batch, SceneBatch
 from completesplat.settings.checks import check_image_size, check_optimizer, each_part, remove_start_weights
@@ -35,21 +32,21 @@ from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.scoring import synchronized_time
 from completesplat.training.stage import Stage
 from completesplat.training.step_counts import Operation, StepCounts, count_step, with_latents
-from completesplat.training.steps import MEBIBYTE, Training, autocast, peak_megabytes, synthetic_batch
+from completesplat.training.steps import MEBIBYTE, Training, peak_megabytes, synthetic_batch
 
 HERE = "this"
 MOST_TIMED = 1e9  # bytes that a timed step may take on a CPU
 UNTIMED_STEPS, TIMED_STEPS, TIMED_BATCHES = 2, 5, 5
 BYTES, DAY = 1e9, 24 * 3600
-GAUSSIANS = 2  # of a pixel
 REMARKS = (
     "An operation takes the longest of its FLOPs, its reads and writes, and its start; the rasterizer a time for each "
     "Gaussian and view. Not counted: exchange of gradients between GPUs, images drawn during training, the test.",
 )
-PAPER = (
-    "The paper's step (6 and 2 days for its stages, on one A100) took {:.2g} times as long. What is left may be views "
-    "that are rendered one after the other, images decoded at full size in every step, float32, or more views of a "
-    "scene: the paper states none of them, nor whether its days include validation."
+PAPER = "The paper's step (6 and 2 days for its stages, on one A100) took {:.1f} times as long."
+MUCH = 1.2  # from which factor on something is left
+LEFT = (
+    "What is left may be views that are rendered one after the other, images decoded at full size in every step, "
+    "float32, or more views of a scene: the paper states none of them, nor whether its days include validation."
 )
 ASSUMED = (
     *("gpu", "devices", "share", "bandwidth_share", "operation_us", "gaussian_ns", "checkpoint_rate"),
@@ -126,21 +123,21 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
     steps, counts, limit = steps_of(config, sequences), count_work(config, batch), memory_limit(config)
     flops, measured, fits = counts.flops * config.devices, None, counts.peak <= limit
     if config.gpu == HERE:
-        seconds, measured, speeds = measure_steps(config, counts, batch)
-        parts = parts_of_step(counts, speeds)
-        parts["measured, not counted"] = seconds * accumulated - sum(parts.values())
+        seconds, measured = measure_steps(config, counts, batch)
+        step = {"steps as timed here": seconds * accumulated}
     else:
-        speeds = speeds_of_gpu(config)
-        parts = parts_of_step(counts, speeds)
-    seconds = sum(parts.values())
-    views, loading = 1 if data.latent_cache is not None else 1 + data.targets, loading_seconds(config)
-    parts |= parts_beside_steps(config, counts, speeds, batch, seconds, loading)
-    rate, total = data.batch_size * views / seconds, sum(filter(None, parts.values()))
+        step = parts_of_step(counts, speeds_of_gpu(config))
+    seconds, loading = sum(step.values()), loading_seconds(config)
+    parts = {**step, **parts_beside_steps(config, counts, batch, seconds, loading)}
+    total, views = sum(filter(None, parts.values())), 1 if data.latent_cache is not None else 1 + data.targets
+    rate = data.batch_size * views / seconds
     processes = math.ceil(rate / config.loading_rate if loading is None else data.batch_size / seconds * loading)
     hours, images = steps * total * config.devices / 3600, sequences * frames
     stored = None if counts.latent_bytes is None else counts.latent_bytes * images / BYTES
     paper = OmegaConf.select(config, f"paper.{config.evaluation.data_set}.seconds_a_step")
     remarks = [*([] if fits else advice(config, counts, batch, limit)), *REMARKS]
+    if paper is not None:
+        remarks += [PAPER.format(paper / total), *([LEFT] if paper > MUCH * total else [])]
     assumed = {key: config[key] for key in ASSUMED}
     return {
         **{"trained_parameters": counts.trained, "frozen_parameters": counts.frozen, "flops_of_a_step": flops},
@@ -153,7 +150,7 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
         **{"steps": steps, "days": steps * total / DAY, "gpu_hours": hours, "price": hours * config.price},
         **{"paper_seconds_a_step": paper, "parts": parts},
         "assumptions": {**assumed, "sequences": sequences, "frames": frames, "precision": precision(config)},
-        "remarks": remarks if paper is None else [*remarks, PAPER.format(paper / total)],
+        "remarks": remarks,
     }
 
 
@@ -182,12 +179,12 @@ def parts_of_step(counts: StepCounts, speeds: Speeds) -> dict[str, float]:
 
 
 def parts_beside_steps(
-    config: DictConfig, counts: StepCounts, speeds: Speeds, batch: int, seconds: float, loading: float | None
+    config: DictConfig, counts: StepCounts, batch: int, seconds: float, loading: float | None
 ) -> dict[str, float | None]:
     """Return the seconds of a step's share of waiting for data, of validation and of checkpoints; None: not counted.
 
-    A validation is taken to need a step's forward pass for the scenes, once for each step of the sampler, and to draw
-    in a third of the time of both passes. A checkpoint holds the weights, the optimizer's state and averages.
+    A validation is taken to need a step's forward pass for its scenes, and one for each step of the sampler. Forward
+    passes take their share of a step's FLOPs. A checkpoint holds the weights, the optimizer's state and averages.
 
     Args:
         batch: scenes of a batch of this process.
@@ -199,13 +196,11 @@ def parts_beside_steps(
     load = None if loading is None else loading * data.batch_size / config.devices / max(workers, 1)
     waiting = load if load is None or workers == 0 else max(0.0, load - seconds)
 
-    scenes = trainer.limit_val_batches * data.evaluation_batch_size
-    part = data.evaluation_batch_size / batch
-    passes = trainer.limit_val_batches * (config.sampler.steps if "completesplat" in config.model else 1)
-    once = sum(seconds_of((Operation(flops * part, size * part) for flops, size in counts.forward), speeds).values())
-    views = data.get("evaluation_targets") or data.get("frames", config.frames) - 1
-    drawn = GAUSSIANS * data.image_size**2 * scenes * views * speeds.drawing / 3
-    validation = (passes * once + drawn) / trainer.val_check_interval
+    forward = seconds * sum(operation.flops for operation in counts.forward) * counts.accumulated / counts.flops
+    passes = config.sampler.steps if "completesplat" in config.model else 1
+    every, batches, validation = trainer.val_check_interval, trainer.limit_val_batches, None
+    if isinstance(every, int) and isinstance(batches, int):  # else shares of an epoch, or without an end
+        validation = passes * forward * batches * data.evaluation_batch_size / (batch * counts.accumulated * every)
 
     size = sum(counts.memory[kind] for kind in ("weights", "optimizer", "averages"))
     by_steps, by_time = checkpoint.get("every_n_train_steps"), checkpoint.get("every_minutes")
@@ -216,8 +211,10 @@ def parts_beside_steps(
 
 def loading_seconds(config: DictConfig) -> float | None:
     """Return the seconds in which one process loads a scene on this machine, or None if there are no data."""
-    folders = [config.data[key] for key in ("root", "latent_cache") if not OmegaConf.is_missing(config.data, key)]
-    if not all(folder is None or Path(folder).is_dir() for folder in folders) or len(folders) < 2:
+    if OmegaConf.is_missing(config.data, "root"):
+        return None
+    folders = [config.data.root, config.data.get("latent_cache")]
+    if not all(Path(folder).is_dir() for folder in folders if folder is not None):
         return None
     data = build({**config.data, "workers": 0}, _convert_="all")
     data.setup("fit")
@@ -316,8 +313,8 @@ def advice(config: DictConfig, counts: StepCounts, batch: int, limit: float) -> 
     return lines or [f"No setting here makes it fit: {reason}."]
 
 
-def measure_steps(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, float | None, Speeds]:
-    """Return the median seconds of real steps here with `batch` scenes, their peak in GB, if known, and the speeds.
+def measure_steps(config: DictConfig, counts: StepCounts, batch: int) -> tuple[float, float | None]:
+    """Return the median seconds of real steps on this machine with `batch` scenes, and their peak in GB, if known.
 
     On a CPU, steps with fewer scenes are timed, and their memory not measured, if a whole batch takes more than 1 GB.
 
@@ -337,39 +334,15 @@ def measure_steps(config: DictConfig, counts: StepCounts, batch: int) -> tuple[f
     inputs: Batch = synthetic_batch(config.data.image_size, scenes, config.data.targets).to(device)
     if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch) and config.data.latent_cache is not None:
         inputs = with_latents(module, inputs)
-    training, drawn, rasterizer = Training(module, precision(config)), [], module.rasterizer
+    training, seconds = Training(module, precision(config)), []
 
-    def keeping(gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        drawn[:] = gaussians, cameras
-        return rasterizer(gaussians, cameras)
-
-    def draw() -> None:
-        gaussians = drawn[0].map(lambda tensor: tensor.detach().requires_grad_())
-        torch.autograd.backward([rasterizer(gaussians, drawn[1]).color.sum()])
-
-    module.rasterizer = keeping
-    seconds = median_seconds(lambda: training.step(inputs))
-    drawing = median_seconds(draw) / (drawn[0].opacities.numel() * drawn[1].intrinsics.shape[1]) if drawn else 0.0
-    growth = peak_megabytes(lambda: training.step(inputs), device)
-    peak = None if growth is None or scenes < batch else (fixed + growth * MEBIBYTE) / BYTES
-    return seconds * batch / scenes, peak, measured_speeds(config, device, drawing)
-
-
-def median_seconds(work: Callable[[], object]) -> float:
-    seconds = []
-    for _ in range(UNTIMED_STEPS + TIMED_STEPS):
+    def step() -> None:
         start = synchronized_time()
-        work()
+        training.step(inputs)
         seconds.append(synchronized_time() - start)
-    return statistics.median(seconds[UNTIMED_STEPS:])
 
-
-def measured_speeds(config: DictConfig, device: torch.device, drawing: float) -> Speeds:
-    """Return this machine's speeds: a 3 x 3 convolution, and sums of 4 MB and of one number."""
-    images, weights = torch.rand(8, 64, 32, 32, device=device), torch.rand(64, 64, 3, 3, device=device)
-    many, one = torch.rand(2**20, device=device), torch.rand(1, device=device)
-    with autocast(device, precision(config)):
-        flops = 2 * 9 * 64 * images.numel() / median_seconds(lambda: torch.conv2d(images, weights, padding=1))
-    bandwidth = 3 * many.nbytes / median_seconds(lambda: many + many)
-    start = median_seconds(lambda: [one + one for _ in range(1000)]) / 1000
-    return Speeds(flops, bandwidth, start, drawing)
+    for _ in range(UNTIMED_STEPS + TIMED_STEPS):
+        step()
+    growth = peak_megabytes(step, device)
+    peak = None if growth is None or scenes < batch else (fixed + growth * MEBIBYTE) / BYTES
+    return statistics.median(seconds[UNTIMED_STEPS:-1]) * batch / scenes, peak

@@ -236,12 +236,12 @@ def count_step(
             latent_bytes = 8 * encoded.mean[0].numel() + part * encoded.condition[0].numel() + 4
             inputs = encoded if cached else inputs
             del encoded
-        passes, memory = _count(Training(module, precision), inputs, live)
+        (forward, backward, update), memory = _count(Training(module, precision), inputs, live)
         memory = {"weights": weights, **memory, "batch": memory["batch"] - weights}
         trained = sum(p.numel() for p in module.parameters() if p.requires_grad)
         frozen = sum(p.numel() for p in module.parameters()) - trained
         drawn = getattr(module.rasterizer, "drawn", 0)
-        return StepCounts(trained, frozen, *passes, accumulated, drawn, memory, latent_bytes)
+        return StepCounts(trained, frozen, forward, backward, update, accumulated, drawn, memory, latent_bytes)
 
 
 def _count(training: Training, inputs: Batch, live: LiveMemory) -> tuple[list[list[Operation]], dict[str, int]]:
