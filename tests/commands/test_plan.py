@@ -106,7 +106,7 @@ def test_the_papers_step_is_beside_ours_where_the_data_are_its(experiment):
 
 def test_data_that_are_here_are_loaded_and_waited_for_if_that_takes_longer(toy_root, tmp_path):
     assert loading_seconds(compose_config("plan", *SMALL, f"data.root={tmp_path / 'absent'}")) is None
-    settings = ["data.batch_size=2", "data.targets=3", "data.workers=2", f"data.root={toy_root}"]
+    settings = ["optimizer=adam", "data.batch_size=2", "data.targets=3", "data.workers=2", f"data.root={toy_root}"]
     config = compose_config("plan", "experiment=toy_var", *settings)
     seconds = loading_seconds(config)
     assert 0 < seconds < 10
