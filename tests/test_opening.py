@@ -78,6 +78,7 @@ def test_without_a_network_a_name_on_the_hub_is_refused_at_once(name, tmp_path, 
     def unknown(*_, **__):
         raise socket.gaierror(-3, "Temporary failure in name resolution")
 
+    caplog.set_level("INFO")
     waits = []
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
