@@ -49,10 +49,10 @@ NEED_BLENDER = ("RENDERS", "ASSET", "RUN40", "RUN41")
 # What they need cannot be made here: Infinigen (`test_rendering` has such commands), CO3D, eight GPUs, VGG16
 # (`test_sweeps` has these two sweeps with a random one), Splatter Image's published weights (`test_published` has
 # made-up ones), images that Python lines of a README write (`test_scene_files` runs them), photos that COLMAP can pose
-# (`test_importing` draws them), published captures, random solids and the weights to start from.
+# (`test_importing` draws them), published captures, random solids, the mixture of things for a GPU (MIX, STORE).
 NEEDS_MORE = ["IMAGES", "SOFA", "COUCH", "SPLATS", "PART1", "TABLE_OF_A", "PHOTOS", "FOX", "MOUSE", "CUP", "FRUITS"]
 NEEDS_MORE += ["FRUIT_TURNS", "ETH80_FRUIT", "RUN7", "evaluation=co3d", "trainer.devices=8", "splatter_image:"]
-NEEDS_MORE += ["model_hydrants.pth", "SHAPES"]
+NEEDS_MORE += ["model_hydrants.pth", "SHAPES", "MIX", "STORE", "RUN90", "TOYS_TEST"]
 TAKES_MINUTES = ["completesplat bench"]
 
 
