@@ -6,13 +6,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from completesplat.metrics import Style
 from completesplat.results.machine import machine
 from completesplat.results.runs import read_record, shell_command
 from completesplat.version import __version__
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
+    from completesplat.metrics import Style
 
 
 def git_commit() -> str | None:
@@ -71,7 +71,7 @@ def protocol(
     return described
 
 
-def described_metric(config: Mapping[str, object], style: Style) -> dict[str, object]:
+def described_metric(config: Mapping[str, object], style: "Style") -> dict[str, object]:
     """Return how an image metric measures; of those that are not in `METRICS`, the config, and `style` for tables."""
     return METRICS.get(str(config["_target_"]), {**config, "style": asdict(style)})
 
