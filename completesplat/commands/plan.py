@@ -90,11 +90,11 @@ def plan_table(plans: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return a table with a column for each plan; several have a total, as for the stages of one recipe."""
     rows: list[dict[str, object]] = []
     plans = {name: {**plan, **written_parts(plan)} for name, plan in plans.items()}
-    for key in [key for key in next(iter(plans.values())) if key not in ("assumptions", "remarks", "parts")]:
-        label = f"price, {next(iter(plans.values()))['assumptions']['currency']}" if key == "price" else key
-        rows.append(
-            {"": label.replace("_", " "), **{name.replace("_", " "): plan[key] for name, plan in plans.items()}}
-        )
+    first = next(iter(plans.values()))
+    labels = {key: key.replace("_", " ") for key in first if key not in ("assumptions", "remarks", "parts")}
+    labels["price"] = f"price, {first['assumptions']['currency']}"
+    for key, label in labels.items():
+        rows.append({"": label, **{name.replace("_", " "): plan[key] for name, plan in plans.items()}})
         if len(plans) > 1:
             rows[-1]["total"] = sum(plan[key] for plan in plans.values()) if key in ADDED else None
     return records_table("completesplat plan", rows)

@@ -70,23 +70,28 @@ class Evaluation:
         candidates = list((sets or {}).values())
         absent = [metric for metric in (*given.values(), *candidates) if isinstance(metric, MissingMetrics)]
         self.missing = {name: str(metric) for metric in absent for name in metric.names}
+        self.samples, self.criterion, self.seed = samples, criterion, seed
+        self._check_settings()
+        self.set_metrics = [
+            metric for metric in candidates if metric is not None and not isinstance(metric, MissingMetrics)
+        ]
+        self.reset()
+
+    def _check_settings(self) -> None:
+        """Raise CompleteSplatError for a metric that cannot be used, or samples that cannot be chosen."""
         for name, metric in self.metrics.items():
             if name in TAKEN or not name.isidentifier():
                 raise CompleteSplatError(f"evaluation.metrics.{name}: choose another name, of letters and digits")
             if not callable(metric):
                 raise CompleteSplatError(f"evaluation.metrics.{name}={metric}: give evaluation.metrics.{name}._target_")
-        if samples < 1:
-            raise CompleteSplatError(f"evaluation.scoring.samples={samples}: must be at least 1")
-        if criterion not in self.metrics:
-            message = self.missing.get(criterion, f"choose one of {', '.join(self.metrics)}")
-            raise CompleteSplatError(f"evaluation.scoring.criterion={criterion}: {message}")
-        if self.styles[criterion].higher_is_better is None:
-            raise CompleteSplatError(f"evaluation.scoring.criterion={criterion}: the metric needs `higher_is_better`")
-        self.samples, self.criterion, self.seed = samples, criterion, seed
-        self.set_metrics = [
-            metric for metric in candidates if metric is not None and not isinstance(metric, MissingMetrics)
-        ]
-        self.reset()
+        if self.samples < 1:
+            raise CompleteSplatError(f"evaluation.scoring.samples={self.samples}: must be at least 1")
+        setting = f"evaluation.scoring.criterion={self.criterion}"
+        if self.criterion not in self.metrics:
+            message = self.missing.get(self.criterion, f"choose one of {', '.join(self.metrics)}")
+            raise CompleteSplatError(f"{setting}: {message}")
+        if self.styles[self.criterion].higher_is_better is None:
+            raise CompleteSplatError(f"{setting}: the metric needs `higher_is_better`")
 
     def reset(self) -> None:
         self.sets = ImageSets(self.set_metrics)

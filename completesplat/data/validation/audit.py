@@ -1,6 +1,6 @@
 """Check of a whole data set: numbers of usable sequences and frames, and reasons for those that are not usable."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -83,12 +83,17 @@ def check(
         for batch in map_in_processes(partial(_read_batch, sources), batches, workers):
             sequences += batch
             bar.advance(task, len(batch))
-    refused += [error for sequence in sequences for error in sequence.refused]
-    explained = {error.sequence for error in refused}
-    short = [s for s in sequences if len(s.usable) < FEWEST_FRAMES and s.name not in explained]
-    refused += [TooFewFrames(f"{len(s.usable)} usable, 2 are needed", sequence=s.name) for s in short]
+    return _report(sources, sequences, refused, splits_share_sequences)
+
+
+def _report(
+    sources: Sources, sequences: Sequence["_Sequence"], refused: list[DataError], splits_share_sequences: bool
+) -> AuditReport:
+    """Return what was found in sequences, which were read, and in sources, which refused some before."""
+    refused = refused + [error for sequence in sequences for error in sequence.refused]
+    refused += _too_short(sequences, {error.sequence for error in refused})
     unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in refused}
-    usable = {split: [s.usable & s.frames.get(split, set()) for s in sequences] for split in sources}
+    usable = {split: [sequence.usable_in(split) for sequence in sequences] for split in sources}
     names = {split: source.names for split, source in sources.items()}
     return AuditReport(
         **_numbers([sequence.usable for sequence in sequences]),
@@ -104,6 +109,11 @@ def _source_errors(source: SequenceSource) -> list[DataError]:
     for reason, names in source.left_out.items():
         errors += [ExcludedSequence(reason, sequence=name) for name in names]
     return [*errors, *source.verify()]
+
+
+def _too_short(sequences: Sequence["_Sequence"], explained: Set[str | None]) -> list[DataError]:
+    short = [s for s in sequences if len(s.usable) < FEWEST_FRAMES and s.name not in explained]
+    return [TooFewFrames(f"{len(s.usable)} usable, 2 are needed", sequence=s.name) for s in short]
 
 
 def show_findings(findings: AuditReport) -> None:
@@ -133,6 +143,9 @@ class _Sequence:
     frames: dict[str, set[int]] = field(default_factory=dict)
     usable: set[int] = field(default_factory=set)
     refused: list[DataError] = field(default_factory=list)
+
+    def usable_in(self, split: str) -> set[int]:
+        return self.usable & self.frames.get(split, set())
 
 
 def _batches(sources: Sources) -> list[_Batch]:
