@@ -92,7 +92,8 @@ def plan_table(plans: Mapping[str, Mapping[str, Any]]) -> Table:
     plans = {name: {**plan, **written_parts(plan)} for name, plan in plans.items()}
     first = next(iter(plans.values()))
     labels = {key: key.replace("_", " ") for key in first if key not in ("assumptions", "remarks", "parts")}
-    labels["price"] = f"price, {first['assumptions']['currency']}"
+    if "price" in labels:
+        labels["price"] += f", {first['assumptions']['currency']}"
     for key, label in labels.items():
         rows.append({"": label, **{name.replace("_", " "): plan[key] for name, plan in plans.items()}})
         if len(plans) > 1:
