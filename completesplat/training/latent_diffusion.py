@@ -20,7 +20,7 @@ from completesplat.scene import Batch, SceneBatch
 from completesplat.settings.schema import Natural, Positive, Share
 from completesplat.training.encoding import check_cache
 from completesplat.training.scoring import Scorer
-from completesplat.training.stage import Stage, prepare_network
+from completesplat.training.stage import Compile, Stage, prepare_network
 from completesplat.weights.checkpoint_reading import load_part
 
 LOSS_BUCKETS = 4
@@ -108,7 +108,7 @@ class LatentDiffusion(DiffusionScorer, Stage):
         color_fits: Natural = 0,
         scale_batches: Positive = 50,
         channels_last: bool = False,
-        compile: bool = False,
+        compile: Compile = False,
         **rendering_and_optimization: Any,
     ) -> None:
         super().__init__(completesplat, **rendering_and_optimization)

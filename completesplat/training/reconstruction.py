@@ -22,7 +22,7 @@ from completesplat.scene import SceneBatch, Views
 from completesplat.scene_model import camera_tensors
 from completesplat.splatter_image import SplatterImage
 from completesplat.training.scoring import Scorer
-from completesplat.training.stage import Stage, prepare_network
+from completesplat.training.stage import Compile, Stage, prepare_network
 from completesplat.weights import CAMERA
 from completesplat.weights.checkpoint_reading import load_part
 
@@ -78,7 +78,7 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         checkpoint: str | None = None,
         masked: bool = False,
         channels_last: bool = False,
-        compile: bool = False,
+        compile: Compile = False,
         **rendering_and_optimization: Any,
     ) -> None:
         super().__init__(model, **rendering_and_optimization)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import torch
 from hydra.utils import instantiate
@@ -28,12 +28,16 @@ from completesplat.training.scoring import Scorer
 from completesplat.weights.checkpoint_reading import load_part, read_checkpoint
 
 
-def prepare_network(network: nn.Module, channels_last: bool, compile: bool) -> torch.memory_format:
+# "cudagraphs" also records a call's operations on a GPU, to start them at once.
+Compile = Literal[False, True, "cudagraphs"]
+
+
+def prepare_network(network: nn.Module, channels_last: bool, compile: Compile) -> torch.memory_format:
     """Order convolution weights in NHWC, or compile on the first call; return the order that images should have."""
     if channels_last:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if compile:
-        network.compile()
+        network.compile(mode="reduce-overhead" if compile == "cudagraphs" else "default")
     return torch.channels_last if channels_last else torch.contiguous_format
 
 

@@ -175,10 +175,11 @@ def test_channels_last_is_the_same_training(monkeypatch):
     torch.testing.assert_close(result[1][1], result[0][1], atol=1e-4, rtol=1e-3)
 
 
-def test_a_compiled_denoiser_keeps_its_keys_and_runs_what_the_compiler_returns(monkeypatch):
+@pytest.mark.parametrize(("compile", "mode"), [(True, "default"), ("cudagraphs", "reduce-overhead")])
+def test_a_compiled_denoiser_keeps_its_keys_and_runs_what_the_compiler_returns(monkeypatch, compile, mode):
     compiled = []
-    monkeypatch.setattr(torch, "compile", lambda call, **_: lambda *inputs: compiled.append(1) or call(*inputs))
-    module, _ = module_of(monkeypatch, compile=True)
+    monkeypatch.setattr(torch, "compile", lambda call, mode: lambda *inputs: compiled.append(mode) or call(*inputs))
+    module, _ = module_of(monkeypatch, compile=compile)
     assert module.state_dict().keys() == module_of(monkeypatch)[0].state_dict().keys()
     module.training_step(scenes(), 0)
-    assert compiled == [1]
+    assert compiled == [mode]
