@@ -27,7 +27,6 @@ from completesplat.settings.schema import Share
 from completesplat.training.scoring import Scorer
 from completesplat.weights.checkpoint_reading import load_part, read_checkpoint
 
-
 # "cudagraphs" also records a call's operations on a GPU, to start them at once.
 Compile = Literal[False, True, "cudagraphs"]
 
