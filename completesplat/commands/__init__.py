@@ -60,7 +60,7 @@ def launch(verb: str, arguments: list[str]) -> None:
 
     def job(config: DictConfig) -> float | None:
         try:
-            with jobs.hold_job_lock(Path(HydraConfig.get().runtime.output_dir)):
+            with jobs.hold_job_lock(*jobs.job_folders(config)):
                 return jobs.run_job(verb, config, program, original)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from completesplat.commands.trained import open_generator, shown_background
 from completesplat.data.images.photograph import Photograph, outside_of_box, outside_of_mask
-from completesplat.data.validation.processes import map_in_processes
+from completesplat.data.validation.processes import map_in_processes, share_of
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
@@ -66,8 +66,7 @@ def run(config: DictConfig, out: Path) -> None:
     images = find_images(config.image)
     if config.mask is not None and len(images) > 1:
         raise CompleteSplatError("mask=FILE belongs to one image; box=[x0,y0,x1,y1] goes for several")
-    if config.shard >= config.shards:
-        raise CompleteSplatError(f"shard={config.shard}: the last of shards={config.shards} is {config.shards - 1}")
+    share_of(images, config.shard, config.shards)  # refuses a shard that does not exist
     if config.cameras is not None:
         return predict_from_views(config, images, wanted, out)
     start, threads = time.perf_counter(), max(1, torch.get_num_threads() // config.devices)
@@ -94,8 +93,9 @@ def predict_share(
         torch.set_num_threads(threads)
         if torch.cuda.is_available():
             torch.cuda.set_device(process % torch.cuda.device_count())
-    mine = slice(config.shard + config.shards * process, None, config.shards * config.devices)
-    photos = [*zip(images, (out / name for name in folder_names(image.stem for image in images)), strict=True)][mine]
+    folders = (out / name for name in folder_names(image.stem for image in images))
+    photos = [*zip(images, folders, strict=True)]
+    photos = share_of(photos, config.shard + config.shards * process, config.shards * config.devices)
     if not photos:
         return 0, []
     model = open_generator(config, images)

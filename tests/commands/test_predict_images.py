@@ -188,10 +188,10 @@ def test_shards_are_each_image_once_and_names_do_not_depend_on_them(predict, tmp
         save(tmp_path / place)
     images = f"[{tmp_path / 'x'},{tmp_path / 'y'}]"
     assert "1/2 a.png" in predict(images, "shard=0", "shards=2").out
-    assert sorted(path.name for path in (tmp_path / "out").glob("*/")) == ["a", "a_2"]
+    assert sorted(path.name for path in (tmp_path / "out").glob("*/")) == ["a", "a_2", "shard-0"]
     assert "1/1 b.png" in predict(images, "shard=1", "shards=2").out
     assert predict(images, "shard=3", "shards=4").status == 0  # nothing is left for it
-    assert "shard=2: the last of shards=2 is 1" in predict(images, "shard=2", "shards=2").err
+    assert "shard=2: must lie between 0 and 1, for shards=2" in predict(images, "shard=2", "shards=2").err
 
 
 @pytest.mark.processes
