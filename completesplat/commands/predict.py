@@ -98,7 +98,7 @@ def predict_share(
     photos = share_of(photos, config.shard + config.shards * process, config.shards * config.devices)
     if not photos:
         return 0, []
-    model = open_generator(config, images)
+    model = open_generator(config, images, announced=process == 0)
     waiting = [(image, folder) for image, folder in photos if not is_predicted(folder, config, model, image)]
     if len(waiting) < len(photos):
         before = f"{len(photos) - len(waiting)} of {len(photos)} images: predicted before by the same settings"
@@ -261,7 +261,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Outpu
     model = open_generator(config, images)
     views = read_photographs(images, Path(config.cameras), model.image_size)
     views = replace(views, cameras=model.in_model_units(views.cameras))
-    scene = model.reconstruct(views)
+    scene = model.reconstruct(views).to("cpu")
     recorded = {
         "seed": config.seed,
         "image": printable(images[0].name),
@@ -273,7 +273,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Outpu
     }
     wanted = replace(wanted, background=shown_background(config.background, model))
     rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / safe_name(images[0].stem)
-    shot = Shot(scene, views.cameras[0], model.up)
+    shot = Shot(scene, views.cameras[0], model.up.cpu())
     write_prediction(folder, views.images[0], [shot], rasterizer, wanted, recorded, partial(print, flush=True))
     print(f"one scene of {len(images)} images, at the posterior's mean: {folder}")
 
@@ -318,10 +318,10 @@ def _predict(
     if config.background == REMOVE:
         recorded["background"] = REMOVE
     visible_image = photograph.image if visible is None else photograph.image * visible
-    camera = model.camera(photograph)
+    camera, up = model.camera(photograph).to("cpu"), model.up.cpu()
     if model.background is not None:  # images of objects, whose centre is in the middle of the depth range
         wanted = replace(wanted, pivot_depth=model.middle_depth(model.depth_range_of(photograph)))
-    shots = [Shot(scene, camera, model.up) for scene in scenes]
+    shots = [Shot(scene.to("cpu"), camera, up) for scene in scenes]
     write_prediction(folder, visible_image, shots, rasterizer, wanted, recorded, begin)
 
 

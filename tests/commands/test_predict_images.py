@@ -16,9 +16,11 @@ from PIL import Image
 from rich.progress import Progress
 from support import compose_config, some_gaussians, strict_json
 
+from completesplat.commands import trained
 from completesplat.commands.predict import find_images, output_files, photo_warnings, run, unusual_field_of_view
 from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
+from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.generator import CompleteSplat
 
@@ -207,6 +209,20 @@ def test_two_processes_predict_each_image_once_and_go_on_after_one_failed(comman
     )
     assert re.search(r"^3 photos in \d+ s by 2 process\(es\): [\d.]+ a minute$", finished.out, re.M)
     assert {path.parent.name for path in (tmp_path / "out").glob("*/scene.json")} == {"a", "c", "d"}
+
+
+@pytest.mark.gpu
+def test_a_prediction_on_a_gpu_is_that_on_the_cpu_up_to_rounding(command, tiny_weights, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+    given = [f"image={save(tmp_path / 'a.png')}", f"weights={tiny_weights}", "samples=2", "steps=2", "color_fits=0"]
+    command.succeeds("predict", *given, "video=[]", f"out={tmp_path / 'gpu'}")
+    assert torch.cuda.max_memory_allocated() > 0
+    monkeypatch.setattr(trained, "used_device", lambda: "cpu")
+    command.succeeds("predict", *given, "video=[]", f"out={tmp_path / 'cpu'}")
+    for sample in range(2):
+        gpu, cpu = (read_gaussians(tmp_path / device / f"a/sample_{sample:02}.ply") for device in ("gpu", "cpu"))
+        torch.testing.assert_close(gpu.means, cpu.means, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(gpu.colors, cpu.colors, rtol=1e-3, atol=1e-3)
 
 
 def test_if_all_fail_nothing_is_said_to_be_left(predict, command, tmp_path):
