@@ -27,7 +27,7 @@ EXTRAS = {
     "cuda": "to draw on an NVIDIA GPU",
     "view": "to show scenes in a browser",
     "background": "to cut objects out of photos",
-    "grabcut": "to cut them out by colour, without a download",
+    "grabcut": "to cut them out roughly, by colour, without a download",
     "mesh": "to write meshes",
     "colmap": "to find cameras of photos, to read captures whose lens distorts",
     "slurm": "to spread sweeps over a cluster",

@@ -45,12 +45,7 @@ FAR = 1.5  # ratio of tan(fov / 2), photo to training, from which a warning is g
 UNLIKE = 2.0  # distance from the training images (`distance_to_training`) from which a warning is given
 sha256_of_weights = cache(sha256_of)  # a process has one model, of up to gigabytes
 RESIZING = 0.1  # change of a distance that resizing to another model's size and back may cause
-# The network has 56.4 million numbers in float32; its authors' checkpoint may hold more.
-ELSEWHERE = (
-    "; for an object try weights=splatter_image:objaverse background=remove (MIT, downloads at least 226 MB) or"
-    " github.com/VAST-AI-Research/TripoSplat (MIT), for a scene github.com/apple/ml-sharp (weights for research only);"
-    " view and test scenes= read the PLY files of both projects"
-)
+ELSEWHERE = "for objects weights=splatter_image:objaverse (226 MB), for scenes github.com/apple/ml-sharp"
 
 log = logging.getLogger(__name__)
 
@@ -203,7 +198,7 @@ def predict_images(
                 failed.append(name)
             elif bar.disable:
                 seconds = f"{time.perf_counter() - start:.0f} s"
-                print(f"{index + 1}/{len(photos)} {name}: {folder} ({seconds})", flush=True)
+                print(f"{index + 1}/{len(photos)} {name}: {folder.name}/ ({seconds})", flush=True)
             bar.update(task, completed=(index + 1) * steps)
     return len(photos) - len(failed), failed
 
@@ -291,8 +286,8 @@ def _predict(
         begin("removing the background", advance=0)
     photograph = model.read(image, config.fov, config.background == REMOVE)
     visible = visible_part(config, image, model.image_size)
-    if warnings := photo_warnings(photograph, model, whole=visible is None):
-        log.warning("%s: %s", printable(image.name), "; ".join(warnings))
+    for warning in photo_warnings(photograph, model, whole=visible is None):
+        log.warning("%s: %s", printable(image.name), warning)
     settings = {name: config[name] for name in ("samples", "seed", "color_fits")}
     sampler = {}
     if isinstance(model, CompleteSplat):
@@ -326,15 +321,14 @@ def _predict(
 
 
 def photo_warnings(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]:
-    """Return warnings about a photo that is unlike the training images; its contents are compared only if `whole`."""
+    """Return lines about a photo that is unlike the training images; its contents are compared only if `whole`."""
     moves = "depth_before" in (model.architecture.get("training") or {})  # the depth range, by the field of view
     warnings = [None if moves else unusual_field_of_view(photograph, model.fov_degrees.item())]
     distance = distance_to_training(photograph, model.architecture) if whole else None
     if distance is not None and distance > UNLIKE:
-        warnings.append(
-            f"colours, contrast or detail lie {distance:.1f} standard deviations from the training images'"
-            f" ({UNLIKE:g} is far): expect little of it in the scenes{nearer_weights(photograph, distance)}"
-        )
+        far = f"{distance:.1f} standard deviations, {UNLIKE:g} is far"
+        warnings.append(f"unlike the training images ({far}): expect little of it in the scenes")
+        warnings.append(nearer_weights(photograph, distance))
     return [warning for warning in warnings if warning]
 
 
@@ -342,8 +336,8 @@ def nearer_weights(photograph: Photograph, distance: float) -> str:
     """Name the shipped weights whose training images are nearer to a photo, and `ELSEWHERE` if these are far, too."""
     name, other = next(iter(distances_to_shipped(photograph.image).items()), ("", math.inf))
     nearer = other < distance - RESIZING
-    nearest = f"; weights={name} were trained on images that are nearer ({other:.1f})" if nearer else ""
-    return nearest + (ELSEWHERE if min(other, distance) > UNLIKE else "")
+    lines = [f"weights={name} are nearer ({other:.1f})"] if nearer else []
+    return "; ".join([*lines, ELSEWHERE] if min(other, distance) > UNLIKE else lines)
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:

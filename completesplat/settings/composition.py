@@ -28,6 +28,7 @@ from completesplat.settings.options import LEAST_LIKE, conf_folder, did_you_mean
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 NOT_THERE = re.compile(r"Could not override '([^']+)'")
 LONGEST_NAME = 120
+PARTS_OF_STAGES = {"autoreconstructor", "regressor", "conditioning", "denoiser", "sampler", "objective"}
 
 
 class SettingsOfWorkingFolder(SearchPathPlugin):
@@ -70,6 +71,17 @@ def _composed(verb: str, overrides: Sequence[str] = ()) -> DictConfig:
 def resolved_settings(config: DictConfig) -> dict[str, object]:
     """Return a config as a plain mapping without references."""
     return cast(dict[str, object], OmegaConf.to_container(config, resolve=True))
+
+
+def without_unused_parts(config: DictConfig) -> DictConfig:
+    """Return a config without those `PARTS_OF_STAGES` to which no other part refers."""
+    texts = {key: OmegaConf.to_yaml(OmegaConf.create({key: config._get_node(key)})) for key in map(str, config)}
+    used = waiting = texts.keys() - PARTS_OF_STAGES
+    while waiting:
+        named = {name for key in waiting for name in re.findall(r"\$\{(\w+)", texts[key])}
+        waiting = (named & texts.keys()) - used
+        used |= waiting
+    return OmegaConf.masked_copy(config, [key for key in texts if key in used])
 
 
 @contextmanager

@@ -260,9 +260,10 @@ def test_a_photo_unlike_the_training_images_gets_a_warning_that_names_nearer_wei
 ):
     model = model_with(tiny_weights, picture_mean=[1.0, 0, 0, 0, 0, 0, 0, 0], picture_std=[0.1] * 8)
     red, blue = (model.read(save(tmp_path / f"{color}.png", color), 15) for color in ("red", "blue"))
-    fov, unlike = photo_warnings(blue, model, whole=True)
+    fov, unlike, elsewhere = photo_warnings(blue, model, whole=True)
     assert "field of view is 15" in fov
-    assert unlike.startswith("colours, contrast or detail lie 5.0 standard deviations from the training images'")
+    assert unlike.startswith("unlike the training images (5.0 standard deviations, 2 is far): ")
+    assert max(len(unlike), len(elsewhere)) <= 125
     assert len(photo_warnings(red, model, whole=True)) == len(photo_warnings(blue, model, whole=False)) == 1
     assert len(photo_warnings(blue, model_with(tiny_weights), whole=True)) == 1  # nothing is known of the training
     folders = {}
@@ -272,15 +273,11 @@ def test_a_photo_unlike_the_training_images_gets_a_warning_that_names_nearer_wei
         training = {} if mean is None else {"picture_mean": mean + [0.0] * 5, "picture_std": [0.1] * 8}
         (folders[name] / "config.json").write_text(json.dumps({"image_size": 24, "training": training}))
     monkeypatch.setattr("completesplat.scene_model.shipped", lambda: folders)
-    assert photo_warnings(blue, model, whole=True)[1].endswith(
-        "; weights=blues were trained on images that are nearer (0.0)"
-    )
+    assert photo_warnings(blue, model, whole=True)[2] == "weights=blues are nearer (0.0)"
     monkeypatch.setattr("completesplat.scene_model.shipped", lambda: {"reds": folders["reds"]})
-    unlike = photo_warnings(blue, model, whole=True)[1]
-    near, elsewhere = unlike.partition("expect little of it in the scenes; ")[2].split("; ", 1)
-    assert near == "weights=reds were trained on images that are nearer (4.8)"  # but not near
-    others = "weights=splatter_image:objaverse background=remove (MIT, ", "TripoSplat", "github.com/apple/ml-sharp"
-    assert all(name in elsewhere for name in others)
+    near, elsewhere = photo_warnings(blue, model, whole=True)[2].split("; ", 1)
+    assert near == "weights=reds are nearer (4.8)"  # but not near
+    assert all(name in elsewhere for name in ("weights=splatter_image:objaverse", "github.com/apple/ml-sharp"))
 
 
 def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):

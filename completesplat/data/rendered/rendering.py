@@ -223,7 +223,7 @@ def _write_lists(category: Path, objects: Sequence[Asset], broken: dict[str, str
         raise DataError(f"none of {len(broken)} objects can be rendered: {next(iter(broken.values()))}", str(category))
     frames = [frame for record in records for frame in record["frames"]]
     writing.write_annotations(category, frames, [record["sequence"] for record in records])
-    logger.info("%d objects in %s, %d left out", len(records), category, len(broken))
+    logger.info("%d objects in %s/, %d left out", len(records), CATEGORY, len(broken))
 
 
 def _in_threads(
