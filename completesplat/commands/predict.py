@@ -89,8 +89,8 @@ def predict_share(
         if torch.cuda.is_available():
             torch.cuda.set_device(process % torch.cuda.device_count())
     folders = (out / name for name in folder_names(image.stem for image in images))
-    photos = [*zip(images, folders, strict=True)]
-    photos = share_of(photos, config.shard + config.shards * process, config.shards * config.devices)
+    pairs, count = [*zip(images, folders, strict=True)], config.shards * config.devices
+    photos = share_of(pairs, config.shard + config.shards * process, count)
     if not photos:
         return 0, []
     model = open_generator(config, images, announced=process == 0)
