@@ -97,7 +97,7 @@ def predict_share(
     waiting = [(image, folder) for image, folder in photos if not is_predicted(folder, config, model, image)]
     if len(waiting) < len(photos):
         before = f"{len(photos) - len(waiting)} of {len(photos)} images: predicted before by the same settings"
-        print(f"{before}; to repeat one, remove its folder in {out}", flush=True)
+        print(f"{before}; to repeat one, remove its folder", flush=True)
     return predict_images(config, model, waiting, wanted)
 
 
@@ -270,7 +270,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Outpu
     rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / safe_name(images[0].stem)
     shot = Shot(scene, views.cameras[0], model.up.cpu())
     write_prediction(folder, views.images[0], [shot], rasterizer, wanted, recorded, partial(print, flush=True))
-    print(f"one scene of {len(images)} images, at the posterior's mean: {folder}")
+    print(f"one scene of {len(images)} images, at the posterior's mean: {folder.name}/")
 
 
 def _predict(
