@@ -75,7 +75,8 @@ def resolved_settings(config: DictConfig) -> dict[str, object]:
 
 def without_unused_parts(config: DictConfig) -> DictConfig:
     """Return a config without those `PARTS_OF_STAGES` to which no other part refers."""
-    texts = {key: OmegaConf.to_yaml(OmegaConf.create({key: config._get_node(key)})) for key in map(str, config)}
+    plain = cast(dict[str, object], OmegaConf.to_container(config, resolve=False))
+    texts = {key: str(value) for key, value in plain.items()}
     used = waiting = texts.keys() - PARTS_OF_STAGES
     while waiting:
         named = {name for key in waiting for name in re.findall(r"\$\{(\w+)", texts[key])}
