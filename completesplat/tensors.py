@@ -23,6 +23,12 @@ def in_float32() -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
+def used_device() -> str:
+    """Return where networks compute: "cuda", or else "mps", if torch has one, else "cpu"."""
+    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    return next(name for name, here in available.items() if here)
+
+
 def as_float64(tensor: Tensor) -> Tensor:
     """Return a tensor in float64; on the CPU if it was on Apple's MPS, which has no float64."""
     return (tensor.cpu() if tensor.device.type == "mps" else tensor).double()

@@ -43,7 +43,9 @@ class FakeMPS(TorchFunctionMode):
             kwargs["device"], here = "cpu", True
         elif here and func not in MIXED and any(type(x) is Tensor and x.dim() for x in tensors):
             raise RuntimeError("Expected all tensors to be on the same device, but found at least two: mps:0 and cpu")
-        values = func(*tree_map_only(Tensor, _plain, args), **tree_map_only(Tensor, _plain, kwargs))
+        if func is not torch.autograd.grad:  # which needs the tensors of the graph themselves
+            args, kwargs = tree_map_only(Tensor, _plain, (args, kwargs))
+        values = func(*args, **kwargs)
         return tree_map_only(Tensor, lambda value: self._placed(value, here), values)
 
     @staticmethod

@@ -5,9 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 from fake_mps import MPS, FakeMPS
+from packed_sequences import contents
+from PIL import Image
 from support import round_gaussians
 
 from completesplat.baselines.fitting import scale_of_copies
+from completesplat.commands import trained
+from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.metrics.image_sets import frechet_distance, kernel_distance
 from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
@@ -63,3 +67,23 @@ def test_copies_of_gaussians_on_mps_are_scaled_as_on_the_cpu():
         scales = scale_of_copies(opacities.to("mps"), copies.to("mps"))
         assert scales.device == MPS
         torch.testing.assert_close(scales.cpu(), expected)
+
+
+def test_a_prediction_with_networks_on_mps_has_the_files_of_the_cpu(command, tiny_weights, tmp_path, monkeypatch):
+    image = tmp_path / "a.png"
+    Image.fromarray((torch.rand(32, 32, 3) * 255).byte().numpy()).save(image)
+    given = [f"image={image}", f"weights={tiny_weights}", "samples=2", "frames=2", "steps=2", "color_fits=2"]
+    command.succeeds("predict", *given, "maps=true", f"out={tmp_path / 'cpu'}")
+    monkeypatch.setattr(trained, "used_device", lambda: "mps")
+    overwrite = torch.__future__.get_overwrite_module_params_on_conversion()
+    torch.__future__.set_overwrite_module_params_on_conversion(True)  # else parameters keep their class
+    seen = []
+    generate = CompleteSplat.generate
+    monkeypatch.setattr(CompleteSplat, "generate", lambda *x, **y: seen.append(generate(*x, **y)) or seen[-1])
+    try:
+        with FakeMPS():
+            command.succeeds("predict", *given, "maps=true", f"out={tmp_path / 'mps'}")
+            assert [scenes.means.device for scenes in seen] == [MPS]
+    finally:
+        torch.__future__.set_overwrite_module_params_on_conversion(overwrite)
+    assert contents(tmp_path / "mps/a") == contents(tmp_path / "cpu/a")

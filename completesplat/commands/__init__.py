@@ -20,7 +20,13 @@ from completesplat.errors import CompleteSplatError
 from completesplat.files import file_refusal
 from completesplat.settings import help
 from completesplat.settings.arguments import SWEEP, behind_dashes, for_hydra
-from completesplat.settings.composition import compose, nearest_names, sweep_arguments, use_working_folder
+from completesplat.settings.composition import (
+    compose,
+    nearest_names,
+    sweep_arguments,
+    use_working_folder,
+    without_unused_parts,
+)
 from completesplat.settings.options import conf_folder
 from completesplat.signals import end_with, ended_by_signals
 
@@ -53,6 +59,9 @@ def launch(verb: str, arguments: list[str]) -> None:
     # Logging stays silent on a full disk, because the next file that is written reports it in one line.
     logging.raiseExceptions = False
     arguments = for_hydra(verb, arguments)
+    if verb == "fit" and [text for text in arguments if text.startswith("-")] in (["--cfg=job"], ["-c=job"]):
+        settings = [text for text in arguments if not text.startswith("-")]
+        return print(OmegaConf.to_yaml(without_unused_parts(compose(verb, *settings))))
     sweep = any(flag in arguments for flag in SWEEP)
     _check_together(arguments, sweep)
     sys.argv = [f"completesplat {verb}", *arguments, *(sweep_arguments(verb, arguments) if sweep else [])]
@@ -60,7 +69,7 @@ def launch(verb: str, arguments: list[str]) -> None:
 
     def job(config: DictConfig) -> float | None:
         try:
-            with jobs.hold_job_lock(Path(HydraConfig.get().runtime.output_dir)):
+            with jobs.hold_job_lock(*jobs.job_folders(config)):
                 return jobs.run_job(verb, config, program, original)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:

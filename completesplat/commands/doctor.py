@@ -27,16 +27,16 @@ EXTRAS = {
     "cuda": "to draw on an NVIDIA GPU",
     "view": "to show scenes in a browser",
     "background": "to cut objects out of photos",
-    "grabcut": "to cut them out by colour, without a download",
+    "grabcut": "to cut them out roughly, by colour, without a download",
     "mesh": "to write meshes",
     "colmap": "to find cameras of photos, to read captures whose lens distorts",
     "slurm": "to spread sweeps over a cluster",
     "perceptual": "to train on perceptual features without a download",
 }
 DEVICES = {
-    "cuda": "networks and splats of all verbs but predict, which computes its networks on the CPU",
-    "mps": "networks of fit, test and data latents, whose splats the CPU draws (tiled); all else runs on the CPU. Not"
-    " run yet; PYTORCH_ENABLE_MPS_FALLBACK=1 has the CPU compute what MPS lacks",
+    "cuda": "networks and splats of all verbs",
+    "mps": "networks of all verbs but report, whose splats the CPU draws (tiled). Not run yet;"
+    " PYTORCH_ENABLE_MPS_FALLBACK=1 has the CPU compute what MPS lacks",
     "cpu": "all networks and splats",
 }
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
@@ -110,6 +110,7 @@ def check_device() -> Iterator[Finding]:
 
     from completesplat.rasterizers.selection import FASTER, failure
     from completesplat.results.machine import machine
+    from completesplat.tensors import used_device
 
     yield Finding("CPU", "yes", f"{machine()['processor']}, {os.cpu_count()} cores")
     waits = [f"{name}={os.environ[name]}" for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY") if name in os.environ]
@@ -121,8 +122,7 @@ def check_device() -> Iterator[Finding]:
         built = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
         reason = f"torch {torch.__version__}, built {built}, finds none (nvidia-smi shows the driver's)"
         yield Finding("GPU", "no", f"{reason}; all works on the CPU, slower")
-    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    device = next(name for name, here in available.items() if here)
+    device = used_device()
     yield Finding("used device", "yes", f"{device}: {DEVICES[device]}")
     for name in FASTER:
         fault = failure(name, None)

@@ -26,7 +26,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.files import UNFINISHED, atomic_path, write_bytes, write_json, writing
 from completesplat.imports import importing, postponing
 from completesplat.settings.checks import check_verb
-from completesplat.settings.composition import resolved_settings, use_working_folder
+from completesplat.settings.composition import resolved_settings, shard_folder, use_working_folder
 from completesplat.settings.options import did_you_mean
 from completesplat.signals import Interrupted, ended_by_signals
 from completesplat.version import __version__
@@ -62,17 +62,24 @@ class LogFile(logging.FileHandler):
         super().__init__(filename, mode)
 
 
+def job_folders(config: DictConfig) -> tuple[Path, Path]:
+    """Return the folder of a job's record, and that of its results, which jobs that are its shards share."""
+    folder = HydraConfig.get().runtime.output_dir
+    return Path(folder), Path(folder.removesuffix(shard_folder(config)))
+
+
 @contextmanager
-def hold_job_lock(out: Path) -> Iterator[None]:
-    """Hold the lock of a job's directory in the job's first process; the lock file names process and computer.
+def hold_job_lock(folder: Path, out: Path) -> Iterator[None]:
+    """Hold the lock of a job's folder in the job's first process; the lock file names process and computer.
 
     The operating system releases the lock when the process ends, for whatever reason. The unfinished files of a killed
-    process are removed, except below the directories of other jobs.
+    process are removed, except below the folders of other jobs.
 
     Raises:
-        CompleteSplatError: another process holds the lock, or its path is a link or a folder.
+        CompleteSplatError: another process holds the lock, or its path is a link or a folder; or a job that is no shard
+            and one that is would write into `out` at the same time.
     """
-    path = out / LOCK
+    path = folder / LOCK
     if not is_first_process():
         yield
         return
@@ -82,18 +89,24 @@ def hold_job_lock(out: Path) -> Iterator[None]:
         with writing(path):
             lock = FileLock(path).acquire(blocking=False)
     except Timeout:
-        holder = path.read_text().split()
-        named = f"process {holder[0]} on {holder[1]}" if len(holder) > 1 else "another process"
-        message = f"{out}: {named} is at work in it: wait for it or end it, or choose another out=DIR"
-        raise CompleteSplatError(message) from None
+        raise _busy(folder) from None
     with lock:
+        for other in out.glob("shard-*") if folder == out else [out]:
+            if is_running(other):
+                raise _busy(other)
         with writing(path):
             path.write_text(f"{os.getpid()}\n{platform.node()}\n")
-        for place, folders, names in os.walk(out):
+        for place, folders, names in os.walk(folder):
             folders[:] = [name for name in folders if not Path(place, name, LOCK).exists()]
             for name in filter(UNFINISHED.fullmatch, names):
                 Path(place, name).unlink(missing_ok=True)
         yield
+
+
+def _busy(folder: Path) -> CompleteSplatError:
+    holder = (folder / LOCK).read_text().split()
+    named = f"process {holder[0]} on {holder[1]}" if len(holder) > 1 else "another process"
+    return CompleteSplatError(f"{folder}: {named} is at work in it: wait for it or end it, or choose another out=DIR")
 
 
 def is_running(out: Path) -> bool:
@@ -102,21 +115,21 @@ def is_running(out: Path) -> bool:
     if not path.is_file():
         return False
     try:
-        with FileLock(path).acquire(blocking=False):
+        with FileLock(path).acquire(timeout=0.2):  # for which another process may look, too
             return False
     except (Timeout, OSError):
         return True
 
 
 def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> float | None:
-    """Run one job in its own directory, record its command and config there, and return the value of `optimized`.
+    """Run one job, record its command and config in its own folder, and return the value of `optimized`.
 
     A job with `ckpt_path=last` is not repeated if its directory holds its results; see `is_finished`. The user started
     `program` with the arguments `given` behind the verb.
     """
     use_working_folder()  # a cluster may have started this process
     hydra_config = HydraConfig.get()
-    out = Path(hydra_config.runtime.output_dir)
+    folder, out = job_folders(config)
     OmegaConf.set_struct(config, False)
     config.out = str(out)
     resolved = resolved_settings(config)
@@ -125,13 +138,13 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
         return optimized(config.get("optimized_metric"), out)
     first = is_first_process()
     try:
-        recorded = out, [f"completesplat {verb}", *given], list(hydra_config.overrides.task), resolved
+        recorded = folder, [f"completesplat {verb}", *given], list(hydra_config.overrides.task), resolved
         with ended_by_signals(), _recorded(*recorded) if first else nullcontext():
             for key in ("checkpoint", "autoreconstructor_checkpoint"):
                 # The path may refer to the job's choices (`hydra:runtime.choices`), which `start` cannot resolve.
                 if (path := OmegaConf.select(config, f"model.{key}")) is not None:
                     config.model[key] = path
-            with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{out}"]):
+            with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{folder}"]):
                 result = start(verb, config, out)
     except Interrupted as stop:
         if first:

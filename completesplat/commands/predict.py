@@ -25,7 +25,7 @@ from torch import Tensor
 
 from completesplat.commands.trained import open_generator, shown_background
 from completesplat.data.images.photograph import Photograph, outside_of_box, outside_of_mask
-from completesplat.data.validation.processes import map_in_processes
+from completesplat.data.validation.processes import map_in_processes, share_of
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
@@ -45,12 +45,7 @@ FAR = 1.5  # ratio of tan(fov / 2), photo to training, from which a warning is g
 UNLIKE = 2.0  # distance from the training images (`distance_to_training`) from which a warning is given
 sha256_of_weights = cache(sha256_of)  # a process has one model, of up to gigabytes
 RESIZING = 0.1  # change of a distance that resizing to another model's size and back may cause
-# The network has 56.4 million numbers in float32; its authors' checkpoint may hold more.
-ELSEWHERE = (
-    "; for an object try weights=splatter_image:objaverse background=remove (MIT, downloads at least 226 MB) or"
-    " github.com/VAST-AI-Research/TripoSplat (MIT), for a scene github.com/apple/ml-sharp (weights for research only);"
-    " view and test scenes= read the PLY files of both projects"
-)
+ELSEWHERE = "for objects weights=splatter_image:objaverse (226 MB), for scenes github.com/apple/ml-sharp"
 
 log = logging.getLogger(__name__)
 
@@ -66,8 +61,7 @@ def run(config: DictConfig, out: Path) -> None:
     images = find_images(config.image)
     if config.mask is not None and len(images) > 1:
         raise CompleteSplatError("mask=FILE belongs to one image; box=[x0,y0,x1,y1] goes for several")
-    if config.shard >= config.shards:
-        raise CompleteSplatError(f"shard={config.shard}: the last of shards={config.shards} is {config.shards - 1}")
+    share_of(images, config.shard, config.shards)  # refuses a shard that does not exist
     if config.cameras is not None:
         return predict_from_views(config, images, wanted, out)
     start, threads = time.perf_counter(), max(1, torch.get_num_threads() // config.devices)
@@ -94,15 +88,16 @@ def predict_share(
         torch.set_num_threads(threads)
         if torch.cuda.is_available():
             torch.cuda.set_device(process % torch.cuda.device_count())
-    mine = slice(config.shard + config.shards * process, None, config.shards * config.devices)
-    photos = [*zip(images, (out / name for name in folder_names(image.stem for image in images)), strict=True)][mine]
+    folders = (out / name for name in folder_names(image.stem for image in images))
+    pairs, count = [*zip(images, folders, strict=True)], config.shards * config.devices
+    photos = share_of(pairs, config.shard + config.shards * process, count)
     if not photos:
         return 0, []
-    model = open_generator(config, images)
+    model = open_generator(config, images, announced=process == 0)
     waiting = [(image, folder) for image, folder in photos if not is_predicted(folder, config, model, image)]
     if len(waiting) < len(photos):
         before = f"{len(photos) - len(waiting)} of {len(photos)} images: predicted before by the same settings"
-        print(f"{before}; to repeat one, remove its folder in {out}", flush=True)
+        print(f"{before}; to repeat one, remove its folder", flush=True)
     return predict_images(config, model, waiting, wanted)
 
 
@@ -203,7 +198,7 @@ def predict_images(
                 failed.append(name)
             elif bar.disable:
                 seconds = f"{time.perf_counter() - start:.0f} s"
-                print(f"{index + 1}/{len(photos)} {name}: {folder} ({seconds})", flush=True)
+                print(f"{index + 1}/{len(photos)} {name}: {folder.name}/ ({seconds})", flush=True)
             bar.update(task, completed=(index + 1) * steps)
     return len(photos) - len(failed), failed
 
@@ -261,7 +256,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Outpu
     model = open_generator(config, images)
     views = read_photographs(images, Path(config.cameras), model.image_size)
     views = replace(views, cameras=model.in_model_units(views.cameras))
-    scene = model.reconstruct(views)
+    scene = model.reconstruct(views).to("cpu")
     recorded = {
         "seed": config.seed,
         "image": printable(images[0].name),
@@ -273,9 +268,9 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Outpu
     }
     wanted = replace(wanted, background=shown_background(config.background, model))
     rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / safe_name(images[0].stem)
-    shot = Shot(scene, views.cameras[0], model.up)
+    shot = Shot(scene, views.cameras[0], model.up.cpu())
     write_prediction(folder, views.images[0], [shot], rasterizer, wanted, recorded, partial(print, flush=True))
-    print(f"one scene of {len(images)} images, at the posterior's mean: {folder}")
+    print(f"one scene of {len(images)} images, at the posterior's mean: {folder.name}/")
 
 
 def _predict(
@@ -291,8 +286,8 @@ def _predict(
         begin("removing the background", advance=0)
     photograph = model.read(image, config.fov, config.background == REMOVE)
     visible = visible_part(config, image, model.image_size)
-    if warnings := photo_warnings(photograph, model, whole=visible is None):
-        log.warning("%s: %s", printable(image.name), "; ".join(warnings))
+    for warning in photo_warnings(photograph, model, whole=visible is None):
+        log.warning("%s: %s", printable(image.name), warning)
     settings = {name: config[name] for name in ("samples", "seed", "color_fits")}
     sampler = {}
     if isinstance(model, CompleteSplat):
@@ -318,23 +313,22 @@ def _predict(
     if config.background == REMOVE:
         recorded["background"] = REMOVE
     visible_image = photograph.image if visible is None else photograph.image * visible
-    camera = model.camera(photograph)
+    camera, up = model.camera(photograph).to("cpu"), model.up.cpu()
     if model.background is not None:  # images of objects, whose centre is in the middle of the depth range
         wanted = replace(wanted, pivot_depth=model.middle_depth(model.depth_range_of(photograph)))
-    shots = [Shot(scene, camera, model.up) for scene in scenes]
+    shots = [Shot(scene.to("cpu"), camera, up) for scene in scenes]
     write_prediction(folder, visible_image, shots, rasterizer, wanted, recorded, begin)
 
 
 def photo_warnings(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]:
-    """Return warnings about a photo that is unlike the training images; its contents are compared only if `whole`."""
+    """Return lines about a photo that is unlike the training images; its contents are compared only if `whole`."""
     moves = "depth_before" in (model.architecture.get("training") or {})  # the depth range, by the field of view
     warnings = [None if moves else unusual_field_of_view(photograph, model.fov_degrees.item())]
     distance = distance_to_training(photograph, model.architecture) if whole else None
     if distance is not None and distance > UNLIKE:
-        warnings.append(
-            f"colours, contrast or detail lie {distance:.1f} standard deviations from the training images'"
-            f" ({UNLIKE:g} is far): expect little of it in the scenes{nearer_weights(photograph, distance)}"
-        )
+        far = f"{distance:.1f} standard deviations, {UNLIKE:g} is far"
+        warnings.append(f"unlike the training images ({far}): expect little of it in the scenes")
+        warnings.append(nearer_weights(photograph, distance))
     return [warning for warning in warnings if warning]
 
 
@@ -342,8 +336,8 @@ def nearer_weights(photograph: Photograph, distance: float) -> str:
     """Name the shipped weights whose training images are nearer to a photo, and `ELSEWHERE` if these are far, too."""
     name, other = next(iter(distances_to_shipped(photograph.image).items()), ("", math.inf))
     nearer = other < distance - RESIZING
-    nearest = f"; weights={name} were trained on images that are nearer ({other:.1f})" if nearer else ""
-    return nearest + (ELSEWHERE if min(other, distance) > UNLIKE else "")
+    lines = [f"weights={name} are nearer ({other:.1f})"] if nearer else []
+    return "; ".join([*lines, ELSEWHERE] if min(other, distance) > UNLIKE else lines)
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:

@@ -1,5 +1,6 @@
 """Models for commands, from a run's checkpoint, from weights or from files of scenes, and the data to use with them."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from completesplat.generator import CompleteSplat
 from completesplat.run_configs import config_of_run
 from completesplat.scene_model import SceneModel, distances_to_shipped
 from completesplat.settings.checks import REMOVE
+from completesplat.tensors import used_device
 from completesplat.weights import AUTO, RUN_CHECKPOINT, sha256_of, shipped
 from completesplat.weights.checkpoint_reading import load_part
 
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
     from completesplat.training.scoring import SceneFiles, Scorer
 
+logger = logging.getLogger(__name__)
 WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no effect"
 
 
@@ -150,31 +153,31 @@ def nearest_weights(images: Sequence[Path], remove_background: bool) -> tuple[st
     return name, f"; there is no image to choose by (weights=NAME takes others: {', '.join(names)})"
 
 
-def open_generator(config: Any, images: Sequence[Path]) -> SceneModel:
-    """Return the model of `config.weights`, with `config.sampler` if given, and print its limits.
+def open_generator(config: Any, images: Sequence[Path], announced: bool = True) -> SceneModel:
+    """Return the model of `config.weights`, with `config.sampler` if given, on `used_device`; print its limits.
 
-    `weights=auto` is replaced by `nearest_weights` of the images. If the model draws no samples, `config.samples` is
-    set to 1.
+    Of several processes, one prints them (`announced`). `weights=auto` is replaced by `nearest_weights` of the images.
+    If the model draws no samples, `config.samples` is set to 1.
 
     Raises:
         WeightsError: as `from_pretrained`.
         CompleteSplatError: a sampler is given for a model that draws no samples.
     """
-    reason = ""
+    reason, say = "", print if announced else logger.debug
     if config.weights == AUTO:
         config.weights, reason = nearest_weights(images, config.background == REMOVE)
     model = CompleteSplat.from_pretrained(config.weights, config.trust)
     if config.weights in shipped():
         content = model.architecture["training"]["content"]
-        print(f"weights: {config.weights}, which come with the package and know {content}{reason}")
+        say(f"weights: {config.weights}, which come with the package and know {content}{reason}")
     if config.get("sampler") is not None:
         model.replace_sampler(OmegaConf.to_container(config.sampler))  # type: ignore[arg-type]
     if not model.draws_samples:
-        print(f"weights: {config.weights} gives one answer for each image and draws no samples: {WITHOUT_EFFECT}")
+        say(f"weights: {config.weights} gives one answer for each image and draws no samples: {WITHOUT_EFFECT}")
         config.samples = 1
     if model.note is not None:
-        print(f"weights: {model.note}")
-    return model
+        say(f"weights: {model.note}")
+    return model.to(used_device())
 
 
 def shown_background(chosen: float | str | None, model: SceneModel | None) -> float:

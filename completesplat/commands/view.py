@@ -93,7 +93,6 @@ def scenes_in(path: Path) -> dict[str, Path]:
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     """Create a server's page and fill it with the scenes or the model that the settings name."""
     with importing(), postponing():
-        import torch
         from hydra.utils import instantiate
 
         from completesplat.commands.trained import open_generator, shown_background
@@ -105,7 +104,6 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
         from completesplat.viewer.splat_view import SplatView
 
         check_parts(config)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
     model, scenes, status = None, {}, ""
     if config.watch is not None:
         status, samples, up = newest_scenes(Path(config.watch))
@@ -114,7 +112,7 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
         status, path = next(iter(scenes.items()))
         samples, up = read_scene(path)
     else:
-        model = open_generator(config, [] if config.image is None else [Path(config.image)]).to(device)
+        model = open_generator(config, [] if config.image is None else [Path(config.image)])
         samples, up = [], tuple(model.up.tolist())
     remove = config.background == REMOVE
     background = shown_background(config.background, model)

@@ -5,11 +5,11 @@ import re
 import secrets
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from hydra import compose as compose_by_hydra
 from hydra import initialize_config_dir
@@ -28,6 +28,7 @@ from completesplat.settings.options import LEAST_LIKE, conf_folder, did_you_mean
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 NOT_THERE = re.compile(r"Could not override '([^']+)'")
 LONGEST_NAME = 120
+PARTS_OF_STAGES = {"autoreconstructor", "regressor", "conditioning", "denoiser", "sampler", "objective"}
 
 
 class SettingsOfWorkingFolder(SearchPathPlugin):
@@ -70,6 +71,18 @@ def _composed(verb: str, overrides: Sequence[str] = ()) -> DictConfig:
 def resolved_settings(config: DictConfig) -> dict[str, object]:
     """Return a config as a plain mapping without references."""
     return cast(dict[str, object], OmegaConf.to_container(config, resolve=True))
+
+
+def without_unused_parts(config: DictConfig) -> DictConfig:
+    """Return a config without those `PARTS_OF_STAGES` to which no other part refers."""
+    plain = cast(dict[str, object], OmegaConf.to_container(config, resolve=False))
+    texts = {key: str(value) for key, value in plain.items()}
+    used = waiting = texts.keys() - PARTS_OF_STAGES
+    while waiting:
+        named = {name for key in waiting for name in re.findall(r"\$\{(\w+)", texts[key])}
+        waiting = (named & texts.keys()) - used
+        used |= waiting
+    return OmegaConf.masked_copy(config, [key for key in texts if key in used])
 
 
 @contextmanager
@@ -137,7 +150,7 @@ def sweep_arguments(verb: str, arguments: Sequence[str]) -> list[str]:
         added.append("ckpt_path=last")
     swept = swept_keys(arguments)
     if swept and "hydra.sweep.subdir" not in keys:
-        added.append(f"hydra.sweep.subdir=${{job_name:{','.join(swept)}}}")
+        added.append(f"hydra.sweep.subdir=${{job_name:{','.join(swept)}}}${{shard_folder:}}")
     return added
 
 
@@ -154,11 +167,17 @@ def job_name(*keys: str, _root_: DictConfig) -> str:
     It has no equals signs and commas, so that paths into the directory need no quotes in Hydra's overrides.
     """
     values = dict(override.lstrip("+~").split("=", 1) for override in _root_.hydra.overrides.task if "=" in override)
-    full = "+".join(f"{key}-{values[key]}" for key in keys if key in values)
-    name = re.sub(r"[^\w.+-]+", "_", full)
-    if name == full and len(name) <= LONGEST_NAME:
+    shared = shard_folder(_root_)
+    full = "+".join(f"{key}-{values[key]}" for key in keys if key in values and not (shared and key == "shard"))
+    name = re.sub(r"[^\w.+-]+", "_", full) or "."
+    if name in (full, ".") and len(name) <= LONGEST_NAME:
         return name
     return f"{name[:LONGEST_NAME]}-{hashlib.sha256(full.encode()).hexdigest()[:8]}"
+
+
+def shard_folder(_root_: Mapping[str, Any]) -> str:
+    """Return the ending of a job's folder, for its record, log and lock, if it shares `out` with other jobs."""
+    return f"/shard-{_root_['shard']}" if _root_.get("shards", 1) != 1 else ""
 
 
 def best_precision() -> str:
@@ -174,3 +193,4 @@ def best_precision() -> str:
 OmegaConf.register_new_resolver("run_name", lambda: RUN_NAME, replace=True)
 OmegaConf.register_new_resolver("best_precision", best_precision, replace=True)
 OmegaConf.register_new_resolver("job_name", job_name, replace=True)
+OmegaConf.register_new_resolver("shard_folder", shard_folder, replace=True)

@@ -73,12 +73,13 @@ class Completion:
         progress, forming = self.controls.progress, self.controls.forming.value
         earlier = [sample for sample in self.page.view.samples if sample.finished] if self.controls.keep.value else []
         layers = self.model.parameterization.layers
-        reference, last_shown = self.model.camera(photograph), 0.0
+        reference, last_shown = self.model.camera(photograph).to("cpu"), 0.0
 
         def arranged(scenes: Sequence[Gaussians], finished: bool) -> list[Sample]:
             """Return the earlier samples and then the new ones, without the first ones if there are too many."""
             infos = [{**settings, "image": name, "sample": i} for i in range(len(scenes))]
-            new = [Sample(x, layers, reference, info, finished, True) for x, info in zip(scenes, infos, strict=True)]
+            pairs = zip(scenes, infos, strict=True)
+            new = [Sample(x.to("cpu"), layers, reference, info, finished, True) for x, info in pairs]
             return [*earlier, *new][-MOST_SAMPLES:]
 
         def formed(step: int, level: int, estimate: Gaussians) -> None:

@@ -16,9 +16,11 @@ from PIL import Image
 from rich.progress import Progress
 from support import compose_config, some_gaussians, strict_json
 
+from completesplat.commands import trained
 from completesplat.commands.predict import find_images, output_files, photo_warnings, run, unusual_field_of_view
 from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
+from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.generator import CompleteSplat
 
@@ -188,10 +190,10 @@ def test_shards_are_each_image_once_and_names_do_not_depend_on_them(predict, tmp
         save(tmp_path / place)
     images = f"[{tmp_path / 'x'},{tmp_path / 'y'}]"
     assert "1/2 a.png" in predict(images, "shard=0", "shards=2").out
-    assert sorted(path.name for path in (tmp_path / "out").glob("*/")) == ["a", "a_2"]
+    assert sorted(path.name for path in (tmp_path / "out").glob("*/")) == ["a", "a_2", "shard-0"]
     assert "1/1 b.png" in predict(images, "shard=1", "shards=2").out
     assert predict(images, "shard=3", "shards=4").status == 0  # nothing is left for it
-    assert "shard=2: the last of shards=2 is 1" in predict(images, "shard=2", "shards=2").err
+    assert "shard=2: must lie between 0 and 1, for shards=2" in predict(images, "shard=2", "shards=2").err
 
 
 @pytest.mark.processes
@@ -207,6 +209,20 @@ def test_two_processes_predict_each_image_once_and_go_on_after_one_failed(comman
     )
     assert re.search(r"^3 photos in \d+ s by 2 process\(es\): [\d.]+ a minute$", finished.out, re.M)
     assert {path.parent.name for path in (tmp_path / "out").glob("*/scene.json")} == {"a", "c", "d"}
+
+
+@pytest.mark.gpu
+def test_a_prediction_on_a_gpu_is_that_on_the_cpu_up_to_rounding(command, tiny_weights, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+    given = [f"image={save(tmp_path / 'a.png')}", f"weights={tiny_weights}", "samples=2", "steps=2", "color_fits=0"]
+    command.succeeds("predict", *given, "video=[]", f"out={tmp_path / 'gpu'}")
+    assert torch.cuda.max_memory_allocated() > 0
+    monkeypatch.setattr(trained, "used_device", lambda: "cpu")
+    command.succeeds("predict", *given, "video=[]", f"out={tmp_path / 'cpu'}")
+    for sample in range(2):
+        gpu, cpu = (read_gaussians(tmp_path / device / f"a/sample_{sample:02}.ply") for device in ("gpu", "cpu"))
+        torch.testing.assert_close(gpu.means, cpu.means, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(gpu.colors, cpu.colors, rtol=1e-3, atol=1e-3)
 
 
 def test_if_all_fail_nothing_is_said_to_be_left(predict, command, tmp_path):
@@ -244,9 +260,10 @@ def test_a_photo_unlike_the_training_images_gets_a_warning_that_names_nearer_wei
 ):
     model = model_with(tiny_weights, picture_mean=[1.0, 0, 0, 0, 0, 0, 0, 0], picture_std=[0.1] * 8)
     red, blue = (model.read(save(tmp_path / f"{color}.png", color), 15) for color in ("red", "blue"))
-    fov, unlike = photo_warnings(blue, model, whole=True)
+    fov, unlike, elsewhere = photo_warnings(blue, model, whole=True)
     assert "field of view is 15" in fov
-    assert unlike.startswith("colours, contrast or detail lie 5.0 standard deviations from the training images'")
+    assert unlike.startswith("unlike the training images (5.0 standard deviations, 2 is far): ")
+    assert max(len(unlike), len(elsewhere)) <= 125
     assert len(photo_warnings(red, model, whole=True)) == len(photo_warnings(blue, model, whole=False)) == 1
     assert len(photo_warnings(blue, model_with(tiny_weights), whole=True)) == 1  # nothing is known of the training
     folders = {}
@@ -256,15 +273,11 @@ def test_a_photo_unlike_the_training_images_gets_a_warning_that_names_nearer_wei
         training = {} if mean is None else {"picture_mean": mean + [0.0] * 5, "picture_std": [0.1] * 8}
         (folders[name] / "config.json").write_text(json.dumps({"image_size": 24, "training": training}))
     monkeypatch.setattr("completesplat.scene_model.shipped", lambda: folders)
-    assert photo_warnings(blue, model, whole=True)[1].endswith(
-        "; weights=blues were trained on images that are nearer (0.0)"
-    )
+    assert photo_warnings(blue, model, whole=True)[2] == "weights=blues are nearer (0.0)"
     monkeypatch.setattr("completesplat.scene_model.shipped", lambda: {"reds": folders["reds"]})
-    unlike = photo_warnings(blue, model, whole=True)[1]
-    near, elsewhere = unlike.partition("expect little of it in the scenes; ")[2].split("; ", 1)
-    assert near == "weights=reds were trained on images that are nearer (4.8)"  # but not near
-    others = "weights=splatter_image:objaverse background=remove (MIT, ", "TripoSplat", "github.com/apple/ml-sharp"
-    assert all(name in elsewhere for name in others)
+    near, elsewhere = photo_warnings(blue, model, whole=True)[2].split("; ", 1)
+    assert near == "weights=reds are nearer (4.8)"  # but not near
+    assert all(name in elsewhere for name in ("weights=splatter_image:objaverse", "github.com/apple/ml-sharp"))
 
 
 def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):

@@ -22,7 +22,7 @@ HOLDER = """
 import os, sys, time
 from pathlib import Path
 from completesplat.commands.jobs import hold_job_lock
-with hold_job_lock(Path(sys.argv[1])):
+with hold_job_lock(*[Path(sys.argv[1])] * 2):
     if os.fork() == 0:
         time.sleep(900)
         os._exit(0)
@@ -76,7 +76,8 @@ def test_a_lock_that_is_no_file_is_refused(tmp_path, kind):
         lock.symlink_to(target)
     if kind == "link":
         target.write_text("kept")
-    with pytest.raises(CompleteSplatError, match=r"run/\.lock: is a link or a folder"), hold_job_lock(lock.parent):
+    refusal = pytest.raises(CompleteSplatError, match=r"run/\.lock: is a link or a folder")
+    with refusal, hold_job_lock(lock.parent, lock.parent):
         pass
     assert (target.read_text() == "kept") if kind == "link" else not target.exists()
 

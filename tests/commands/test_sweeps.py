@@ -18,7 +18,7 @@ from vgg_weights import blank, saved
 from completesplat.commands.jobs import is_finished, optimized
 from completesplat.errors import CompleteSplatError
 from completesplat.losses.lpips import load_vgg16
-from completesplat.settings.composition import LONGEST_NAME, job_name, swept_keys
+from completesplat.settings.composition import LONGEST_NAME, job_name, shard_folder, swept_keys
 
 LAST = "checkpoints/last.ckpt"
 
@@ -40,6 +40,10 @@ def test_a_job_is_named_by_what_is_swept_plainly_and_like_no_other():
     root = root_with("experiment=toy_var", "ablation=no_skips", "seed=1", "data.root=/a/b")
     assert job_name("ablation", "seed", _root_=root) == "ablation-no_skips+seed-1"
     assert job_name("optimizer.lr", _root_=root_with("+optimizer.lr=1e-3")) == "optimizer.lr-1e-3"
+    shards = OmegaConf.merge(root_with("shard=1", "shards=2", "seed=3"), {"shard": 1, "shards": 2})
+    assert job_name("shard", "seed", _root_=shards) + shard_folder(shards) == "seed-3/shard-1"
+    assert job_name("shard", _root_=shards) + shard_folder(shards) == "./shard-1"
+    assert job_name("seed", _root_=root) + shard_folder(root) == "seed-1"
     names = {job_name("data.root", _root_=root_with(f"data.root={path}")) for path in ("/a/b", "/a_b", "a/b", "ab")}
     names |= {job_name("x", _root_=root_with(f"x={'y' * 300}{end}")) for end in "ab"}
     assert len(names) == 6

@@ -90,7 +90,7 @@ def test_a_run_is_watched_while_a_process_is_at_work_in_it(tmp_path):
     assert setting_of_path(run) == {"weights": str(run)}
     (run / ".lock").touch()
     assert setting_of_path(run) == {"weights": str(run)}
-    with hold_job_lock(run):
+    with hold_job_lock(run, run):
         assert setting_of_path(run) == {"watch": str(run)}
         assert (run / ".lock").read_text().split()[0] == str(os.getpid())  # as it was
     assert setting_of_path(run) == {"weights": str(run)}

@@ -42,6 +42,14 @@ def test_the_object_stands_on_white_the_right_way_up(rembg, tmp_path):
     assert read_photograph(tmp_path / "a.png", 32).image[1, 0, 0] == 0
 
 
+def test_a_network_that_rembg_has_is_taken_and_the_best_first(rembg, tmp_path, monkeypatch):
+    monkeypatch.setenv("U2NET_HOME", str(tmp_path))
+    for name in ("u2netp", "isnet-general-use"):
+        (tmp_path / f"{name}.onnx").touch()
+        read_photograph(photo(tmp_path / "a.png"), 16, remove_background=True)
+    assert rembg.sessions == ["u2netp", "isnet-general-use"]
+
+
 def test_the_object_is_sought_in_all_of_the_image_and_fills_its_share_of_the_square(rembg, tmp_path):
     image = Image.new("RGB", (64, 32), "red")
     image.paste("blue", (2, 4, 14, 10))  # left of the central square
@@ -70,7 +78,7 @@ def test_without_rembg_or_its_network_it_is_said_what_to_do(rembg, tmp_path, mon
     with caplog.at_level("INFO"):
         read_photograph(tmp_path / "a.png", 16, remove_background=True)
     assert "rembg fails with its network u2net (no route to host)\n" in caplog.text
-    assert "removed by GrabCut" in caplog.text
+    assert "removed roughly, from colours (GrabCut)" in caplog.text
     for name in ("rembg", "cv2"):
         monkeypatch.setitem(sys.modules, name, None)
     advice = r'needs rembg or OpenCV: .* "completesplat\[background\]", or .*grabcut'
@@ -90,7 +98,7 @@ def test_without_rembg_grabcut_keeps_the_largest_piece_that_differs_from_the_bor
         alpha = np.array(without_background(noisy).getchannel("A")) > 127
     assert (alpha & object_mask).sum() > 0.97 * (alpha | object_mask).sum()
     assert not alpha[speck].any()
-    assert "removed by GrabCut" in caplog.text
+    assert "removed roughly, from colours (GrabCut)" in caplog.text
     assert "rembg is better" in caplog.text
     with pytest.raises(ImageError, match="no object is found"):
         without_background(Image.new("RGB", (3000, 8), "red"))

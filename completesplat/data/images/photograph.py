@@ -31,7 +31,9 @@ FOVS = 0.1, 179  # degrees; float32 holds neither the focal lengths nor the dept
 DEEP_GREY_MODES = (*files.SIXTEEN_BIT_MODES, "I", "F")
 LARGEST_OBJECT = 4096  # pixels; larger ones are reduced before they are padded to a square of unbounded size
 LANCZOS_REACH = 3  # radius of the filter, in pixels of the coarser image
-CUTTER = "u2net"  # rembg's default network has a licence for non-commercial use only
+# Networks of rembg under Apache 2.0, the best first (DIS, U2-Net, its small form); its default forbids commercial use.
+CUTTERS = ("isnet-general-use", "u2net", "u2netp")
+DOWNLOADED = "u2net"
 GRABCUT_SIDE = 400  # pixels; more would take longer than a prediction
 
 log = logging.getLogger(__name__)
@@ -208,23 +210,26 @@ def _to_srgb(square: Image.Image, background: float) -> Image.Image:
 
 
 def without_background(image: Image.Image) -> Image.Image:
-    """Make the background of an RGB image transparent (RGBA) with U2-Net (Qin et al. 2020) from rembg, or by GrabCut.
+    """Make the background of an RGB image transparent (RGBA) with a network of rembg, or by GrabCut.
+
+    The network is the best of `CUTTERS` in rembg's folder, or else U2-Net (Qin et al. 2020), which rembg downloads.
 
     Raises:
-        CompleteSplatError: OpenCV is not installed, nor a rembg that works; it downloads its network (176 MB).
+        CompleteSplatError: OpenCV is not installed, nor a rembg that works.
         ImageError: the whole image is background.
     """
     pixels = Image.fromarray(np.array(image))  # without EXIF, because rembg would turn the image again
+    name = _network()
     try:
         import rembg
 
-        cut: Image.Image = rembg.remove(pixels, session=_session())
-        log.info("background: removed by rembg (%s)", CUTTER)
+        cut: Image.Image = rembg.remove(pixels, session=_session(name))
+        log.info("background: removed by rembg (%s)", name)
     except (ImportError, SystemExit):  # rembg exits if onnxruntime is missing
         cut = by_grabcut(pixels)
     except Exception as error:  # from the HTTP library, onnxruntime or the file system
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        log.warning("background: rembg fails with its network %s (%s)", CUTTER, reason)
+        log.warning("background: rembg fails with its network %s (%s)", name, reason)
         cut = by_grabcut(pixels)
     if not cut.getchannel("A").getbbox():
         raise ImageError("background=remove leaves nothing of it: no object is found")
@@ -251,17 +256,25 @@ def by_grabcut(image: Image.Image) -> Image.Image:
     _, pieces, statistics, _ = cv2.connectedComponentsWithStats(labels & 1)
     sizes = [0, *statistics[1:, cv2.CC_STAT_AREA]]  # the first piece is the background
     mask = (pieces == np.argmax(sizes)) & (labels & 1 > 0)
-    log.info('background: removed by GrabCut, from colours; rembg is better: pip install "completesplat[background]"')
+    log.info(
+        'background: removed roughly, from colours (GrabCut); rembg is better: pip install "completesplat[background]"'
+    )
     cut = image.convert("RGBA")
     cut.putalpha(Image.fromarray(mask).convert("L").resize(image.size, Image.Resampling.BICUBIC))
     return cut
 
 
+def _network() -> str:
+    home = os.environ.get("U2NET_HOME", os.path.join(os.environ.get("XDG_DATA_HOME", "~"), ".u2net"))
+    folder = Path(home).expanduser()
+    return next((name for name in CUTTERS if (folder / f"{name}.onnx").is_file()), DOWNLOADED)
+
+
 @cache
-def _session() -> object:
+def _session(name: str) -> object:
     import rembg
 
-    return rembg.new_session(CUTTER)
+    return rembg.new_session(name)
 
 
 def image_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 8"]:

@@ -12,11 +12,12 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event
-from typing import Annotated, Any, ClassVar, NamedTuple, Unpack
+from typing import Annotated, Any, ClassVar, NamedTuple, Unpack, cast
 from urllib.parse import unquote
 
 import numpy as np
 import torch
+from filelock import FileLock
 from jaxtyping import Float
 from PIL import Image
 from rich.progress import track
@@ -29,15 +30,16 @@ from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
 from completesplat.data.rendered.drawing import PAINTS, RenderSettings, check_surroundings, draw_rendered_scene
 from completesplat.data.validation import MissingFile, UnreadableFile, read_points
+from completesplat.data.validation.processes import share_of
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import atomic_folder, folder_names, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
-from completesplat.settings.schema import Positive, Range
+from completesplat.settings.schema import Natural, Positive, Range
 
 logger = logging.getLogger(__name__)
 
 CATEGORY = "rendered"
-DESCRIPTION, OBJECT, BROKEN = "rendered.json", "object.json", "broken.json"
+DESCRIPTION, OBJECT, BROKEN, LOCK = "rendered.json", "object.json", "broken.json", ".rendered.lock"
 FORMAT_VERSION = 2
 SUFFIXES = ("glb", "gltf", "obj", "ply", "stl", "fbx", "usd", "usda", "usdc", "usdz")
 MOST_POINTS = 20_000
@@ -139,35 +141,48 @@ def procedural_objects(program: Blender, factory: str, count: int) -> list[Asset
     return [Asset(name, name, factory=factory) for name in (f"{factory}_{index:05d}" for index in range(count))]
 
 
+class JobSettings(RenderSettings):
+    """Settings of all scenes, and of a job.
+
+    Attributes:
+        max_megabytes: largest size of a mesh's file.
+        max_minutes: longest time of an object.
+        workers: number of Blender's processes, each with one object and one thread (None: one for each core).
+        shard, shards: the job renders every `shards`-th object from number `shard` on, and other jobs the others.
+    """
+
+    max_megabytes: Positive
+    max_minutes: Annotated[float, Range(0)]
+    workers: Positive | None
+    shard: Natural
+    shards: Positive
+
+
 def render(
     meshes: str | None,
     factory: str | None,
     count: Positive,
     out: Path,
-    max_megabytes: Positive,
-    max_minutes: Annotated[float, Range(0)],
     blender: str | None = None,
-    workers: Positive | None = None,
-    **settings: Unpack[RenderSettings],
+    **job: Unpack[JobSettings],
 ) -> Path:
     """Render objects into `out`/rendered, and return this folder.
 
     What an object's images show depends on the settings, which include the seed, and on its path or number alone.
     Objects that are rendered already remain; those that cannot be rendered are left out and tried again the next time.
+    When all jobs that share the objects have ended, in whatever order, the files are those of one job for all.
 
     Args:
         meshes, factory: a folder of meshes, or a class of Infinigen, of which `count` objects are made.
-        max_megabytes: largest size of a mesh's file.
-        max_minutes: longest time of an object.
         blender: see `find_blender`.
-        workers: number of Blender's processes, each with one object and one thread (None: one for each core).
 
     Raises:
-        CompleteSplatError: there is no Blender, or it is too old.
+        CompleteSplatError: there is no Blender, or it is too old; or there is no such shard.
         DataError: there are no meshes, a file of the settings is missing, the folder holds something else, or nothing
             can be rendered; `broken.json` has the reasons.
         DiskError: the disk is full.
     """
+    settings = cast(RenderSettings, {name: x for name, x in job.items() if name in RenderSettings.__annotations__})
     if (meshes is None) == (factory is None):
         raise CompleteSplatError("give either meshes=FOLDER or factory=NAME (of Infinigen, such as SofaFactory)")
     if meshes is not None and out.resolve().is_relative_to(Path(meshes).resolve()):
@@ -177,29 +192,38 @@ def render(
     objects = find_meshes(Path(meshes)) if meshes is not None else []
     program, category = find_blender(blender), out / CATEGORY
     objects = objects or procedural_objects(program, str(factory), count)
-    parameters = {"format": FORMAT_VERSION, **settings}
-    if not writing.is_written(category / DESCRIPTION, parameters):
-        with atomic_folder(category) as unfinished:
-            (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
-    waiting = [asset for asset in objects if not (category / asset.name).exists()]
-    write_one = partial(_write_object, category, program, settings, (MEGABYTE * max_megabytes, max_minutes))
-    results = track(_in_threads(write_one, waiting, workers), "Rendering", len(waiting))
+    mine = share_of(objects, job["shard"], job["shards"])
+    parameters, lock = {"format": FORMAT_VERSION, **settings}, FileLock(out / LOCK)
+    out.mkdir(parents=True, exist_ok=True)
+    with lock:
+        if not writing.is_written(category / DESCRIPTION, parameters):
+            with atomic_folder(category) as unfinished:
+                (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
+    waiting = [asset for asset in mine if not (category / asset.name).exists()]
+    most = MEGABYTE * job["max_megabytes"], job["max_minutes"]
+    write_one = partial(_write_object, category, program, settings, most)
+    results = track(_in_threads(write_one, waiting, job["workers"]), "Rendering", len(waiting))
     broken = {name: reason for name, reason in sorted(results) if reason}
-    _write_lists(category, broken)
+    for name, reason in broken.items():
+        logger.warning("left out: %s: %s", name, reason)
+    with lock:
+        _write_lists(category, objects, broken)
     return category
 
 
-def _write_lists(category: Path, broken: dict[str, str]) -> None:
-    """Write the reasons for objects that are left out, and the annotations of all that there are."""
-    write_text(category / BROKEN, json.dumps(broken, indent=1) + "\n")
-    for name, reason in broken.items():
-        logger.warning("left out: %s: %s", name, reason)
+def _write_lists(category: Path, objects: Sequence[Asset], broken: dict[str, str]) -> None:
+    """Write the reasons for objects that are left out, with those of other jobs, and the annotations of all others."""
+    path = category / BROKEN
+    reasons = (json.loads(path.read_text()) if path.is_file() else {}) | broken
+    missing = sorted(asset.name for asset in objects if not (category / asset.name).exists())
+    broken = {name: reasons[name] for name in missing if name in reasons}
+    write_text(path, json.dumps(broken, indent=1) + "\n")
     records = [json.loads(path.read_text()) for path in sorted(category.glob(f"[!.]*/{OBJECT}"))]
-    if not records:
+    if len(broken) == len(objects) and not records:
         raise DataError(f"none of {len(broken)} objects can be rendered: {next(iter(broken.values()))}", str(category))
     frames = [frame for record in records for frame in record["frames"]]
     writing.write_annotations(category, frames, [record["sequence"] for record in records])
-    logger.info("%d objects in %s, %d left out", len(records), category, len(broken))
+    logger.info("%d objects in %s/, %d left out", len(records), CATEGORY, len(broken))
 
 
 def _in_threads(

@@ -15,6 +15,13 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+def share_of(items: Sequence[Item], shard: int, shards: int) -> Sequence[Item]:
+    """Return every `shards`-th item from number `shard` on; raise CompleteSplatError if there is no such shard."""
+    if not 0 <= shard < shards:
+        raise CompleteSplatError(f"shard={shard}: must lie between 0 and {shards - 1}, for shards={shards}")
+    return items[shard::shards]
+
+
 def map_in_processes(work: Callable[[Item], Result], items: Sequence[Item], workers: int | None) -> Iterator[Result]:
     """Yield `work` of every item in order, by `workers` processes (None: one for each core) that get it once.
 

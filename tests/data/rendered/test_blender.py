@@ -60,7 +60,7 @@ def into(line, tmp_path):
     def run(out, program, error=DataError, **settings):
         given = meshes.SETTINGS | {"views": 2, "size": 8, "samples": 1, "blender": program} | settings
         with pytest.raises(error) as caught:
-            render(str(tmp_path / "meshes"), out=out, workers=1, **given)
+            render(str(tmp_path / "meshes"), out=out, **given)
         return str(caught.value)
 
     return run
