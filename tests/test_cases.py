@@ -19,7 +19,6 @@ from realestate10k_trees import module
 from scipy.spatial.transform import Rotation
 from support import some_gaussians, strict_json
 
-from completesplat.data.captures import importing
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.rendered.blender import find_blender
 from completesplat.data.rendered.rendering import render
@@ -95,14 +94,6 @@ def test_a_capture_has_the_cameras_and_images_of_its_scene(case: str, tmp_path: 
     for name, values in expected.items():
         np.testing.assert_allclose(cameras[name], values, atol=1e-6, rtol=0, err_msg=name)
     assert (first_image(tmp_path / case) - first_image(capture("", tmp_path / "truth"))).abs().mean() < 4
-
-
-def test_statistics_of_cameras_that_are_all_equally_far_are_drawn(command, tmp_path: Path) -> None:
-    folder = capture("", tmp_path / "base")
-    finished = command("data", "stats", "data=capture", f"data.root={folder}", "data.image_size=32", "out=stats")
-    assert finished.status == 0, finished.err
-    splits = strict_json(tmp_path / "stats/stats.json")["splits"]
-    assert sum(split["frames"] for split in splits.values()) >= 16
 
 
 @pytest.mark.slow
@@ -242,18 +233,6 @@ def test_a_clip_without_the_line_of_its_address_keeps_its_first_frame(tmp_path: 
     assert sequence.frames == tuple(range(12))
     poses = sequence.cameras.world_to_camera[:, :3].numpy()
     np.testing.assert_allclose(poses, rows[:, 7:].reshape(-1, 3, 4), atol=1e-9)
-
-
-def test_heic_beside_jpeg_is_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    for folder in ("photos", "images"):
-        (tmp_path / folder).mkdir()
-    for path in sorted((CASES / "images").iterdir())[:4]:
-        shutil.copy(path, tmp_path / "photos")
-    for number in range(8):
-        (tmp_path / f"photos/IMG_{number:04}.HEIC").write_bytes(np.random.default_rng(number).bytes(3000))
-    importing._copy_photos(tmp_path / "photos", tmp_path / "images")
-    assert len(list((tmp_path / "images").iterdir())) == 4
-    assert "left out: 8 files of other formats: IMG_0000.HEIC" in caplog.text
 
 
 @pytest.mark.blender
