@@ -127,26 +127,21 @@ def prediction(name: str) -> Callable[[Path], object]:
 
 
 def rendered(name: str, *others: str) -> Callable[[Path], object]:
-    """Render a mesh, beside a folder with a private image."""
+    """Render a mesh."""
 
     def read(folder: Path) -> object:
         (folder / "meshes").mkdir()
         for file in (name, *others):
             shutil.copy(CASES / "meshes" / file, folder / "meshes")
-        shutil.copytree(CASES / "outside", folder / "outside")
         return render(str(folder / "meshes"), out=folder / "data", **QUICK)
 
     return read
 
 
 @pytest.fixture
-def blender(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Skip what needs Blender where there is none; a program that fails stands in for what is refused before."""
-    if "steal" in request.node.name:
-        (program := tmp_path / "blender").write_text("#!/bin/sh\n[ $1 = --version ] && echo Blender 4.2.0\n")
-        program.chmod(0o755)
-        monkeypatch.setenv("COMPLETESPLAT_BLENDER", str(program))
-    elif request.node.get_closest_marker("blender"):
+def blender(request: pytest.FixtureRequest) -> None:
+    """Skip what needs Blender where there is none."""
+    if request.node.get_closest_marker("blender"):
         try:
             find_blender()
         except CompleteSplatError as reason:
@@ -170,7 +165,6 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     "cuttex": (rendered("cuttex.glb", "cut.png"), f"its texture cut.png {UNREADABLE}"),
     "lfstex": (rendered("lfstex.glb", "lfs.png"), f"its texture lfs.png {UNREADABLE}"),
     "ktx2only": (rendered("ktx2only.glb", "t.ktx2"), "a texture in a format that Blender does not read, such as KTX2"),
-    "steal": (rendered("steal.obj", "steal.mtl"), "private.png lies outside of the folder of meshes"),
 }
 
 

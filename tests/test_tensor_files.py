@@ -33,11 +33,13 @@ def clips(value: Any) -> Any:
     return [{"key": "a", "more": value}]
 
 
-def write(path: Path, pickled: bytes, records: Mapping[str, bytes] = {"data/0": bytes(8)}) -> None:
-    """Write an archive as torch does, with a pickle and records of the test's making."""
+def write(path: Path, pickled: bytes, records: Mapping[str, bytes] = {"data/0": bytes(8)}, attribute: int = 0) -> None:
+    """Write an archive as torch does, with a pickle and records of the test's making, these with an attribute."""
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in {"data.pkl": pickled, "byteorder": b"little", "version": b"3\n", **records}.items():
-            archive.writestr(f"archive/{name}", content)
+            record = zipfile.ZipInfo(f"archive/{name}")
+            record.external_attr = attribute if name in records else 0
+            archive.writestr(record, content)
 
 
 def text(value: str) -> bytes:
@@ -194,16 +196,8 @@ def test_a_length_that_is_said_again_allows_no_more(tmp_path):
 @pytest.mark.parametrize("reader", ["checkpoint", "published"])
 def test_numbers_marked_as_a_directory_are_refused(tmp_path, reader):
     """torch takes such a record's bytes from memory that nobody has written to."""
-    with zipfile.ZipFile(tmp_path / "a", "w") as archive:
-        value = (
-            b"\x80\x02}"
-            + b"".join(text(name) + b"}" + text("a") + tensor(2) + b"ss" for name in ("state_dict", STATE))
-            + b"."
-        )
-        for name, content in {"data.pkl": value, "byteorder": b"little", "version": b"3\n", "data/0": bytes(8)}.items():
-            info = zipfile.ZipInfo(f"archive/{name}")
-            info.external_attr = 0x10 if name == "data/0" else 0
-            archive.writestr(info, content)
+    entries = b"".join(text(name) + b"}" + text("a") + tensor(2) + b"ss" for name in ("state_dict", STATE))
+    write(tmp_path / "a", b"\x80\x02}" + entries + b".", attribute=0x10)
     with pytest.raises(CompleteSplatError, match="a record that is a directory"):
         READERS[reader](tmp_path / "a")
 
