@@ -167,14 +167,6 @@ COLMAP: dict[str, Change] = {
 }
 
 
-@pytest.mark.parametrize("change", COLMAP.values(), ids=COLMAP)
-def test_a_text_model_of_colmap_is_read_whole(tmp_path, change):
-    write_colmap(tmp_path)
-    expected = sequence(tmp_path)
-    change(tmp_path)
-    must_agree(sequence(tmp_path), expected)
-
-
 def test_images_without_lines_for_their_features_are_refused_because_every_second_would_be_lost(tmp_path):
     write_colmap(tmp_path)
     lines_of_images(lambda lines: [line for line in lines if not line.startswith("1.5")])(tmp_path)
@@ -324,8 +316,8 @@ LAYOUTS: dict[str, Change] = {
 }
 
 
-@pytest.mark.parametrize("change", LAYOUTS.values(), ids=LAYOUTS)
-def test_models_of_colmap_are_found_in_the_folders_that_programs_make(tmp_path, change):
+@pytest.mark.parametrize("change", (COLMAP | LAYOUTS).values(), ids=COLMAP | LAYOUTS)
+def test_a_model_of_colmap_is_read_whole_in_the_forms_and_folders_that_programs_make(tmp_path, change):
     write_colmap(tmp_path)
     expected = sequence(tmp_path)
     change(tmp_path)
