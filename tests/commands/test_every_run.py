@@ -3,6 +3,7 @@
 import copy
 import json
 import shutil
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -101,6 +102,20 @@ def strangers(pipeline, tmp_path):
     """A copy of stage 1's run without weights."""
     shutil.copytree(pipeline.var, tmp_path / "run", ignore=shutil.ignore_patterns("weights", "images"))
     return tmp_path / "run"
+
+
+@pytest.mark.parametrize("place", ["model.model.encoder", "model.model.encoder.channels", "model"])
+def test_a_checkpoint_names_nothing_but_parts_of_a_model(strangers, tmp_path, monkeypatch, place):
+    (tmp_path / "trap.py").write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')\nclass Trap: pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    config = OmegaConf.load(strangers / "config.yaml")
+    OmegaConf.update(config, place, {"_target_": "trap.Trap"}, merge=False)
+    OmegaConf.save(config, strangers / "config.yaml")
+    for path in (strangers, strangers / "checkpoints/last.ckpt"):
+        with pytest.raises(WeightsError, match=r"names trap\.Trap"):
+            CompleteSplat.from_pretrained(path)
+    assert not (tmp_path / "sprung").exists()
+    assert "trap" not in sys.modules
 
 
 def test_a_checkpoint_of_another_architecture_or_without_its_camera_is_refused(strangers):

@@ -186,6 +186,16 @@ def test_a_clip_of_realestate10k_has_its_first_frame_with_and_without_the_line_o
     torch.testing.assert_close(read.cameras.world_to_camera[:, :3], expected)
 
 
+def test_points_that_float32_cannot_hold_are_left_out_with_a_word(tmp_path, caplog):
+    write_colmap(tmp_path)
+    expected = sequence(tmp_path)
+    with (tmp_path / "sparse/0/points3D.txt").open("a") as file:
+        file.write("98 1e200 0 0 9 9 9 0.5\n99 0 -1e30 0 9 9 9 0.5\n")
+    must_agree(sequence(tmp_path), expected, 0.2)  # the median is another
+    assert sequence(tmp_path).points.shape == expected.points.shape
+    assert "2 of 42 points are more than 100,000 scene radii away and are left out" in caplog.text
+
+
 def resave(folder: Path, change: Callable[[Image.Image], Image.Image], orientation: int = 1, suffix: str = "") -> None:
     """Change all images, and tag them to be turned."""
     exif = Image.Exif()
