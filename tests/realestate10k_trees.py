@@ -11,7 +11,6 @@ from PIL import Image
 
 from completesplat.data.loading.loader import SceneLoader
 from completesplat.data.realestate10k.module import RE10KDataModule
-from completesplat.errors import DataError
 from completesplat.scene import SceneBatch
 
 HEIGHT, WIDTH = 18, 32
@@ -112,11 +111,3 @@ def same(a: SceneBatch, b: SceneBatch) -> bool:
 
 def equal(one: list[SceneBatch], other: list[SceneBatch]) -> bool:
     return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
-
-
-def assert_refusal(error: DataError, kind: type[DataError], file: Path | str, clip: str | None, frame: int | None):
-    """Its kind, and where it says that it happened, in one line."""
-    assert (type(error), error.file, error.sequence, error.frame) == (kind, str(file), clip, frame)
-    place = [str(file), *([clip] if clip else []), *([] if frame is None else [f"frame {frame}"])]
-    assert str(error) == f"{', '.join(place)}: {error.reason}"
-    assert "\n" not in str(error)

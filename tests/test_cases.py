@@ -19,7 +19,6 @@ from realestate10k_trees import module
 from scipy.spatial.transform import Rotation
 from support import some_gaussians, strict_json
 
-from completesplat.data.captures import importing
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.rendered.blender import find_blender
 from completesplat.data.rendered.rendering import render
@@ -97,14 +96,6 @@ def test_a_capture_has_the_cameras_and_images_of_its_scene(case: str, tmp_path: 
     assert (first_image(tmp_path / case) - first_image(capture("", tmp_path / "truth"))).abs().mean() < 4
 
 
-def test_statistics_of_cameras_that_are_all_equally_far_are_drawn(command, tmp_path: Path) -> None:
-    folder = capture("", tmp_path / "base")
-    finished = command("data", "stats", "data=capture", f"data.root={folder}", "data.image_size=32", "out=stats")
-    assert finished.status == 0, finished.err
-    splits = strict_json(tmp_path / "stats/stats.json")["splits"]
-    assert sum(split["frames"] for split in splits.values()) >= 16
-
-
 @pytest.mark.slow
 def test_a_fit_far_from_the_origin_is_as_good_as_at_the_origin(command, tmp_path: Path) -> None:
     quick = ["experiment=capture", "data.image_size=32", "trainer.max_steps=60", "trainer.accelerator=cpu"]
@@ -136,26 +127,21 @@ def prediction(name: str) -> Callable[[Path], object]:
 
 
 def rendered(name: str, *others: str) -> Callable[[Path], object]:
-    """Render a mesh, beside a folder with a private image."""
+    """Render a mesh."""
 
     def read(folder: Path) -> object:
         (folder / "meshes").mkdir()
         for file in (name, *others):
             shutil.copy(CASES / "meshes" / file, folder / "meshes")
-        shutil.copytree(CASES / "outside", folder / "outside")
         return render(str(folder / "meshes"), out=folder / "data", **QUICK)
 
     return read
 
 
 @pytest.fixture
-def blender(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Skip what needs Blender where there is none; a program that fails stands in for what is refused before."""
-    if "steal" in request.node.name:
-        (program := tmp_path / "blender").write_text("#!/bin/sh\n[ $1 = --version ] && echo Blender 4.2.0\n")
-        program.chmod(0o755)
-        monkeypatch.setenv("COMPLETESPLAT_BLENDER", str(program))
-    elif request.node.get_closest_marker("blender"):
+def blender(request: pytest.FixtureRequest) -> None:
+    """Skip what needs Blender where there is none."""
+    if request.node.get_closest_marker("blender"):
         try:
             find_blender()
         except CompleteSplatError as reason:
@@ -179,7 +165,6 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     "cuttex": (rendered("cuttex.glb", "cut.png"), f"its texture cut.png {UNREADABLE}"),
     "lfstex": (rendered("lfstex.glb", "lfs.png"), f"its texture lfs.png {UNREADABLE}"),
     "ktx2only": (rendered("ktx2only.glb", "t.ktx2"), "a texture in a format that Blender does not read, such as KTX2"),
-    "steal": (rendered("steal.obj", "steal.mtl"), "private.png lies outside of the folder of meshes"),
 }
 
 
@@ -242,18 +227,6 @@ def test_a_clip_without_the_line_of_its_address_keeps_its_first_frame(tmp_path: 
     assert sequence.frames == tuple(range(12))
     poses = sequence.cameras.world_to_camera[:, :3].numpy()
     np.testing.assert_allclose(poses, rows[:, 7:].reshape(-1, 3, 4), atol=1e-9)
-
-
-def test_heic_beside_jpeg_is_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    for folder in ("photos", "images"):
-        (tmp_path / folder).mkdir()
-    for path in sorted((CASES / "images").iterdir())[:4]:
-        shutil.copy(path, tmp_path / "photos")
-    for number in range(8):
-        (tmp_path / f"photos/IMG_{number:04}.HEIC").write_bytes(np.random.default_rng(number).bytes(3000))
-    importing._copy_photos(tmp_path / "photos", tmp_path / "images")
-    assert len(list((tmp_path / "images").iterdir())) == 4
-    assert "left out: 8 files of other formats: IMG_0000.HEIC" in caplog.text
 
 
 @pytest.mark.blender

@@ -1,6 +1,7 @@
 """Every file of `conf/` composes and instantiates; every experiment trains; ablations change what they say."""
 
 import re
+from functools import cache
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -21,19 +22,18 @@ CONF = conf_folder()
 
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir())
 TRAINING_GROUPS = [group for group in GROUPS if not group.endswith("_task")]
-EVERY_OPTION = [(group, option) for group in TRAINING_GROUPS for option in options(group)]
 
 
 def test_nothing_in_the_tree_is_forgotten_here():
     assert {path.stem for path in CONF.glob("*.yaml")} == {*VERBS, "base"}
     assert set(GROUPS) == {*TRAINING_GROUPS, "data_task", "bench_task", "report_task"}
-    assert len(EVERY_OPTION) > 20
     assert all(compose_config(verb).out.startswith(f"outputs/{verb}/") for verb in VERBS if verb != "new")
 
 
-WHOLES = ["model", "experiment", "ablation", "evaluation", "posterior", "objective"]
 # Options of other groups differ in one part of a run only, so that one configuration has one of each group.
 DELTAS = ["experiment", "ablation", "posterior", "objective"]
+PARTS = [group for group in TRAINING_GROUPS if group not in DELTAS]
+WHOLES = ["model", "evaluation"]
 
 
 def needed(group: str, option: str) -> list[str]:
@@ -51,26 +51,35 @@ def needed(group: str, option: str) -> list[str]:
     return given + (["model.autoreconstructor_checkpoint=null"] if stage2 else [])
 
 
-def complete(group: str, option: str, *more: str):
-    """Return a config with this option in which nothing is missing."""
-    chosen = {group: option}
-    if group not in DELTAS:
-        number = options(group).index(option)
-        others = [other for other in TRAINING_GROUPS if other not in DELTAS]
-        chosen = {other: options(other)[number % len(options(other))] for other in others}
+def complete(chosen: dict[str, str], *more: str):
+    """Return a config with these options in which nothing is missing, and which passes the checks of `fit`."""
     settings = dict.fromkeys(setting for item in chosen.items() for setting in needed(*item))
-    return compose_config("fit", *(f"{key}={value}" for key, value in chosen.items()), *settings, *more, "out=/nowhere")
-
-
-@pytest.mark.parametrize(("group", "option"), EVERY_OPTION)
-def test_every_option_composes_fits_the_checks_and_builds(group, option):
-    config = complete(group, option)
+    given = [f"{group}={option}" for group, option in chosen.items()]
+    config = compose_config("fit", *given, *settings, *more, "out=/nowhere")
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     check_verb("fit", config)
     check_image_size(config)
+    return config
+
+
+@pytest.mark.parametrize(("group", "option"), [(group, option) for group in DELTAS for option in options(group)])
+def test_every_option_that_changes_several_parts_composes_and_fits_the_checks(group, option):
+    complete({group: option})
+
+
+@pytest.mark.parametrize("number", range(max(len(options(group)) for group in PARTS)))
+def test_every_option_of_a_part_composes_fits_the_checks_and_builds(number):
+    """One config has an option of each part, those with fewer options in turn."""
+    config = complete({group: options(group)[number % len(options(group))] for group in PARTS})
+    for group in PARTS:
+        if group not in WHOLES and number < len(options(group)):
+            builds(config, group, options(group)[number])
+
+
+def builds(config: Any, group: str, option: str) -> None:
     if group == "rasterizer":
         assert instantiate(config.rasterizer.constants) == RenderingConstants()
-    if group in WHOLES or (option == "cuda" and not torch.cuda.is_available()):
+    if option == "cuda" and not torch.cuda.is_available():
         return
     if group == "autoreconstructor":
         config.autoreconstructor.pretrained = None
@@ -124,7 +133,7 @@ DATA = {"co3d": [], "realestate10k": REALESTATE}
 
 @pytest.mark.parametrize("data", DATA)
 def test_the_papers_stages(data):
-    one, two = (complete("experiment", f"paper_var_stage{n}", *DATA[data]) for n in (1, 2))
+    one, two = (complete({"experiment": f"paper_var_stage{n}"}, *DATA[data]) for n in (1, 2))
     lengths = [(c.trainer.get("max_epochs"), c.trainer.max_steps) for c in (one, two)]
     assert lengths == {"co3d": [(6000, -1), (8000, -1)], "realestate10k": [(None, 200_000), (None, 270_000)]}[data]
     assert [c.optimizer.lr for c in (one, two)] == [5e-5, 5e-6]
@@ -144,7 +153,9 @@ def test_the_papers_stages(data):
 
 @pytest.mark.parametrize("data", DATA)
 def test_the_papers_diffusion(data):
-    main, masked = (complete("experiment", f"paper_{name}", *DATA[data]) for name in ("diffusion", "diffusion_masked"))
+    main, masked = (
+        complete({"experiment": f"paper_{name}"}, *DATA[data]) for name in ("diffusion", "diffusion_masked")
+    )
     assert [c.trainer.max_steps for c in (main, masked)] == [1_000_000, 100_000]
     for config in (main, masked):
         assert (config.optimizer.lr, config.data.batch_size, config.data.image_size) == (1e-4, 32, 128)
@@ -250,9 +261,10 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
     return {k: v for key, value in config.items() for k, v in flat(value, f"{prefix}.{key}".lstrip(".")).items()}
 
 
-def parts(config: Any) -> dict[str, Any]:
+@cache
+def parts(ablation: str) -> dict[str, Any]:
     """Return the config groups that `model` refers to."""
-    resolved = OmegaConf.to_container(config, resolve=True)
+    resolved = OmegaConf.to_container(composed(ablation), resolve=True)
     return flat({name: resolved[name] for name in ("autoreconstructor", "loss", "data", "optimizer", "trainer")})
 
 
@@ -262,7 +274,7 @@ def built(ablation: str, part: str) -> Any:
 
 @pytest.mark.parametrize("ablation", ABLATIONS)
 def test_an_ablation_changes_its_own_settings_and_nothing_else(ablation):
-    full, ablated = parts(composed("full")), parts(composed(ablation))
+    full, ablated = {**parts("full")}, parts(ablation)
     if ablation == "no_lpips":
         full["loss.terms.lpips"] = "there"
     changed = {key for key in full.keys() | ablated.keys() if full.get(key) != ablated.get(key)}

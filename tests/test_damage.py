@@ -263,6 +263,8 @@ CO3D = [
     (put(S, "0.point_cloud.path", "../x"), OutsidePath, f"{S}, a", "outside", ALL),
     (put(S, "0.viewpoint_quality_score", "1"), BadAnnotation, f"{S}, a", "must be a number", ALL),
     (edit(S, lambda e: e[1:]), BadAnnotation, f"{S}, a", "not annotated", ALL),
+    (edit(F, lambda e: {"frames": e}), BadAnnotation, F, "must hold a list"),
+    (edit(L, lambda s: [s]), BadAnnotation, L, "no train"),
     (edit(L, lambda s: s["train"].append(["a"])), BadAnnotation, L, "expected", []),
     (edit(L, lambda s: s["train"].append(["a", 99])), BadAnnotation, f"{L}, a, frame 99", "not annotated", []),
     *((cut(file, 100), UnreadableFile, file, "") for file in (F, S, L)),

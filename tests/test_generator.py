@@ -251,8 +251,10 @@ def test_what_is_visible_needs_the_images_shape_and_values_from_0_to_1(model, ph
             model(photo, visible, steps=1)
 
 
-@pytest.mark.parametrize("kind", [torch.complex64, torch.bool, torch.int64])
-@pytest.mark.parametrize("ending", [".bias", "latent_std"])
+@pytest.mark.parametrize(
+    ("kind", "ending"),
+    [(torch.complex64, ".bias"), (torch.bool, "latent_std"), (torch.int64, ".bias")],
+)
 def test_weights_of_another_kind_than_floats_are_refused_and_not_cast(folder, kind, ending):
     tensors = load_file(folder / WEIGHTS_FILE)
     name = next(name for name in tensors if name.endswith(ending))

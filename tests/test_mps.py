@@ -44,20 +44,22 @@ def test_the_tiled_rasterizer_draws_gaussians_of_mps_on_the_cpu_with_their_gradi
     assert gradient.abs().max() > 0
 
 
-@pytest.mark.parametrize("score", [energy_score, crps, lambda *values: rank_histogram(*values).tolist()])
-def test_scores_of_samples_on_mps_are_those_on_the_cpu(score):
-    samples, truth = torch.rand(5, 12), torch.rand(12)
-    expected = score(samples, truth)
-    with FakeMPS():
-        assert score(samples.to("mps"), truth.to("mps")) == expected
+SAMPLES_AND_TRUTH = torch.rand(5, 12), torch.rand(12)
+TWO_SETS = torch.rand(9, 4), torch.rand(9, 4)
+FIGURES = [
+    (energy_score, SAMPLES_AND_TRUTH),
+    (crps, SAMPLES_AND_TRUTH),
+    (lambda *values: rank_histogram(*values).tolist(), SAMPLES_AND_TRUTH),
+    (frechet_distance, TWO_SETS),
+    (kernel_distance, TWO_SETS),
+]
 
 
-@pytest.mark.parametrize("distance", [frechet_distance, kernel_distance])
-def test_distances_of_sets_on_mps_are_those_on_the_cpu(distance):
-    first, second = torch.rand(9, 4), torch.rand(9, 4)
-    expected = distance(first, second)
+@pytest.mark.parametrize(("figure", "values"), FIGURES)
+def test_figures_of_samples_and_of_sets_on_mps_are_those_on_the_cpu(figure, values):
+    expected = figure(*values)
     with FakeMPS():
-        assert distance(first.to("mps"), second.to("mps")) == pytest.approx(expected)
+        assert figure(*(value.to("mps") for value in values)) == pytest.approx(expected)
 
 
 def test_copies_of_gaussians_on_mps_are_scaled_as_on_the_cpu():

@@ -61,66 +61,50 @@ def trap(tmp_path, monkeypatch):
     sys.modules.pop("trap", None)
 
 
-@pytest.mark.parametrize(
-    ("place", "named"),
-    [
-        (SCHEDULER, {"_target_": "trap.Trap"}),
-        (f"{ENCODER}.channels", [8, {"_target_": "trap.Trap"}]),
-        (SCHEDULER, {"_target_": "completesplat.generator.CompleteSplat.from_pretrained", "path": "x"}),
-        (SCHEDULER, {"_target_": "os.system", "command": "true"}),
-        (SCHEDULER, {"_target_": "completesplat.diffusion.sampling.Sampler", "scheduler": {"_target_": "trap.Trap"}}),
-    ],
-)
-def test_a_configuration_names_nothing_but_parts_of_a_model(folder, trap, place, named):
-    change(folder, place, named)
+TRAP = {"_target_": "trap.Trap"}
+LOADER = {"_target_": "completesplat.generator.CompleteSplat.from_pretrained", "path": "x"}
+NO_PART = "no part of models"
+REFUSED = [
+    (SCHEDULER, TRAP, f"names trap.Trap, which is {NO_PART}"),
+    (SCHEDULER, {"_target_": "completesplat.diffusion.sampling.Sampler", "scheduler": TRAP}, NO_PART),
+    (f"{ENCODER}.channels", [8, TRAP], NO_PART),
+    (SCHEDULER, LOADER, NO_PART),
+    (SCHEDULER, {"_target_": "os.system", "command": "true"}, f"names os.system, which is {NO_PART}"),
+    ("denoiser._target_", "mine.Mine", f"names mine.Mine, which is {NO_PART} or data in this package; "),
+    ("denoiser._target_", "\x1b[2J", r"names \x1b[2J, which is no part"),
+    ("denoiser._target_", "${oc.env:HOME}", "${oc.env:HOME} refers to something else"),
+    ("denoiser._target_", "Encoder", "encoder.Encoder, which is no part of a model; allowed are Denoiser, "),
+    ("denoiser._target_", "torch.optim.Adam", "denoiser names torch.optim.Adam, which is no part of a model"),
+    ("denoiser._target_", ["Denoiser"], "Denoiser'], which is no part of a model"),
+    ("sampler._partial_", True, "sampler._partial_: there is no such setting, but scheduler, steps"),
+    ("sampler.steps", "7", "sampler.steps=7: must be a whole number"),
+    ("autoreconstructor.pretrained", "some/hub-id", "autoreconstructor.pretrained=some/hub-id: must be null"),
+    ("image_size", 1_000_000, "image_size=1000000: must lie between 8 and 1024"),
+    (f"{ENCODER}.channels", [10**9] * 4, "must lie between 1 and 8192"),
+    (f"{ENCODER}.channels", 8, "must be a list"),
+    (f"{ENCODER}.first_log_variance", math.inf, "must be finite"),
+    (f"{SCHEDULER}.num_train_timesteps", 10**9, "must lie between 1 and 10000"),
+    ("more", {}, "a model's settings are autoreconstructor, "),
+    ("training", None, "training=None: must be a mapping"),
+    ("training", {"picture_mean": [0.5] * 7}, "must have 8 entries"),
+    # Larger than what the file of weights has.
+    ("denoiser.channels", [2048] * 4, "denoiser.network.conv_in.weight"),
+    (f"{ENCODER}.latent_channels", 8192, f"{ENCODER}.network.conv_out.weight"),
+]
+
+
+@pytest.mark.parametrize(("place", "value", "reason"), REFUSED)
+def test_a_configuration_is_refused_in_one_line_and_nothing_that_it_names_is_imported(
+    folder, trap, place, value, reason
+):
+    change(folder, place, value)
     message = refusal(folder)
     assert not trap()
     assert "trap" not in sys.modules
-    assert message.startswith(f"{folder / CONFIG_FILE} names ")
-    assert "no part of models" in message
-
-
-@pytest.mark.parametrize(
-    ("place", "value", "reason"),
-    [
-        ("denoiser._target_", "Encoder", "encoder.Encoder, which is no part of a model; allowed are Denoiser, "),
-        ("denoiser._target_", "torch.optim.Adam", "denoiser names torch.optim.Adam, which is no part of a model"),
-        ("denoiser._target_", ["Denoiser"], "Denoiser'], which is no part of a model"),
-        ("sampler._partial_", True, "sampler._partial_: there is no such setting, but scheduler, steps"),
-        ("sampler.steps", "7", "sampler.steps=7: must be a whole number"),
-        ("autoreconstructor.pretrained", "some/hub-id", "autoreconstructor.pretrained=some/hub-id: must be null"),
-        ("image_size", 1_000_000, "image_size=1000000: must lie between 8 and 1024"),
-        (f"{ENCODER}.channels", [10**9] * 4, "must lie between 1 and 8192"),
-        (f"{ENCODER}.channels", 8, "must be a list"),
-        (f"{ENCODER}.first_log_variance", math.inf, "must be finite"),
-        (f"{SCHEDULER}.num_train_timesteps", 10**9, "must lie between 1 and 10000"),
-        ("more", {}, "a model's settings are autoreconstructor, "),
-        ("training", None, "training=None: must be a mapping"),
-        ("training", {"picture_mean": [0.5] * 7}, "must have 8 entries"),
-    ],
-)
-def test_settings_are_of_their_kinds_and_within_bounds(folder, place, value, reason):
-    change(folder, place, value)
-    message = refusal(folder)
-    assert message.startswith(f"{folder / CONFIG_FILE}: ")
-    assert reason in message
-    assert len(message) < 1000
-
-
-@pytest.mark.parametrize(
-    ("target", "reason"),
-    [
-        ("mine.Mine", "names mine.Mine, which is no part of models or data in this package; "),
-        ("\x1b[2J", r"names \x1b[2J, which is no part"),
-        ("${oc.env:HOME}", "${oc.env:HOME} refers to something else"),
-    ],
-)
-def test_names_that_are_not_the_packages_are_refused_in_one_line(folder, target, reason):
-    change(folder, "denoiser._target_", target)
-    message = refusal(folder)
-    assert message.startswith(f"{folder / CONFIG_FILE}")
+    assert str(folder / CONFIG_FILE) in message or f"by {CONFIG_FILE}" in message
     assert reason in message
     assert message.isprintable()
+    assert len(message) < 1000
 
 
 def targets(part: dict) -> list[str]:
@@ -152,20 +136,6 @@ def test_what_is_no_configuration_at_all_is_refused(folder):
     ):
         (folder / CONFIG_FILE).write_text(text)
         assert reason in refusal(folder)
-
-
-@pytest.mark.parametrize(
-    ("place", "value", "tensor"),
-    [
-        ("denoiser.channels", [2048] * 4, "denoiser.network.conv_in.weight"),
-        (f"{ENCODER}.latent_channels", 8192, f"{ENCODER}.network.conv_out.weight"),
-    ],
-)
-def test_a_network_is_not_larger_than_its_file(folder, place, value, tensor):
-    change(folder, place, value)
-    message = refusal(folder)
-    assert tensor in message
-    assert f"by {CONFIG_FILE}" in message
 
 
 HOLDER = """

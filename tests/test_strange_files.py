@@ -1,6 +1,5 @@
 """Files of strangers: predictions' descriptions, and Gaussians of other programs, each with its right value."""
 
-import json
 import logging
 import struct
 from pathlib import Path
@@ -17,29 +16,6 @@ from completesplat.export.ply import read_ply, write_ply
 from completesplat.export.reading import read_gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.viewer.sample import read_scene
-
-CAMERA = {
-    "world_to_camera": np.eye(4).tolist(),
-    "intrinsics": [[50, 0, 16], [0, 50, 16], [0, 0, 1]],
-    "image_size": [32, 32],
-}
-DEEP = 100_000
-
-
-def prediction(folder: Path, **changes: object) -> Path:
-    """Write a sample and its description, with changes to its camera and its direction up."""
-    write_ply(folder / "sample_00.ply", SCENE)
-    settings = {"up": changes.pop("up", [0, -1, 0])}
-    (folder / "scene.json").write_text(json.dumps({"reference_camera": CAMERA | changes, "settings": settings}))
-    return folder
-
-
-def test_a_scene_of_thousands_of_layers_is_shown_as_one(tmp_path):
-    samples, _ = read_scene(prediction(tmp_path, image_size=[1, 1]))
-    assert samples[0].layers == 3  # as many Gaussians as SCENE has
-    write_ply(tmp_path / "sample_00.ply", SCENE[torch.zeros(17).long()])
-    samples, _ = read_scene(tmp_path)
-    assert samples[0].layers == 1
 
 
 def spz(system: int) -> bytes:

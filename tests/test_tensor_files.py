@@ -33,11 +33,13 @@ def clips(value: Any) -> Any:
     return [{"key": "a", "more": value}]
 
 
-def write(path: Path, pickled: bytes, records: Mapping[str, bytes] = {"data/0": bytes(8)}) -> None:
-    """Write an archive as torch does, with a pickle and records of the test's making."""
+def write(path: Path, pickled: bytes, records: Mapping[str, bytes] = {"data/0": bytes(8)}, attribute: int = 0) -> None:
+    """Write an archive as torch does, with a pickle and records of the test's making, these with an attribute."""
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in {"data.pkl": pickled, "byteorder": b"little", "version": b"3\n", **records}.items():
-            archive.writestr(f"archive/{name}", content)
+            record = zipfile.ZipInfo(f"archive/{name}")
+            record.external_attr = attribute if name in records else 0
+            archive.writestr(record, content)
 
 
 def text(value: str) -> bytes:
@@ -182,47 +184,41 @@ def test_many_tensors_that_repeat_one_are_refused_by_their_total(tmp_path):
     assert read_tensor_file(tmp_path / "a.pt").keys() == {"embedding", "tied"}
 
 
-def test_a_length_that_is_said_again_allows_no_more(tmp_path):
-    """torch compares the length of a storage with the file only where it is named first."""
-    size = number(2**30)
-    large = tensor(2**30).replace(b"K\x02t", size + b"t")
-    write(tmp_path / "a", b"\x80\x02}" + text("state_dict") + b"](" + tensor(2) + large + b"es.")
-    with bounded(2**26), pytest.raises(CompleteSplatError, match="its content is larger than the file"):
-        read_checkpoint(tmp_path / "a")
-
-
 @pytest.mark.parametrize("reader", ["checkpoint", "published"])
 def test_numbers_marked_as_a_directory_are_refused(tmp_path, reader):
     """torch takes such a record's bytes from memory that nobody has written to."""
-    with zipfile.ZipFile(tmp_path / "a", "w") as archive:
-        value = (
-            b"\x80\x02}"
-            + b"".join(text(name) + b"}" + text("a") + tensor(2) + b"ss" for name in ("state_dict", STATE))
-            + b"."
-        )
-        for name, content in {"data.pkl": value, "byteorder": b"little", "version": b"3\n", "data/0": bytes(8)}.items():
-            info = zipfile.ZipInfo(f"archive/{name}")
-            info.external_attr = 0x10 if name == "data/0" else 0
-            archive.writestr(info, content)
+    entries = b"".join(text(name) + b"}" + text("a") + tensor(2) + b"ss" for name in ("state_dict", STATE))
+    write(tmp_path / "a", b"\x80\x02}" + entries + b".", attribute=0x10)
     with pytest.raises(CompleteSplatError, match="a record that is a directory"):
         READERS[reader](tmp_path / "a")
 
 
-def test_sizes_of_many_long_numbers_take_no_time(tmp_path):
-    sizes = b"(" + 50_000 * (b"\x8a\xff" + b"\x01" * 255) + b"t"
-    write(tmp_path / "a", b"\x80\x02" + tensor(2).replace(number(2) + b"\x85", sizes) + b".")
-    with bounded(2**27), pytest.raises(CompleteSplatError, match="unusual sizes"):
+def of_size(size: int) -> bytes:
+    """Return instructions for a tensor that says this size of itself and of its storage."""
+    said = b"J" + struct.pack("<i", size)
+    return tensor(2).replace(b"K\x02t", said + b"t").replace(number(2), said)
+
+
+SIZES = {
+    # torch compares the length of a storage with the file only where it is named first.
+    "a length that is said again": (
+        b"](" + tensor(2) + tensor(2**30).replace(b"K\x02t", number(2**30) + b"t") + b"e",
+        "its content is larger than the file",
+    ),
+    "many long numbers": (
+        tensor(2).replace(number(2) + b"\x85", b"(" + 50_000 * (b"\x8a\xff" + b"\x01" * 255) + b"t"),
+        "unusual sizes",
+    ),
+    "three numbers of two": (of_size(3), "not a readable checkpoint"),
+    "many numbers of two": (of_size(2**28), "not a readable checkpoint"),
+}
+
+
+@pytest.mark.parametrize(("value", "reason"), SIZES.values(), ids=SIZES)
+def test_sizes_that_the_file_does_not_have_are_refused(tmp_path, value, reason):
+    write(tmp_path / "a", b"\x80\x02}" + text("state_dict") + b"}" + text("a") + value + b"ss.")
+    with bounded(2**27), pytest.raises(CompleteSplatError, match=reason):
         read_checkpoint(tmp_path / "a")
-
-
-def test_numbers_that_the_file_does_not_have_are_refused(tmp_path):
-    path = tmp_path / "last.ckpt"
-    for size in (3, 2**28):
-        sizes = b"J" + struct.pack("<i", size)
-        value = tensor(2).replace(b"K\x02t", sizes + b"t").replace(number(2), sizes)
-        write(path, b"\x80\x02}" + text("state_dict") + b"}" + text("a") + value + b"ss.")
-        with bounded(2**26), pytest.raises(CompleteSplatError, match="not a readable checkpoint"):
-            read_checkpoint(path)
 
 
 def test_plain_values_of_all_kinds_are_read(tmp_path):

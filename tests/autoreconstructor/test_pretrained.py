@@ -157,3 +157,51 @@ def test_stable_diffusions_size_is_the_published_one():
     assert round(decoder / 1e6, 2) == 49.49
     assert parameters(model.reconstructor) == decoder + 27 * (128 * 9 + 1) + parameters(model.reconstructor.skips)
     assert parameters(model.reconstructor.skips) == 128 * 256 + 256
+
+
+def refusal(source, **changes) -> str:
+    with pytest.raises(WeightsError) as caught:
+        build(str(source), **changes)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_hub_id_while_offline_says_how_to_fetch_it(monkeypatch, tmp_path):
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    message = refusal("CompVis/stable-diffusion-v1-4")
+    assert "`hf download CompVis/stable-diffusion-v1-4 --local-dir DIR`" in message
+    assert "autoreconstructor.pretrained=DIR" in message
+
+
+@pytest.mark.parametrize(
+    ("changes", "difference", "setting"),
+    [
+        ({"channels": (16, 16, 16, 16)}, "weight is [8, 3, 3, 3] there and [16, 3, 3, 3] here", "channels=[8,8,16,16]"),
+        ({"norm_groups": 8}, "4 groups, not 8", "norm_groups=4"),  # every shape fits
+    ],
+)
+def test_another_size_names_the_difference_and_the_setting(folder, changes, difference, setting):
+    message = refusal(folder, **changes)
+    assert difference in message
+    assert f"autoreconstructor.encoder.{setting}" in message
+
+
+def test_files_that_are_no_vae_are_named_without_advice_to_download_another(folder, tmp_path):
+    contents = {"vae.gguf": b"GGUF", "vae.pt": b"\x80\x02c__builtin__\neval\n."}
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+    torch.save({"state_dict": {"unet.weight": torch.ones(1)}}, tmp_path / "vae.ckpt")
+    (folder / SAFETENSORS).rename(folder / "kl-f8.safetensors")
+    for name, reason in {
+        "vae.gguf": "not one of the files that are read: .safetensors, .bin, .ckpt",
+        "vae.pt": "damaged, or not a VAE (",
+        "vae.ckpt": "encoder.conv_in.weight is missing there",
+        "vae_only": f"give autoreconstructor.pretrained={folder}/kl-f8.safetensors",
+    }.items():
+        message = refusal(tmp_path / name)
+        assert message.startswith(str(tmp_path / name))
+        assert reason in message
+        assert "hf download" not in message
+        assert "trust" not in message
+    assert refusal(tmp_path / "absent").startswith(f"{tmp_path / 'absent'}: no such folder")  # no id of the hub

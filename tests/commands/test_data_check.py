@@ -1,13 +1,12 @@
 """`completesplat data check` on a damaged copy: every planted fault is found, and nothing else."""
 
-import gzip
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from co3d_trees import change
 from realestate10k_trees import make_clip, write_tree
 from support import SMALL, strict_json
 
@@ -16,15 +15,6 @@ from completesplat.data.toy import write_objects
 FRAMES, SEQUENCES = "frame_annotations.jgz", "sequence_annotations.jgz"
 SET_LIST = "set_lists/set_lists_fewview_train.json"
 SCENES = 6
-
-
-def edit(path: Path, change: Callable[[Any], object]) -> None:
-    opened = gzip.open if path.suffix == ".jgz" else open
-    with opened(path, "rt") as file:
-        content = json.load(file)
-    change(content)
-    with opened(path, "wt") as file:
-        json.dump(content, file)
 
 
 def cut_short(path: Path) -> None:
@@ -60,13 +50,13 @@ def test_every_planted_fault_is_found_and_nothing_else(command, intact, damaged,
     image, pose, cloud, sound, *_ = sorted(path.name for path in damaged.iterdir() if (path / "images").is_dir())
     cut_short(damaged / image / "images/frame000002.jpg")
     cut_short(damaged / cloud / "pointcloud.ply")
-    edit(damaged / SET_LIST, lambda lists: lists["train"].append([sound, 99]))  # frame 99 has no annotation
+    change(damaged / SET_LIST, lambda lists: lists["train"].append([sound, 99]))  # frame 99 has no annotation
 
     def plant(entries: list[dict]) -> None:
         entry = [entry for entry in entries if entry["sequence_name"] == pose][1]
         entry["viewpoint"].update(T=[0.0, float("nan"), 1.0])
 
-    edit(damaged / FRAMES, plant)
+    change(damaged / FRAMES, plant)
     finished, results = checked(command, damaged.parent, tmp_path / "out")
     assert finished.status == 0
     places = {(entry["sequence"], entry["frame"]) for entry in results["refused"]}
@@ -97,7 +87,7 @@ def test_where_nothing_is_usable_the_status_is_1(command, damaged, tmp_path, dam
 
 
 def test_validation_on_test_sequences_is_reported(command, damaged, tmp_path):
-    edit(damaged / SET_LIST, lambda lists: lists.update(val=lists["test"]))
+    change(damaged / SET_LIST, lambda lists: lists.update(val=lists["test"]))
     finished, results = checked(command, damaged.parent, tmp_path / "out")
     assert finished.status == 1
     assert "1 sequences are in both val and test" in results["refused"][-1]["reason"]

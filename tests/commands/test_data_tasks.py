@@ -162,9 +162,3 @@ def test_what_cannot_be_encoded_is_refused(pipeline, packed_toys, stage, setting
     checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
     given = ["data_task=latents", f"ckpt={checkpoint}", f"overrides=['data.root={packed_toys}']", setting]
     assert message in refused("data", *given)
-
-
-def test_stage_one_does_not_train_from_what_it_would_encode(command, pipeline, latent_cache, tmp_path):
-    settings = [f"data.root={pipeline.toy}", *SMALL, "experiment=toy_var", "data.color_jitter=null", "test=false"]
-    finished = command("fit", *settings, f"data.latent_cache={latent_cache}", f"out={tmp_path / 'run'}")
-    assert (finished.status, "cache is for model=latent_diffusion" in finished.err.splitlines()[-1]) == (2, True)

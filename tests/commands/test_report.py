@@ -64,14 +64,7 @@ def test_settings_that_the_model_or_its_data_cannot_follow_are_refused(pipeline)
 PROTOCOL = {"data_set": "toy_objects", "resolution": 64, "scenes": 2}
 
 
-def test_without_runs_the_published_tables_are_written(command, tmp_path):
-    finished = command.succeeds("report", f"out={tmp_path / 'out'}")
-    for place in ("Table 2", "Table 3", "Table 4", "Table D1"):
-        assert all(place in (tmp_path / f"out/tables.{kind}").read_text() for kind in ("md", "csv", "tex"))
-    assert finished.out.splitlines()[-1] == str(tmp_path / "out")
-
-
-def test_runs_are_listed_and_broken_files_are_named(command, tmp_path):
+def test_runs_are_listed_beside_the_published_tables_and_broken_files_are_named(command, tmp_path):
     for name in ("good", "bad"):
         (tmp_path / "runs" / name).mkdir(parents=True)
     scores = {"scenes": 2, "views": 4, "full": {"novel": {"psnr": 21.125}}}
@@ -81,3 +74,6 @@ def test_runs_are_listed_and_broken_files_are_named(command, tmp_path):
     assert "toy_objects, scores, 64 pixels" in finished.out
     assert "21.12" in finished.out
     assert str(tmp_path / "runs/bad/metrics.json") in finished.out + finished.err
+    assert finished.out.splitlines()[-1] == str(tmp_path / "out")
+    for place in ("Table 2", "Table 3", "Table 4", "Table D1"):
+        assert all(place in (tmp_path / f"out/tables.{kind}").read_text() for kind in ("md", "csv", "tex"))

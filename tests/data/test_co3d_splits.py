@@ -1,4 +1,5 @@
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -252,3 +253,38 @@ def test_a_source_knows_how_many_sequences_its_list_has(tmp_path):
     trees.change(category / trees.SET_LIST, lambda splits: splits["test"].append(["gone", 0, "x"]))
     source = module(tmp_path).source("test")
     assert (len(source.names), source.listed) == (3, 4)
+
+
+FEW = {"train": "ab", "val": "c", "test": "d"}
+
+
+def test_what_nobody_reads_may_be_broken(tmp_path):
+    """NaN in a number that is not used (Python's `json`, which wrote CO3D, writes it); frames that no list names."""
+    category = trees.write_tree(tmp_path, dict.fromkeys("abcd", 4), FEW)
+    trees.change(category / trees.FRAMES, lambda entries: entries[2]["mask"].update(mass=float("nan")))
+    trees.change(category / trees.FRAMES, lambda entries: entries[2]["depth"].update(scale_adjustment=2))
+    result = read(tmp_path)
+    assert result.refused == []
+    assert result.splits["train"].frames["a"][2].depth.scale_adjustment == 2.0
+    trees.change(category / trees.SET_LIST, lambda splits: splits["train"].remove(splits["train"][2]))
+    trees.change(category / trees.FRAMES, lambda entries: entries[2].update(viewpoint=None))
+    result = read(tmp_path)
+    assert [frame.number for frame in result.splits["train"].frames["a"]] == [0, 1, 3]
+    assert result.refused == []
+
+
+def test_a_partial_download_is_refused_at_once_with_the_setting_that_uses_what_is_there(tmp_path):
+    category = trees.write_tree(tmp_path, dict.fromkeys("abcd", 4), FEW)
+    for name in "bc":
+        shutil.rmtree(category / name)
+    message = f"{category}: 2 of 4 sequences have no images, as after a partial download; "
+    message += "data.max_bad_fraction=1 uses the others"
+    with pytest.raises(DataError, match=f"^{message}$"):
+        module(tmp_path, batch_size=1).setup("fit")
+    data = module(tmp_path, batch_size=1, max_bad_fraction=1.0)
+    data.setup("test")
+    source = data.source("train")
+    assert (source.names, source.left_out) == (["a"], {"not downloaded": ["b"]})
+    assert [batch.names for batch in data.train_dataloader()] == [("a",)]
+    with pytest.raises(DataError, match="2 of 4 sequences have no images"):
+        module(tmp_path, on_bad="raise").source("test")

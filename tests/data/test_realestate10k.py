@@ -1,13 +1,28 @@
 import json
 import logging
+import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from realestate10k_trees import FORMS, HEIGHT, encode, epoch, equal, make_clip, module, same, write_tree
+from realestate10k_trees import (
+    FORMS,
+    HEIGHT,
+    encode,
+    epoch,
+    equal,
+    make_clip,
+    module,
+    same,
+    write_chunk_form,
+    write_tree,
+)
 from support import compose_config
 
+from completesplat.data.realestate10k import clips
+from completesplat.data.validation import BadAnnotation, BadCamera, OutsidePath, UnreadableFile
+from completesplat.data.validation.audit import check
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import project
 
@@ -81,8 +96,8 @@ def test_a_point_reprojects_onto_its_pixel(tmp_path, crop):
     torch.testing.assert_close(views.cameras.intrinsics[:, :2, 2], expected)
 
 
-@pytest.mark.parametrize("suffix", [".jpeg", ".JPG"])
-def test_jpeg_files_have_any_of_their_suffixes(suffix, tmp_path):
+@pytest.mark.parametrize("suffix", [".jpeg", ".JPG", ".png"])
+def test_image_files_have_any_of_their_suffixes(suffix, tmp_path):
     root = write_tree(tmp_path, "text", [make_clip("a")], [])
     expected = module(root, val_fraction=0.0).source("train").read("a").read(3).image
     for path in root.glob("train/a/*.jpg"):
@@ -169,6 +184,75 @@ def test_what_is_not_there_or_makes_no_sense_is_refused(tmp_path):
     for setting in ({"min_gap": 0}, {"min_gap": 5}, {"near": 0.0}, {"scale": -1.0}, {"targets": -1}):
         with pytest.raises(CompleteSplatError, match="data"):
             module(tmp_path, **setting)
+
+
+@pytest.mark.parametrize(
+    ("index", "kind"), [('{"a": 1}', BadAnnotation), ("[]", BadAnnotation), ("{", UnreadableFile), (None, DataError)]
+)
+def test_a_folder_without_any_use_is_raised_under_either_policy(tmp_path, index, kind):
+    (tmp_path / "train").mkdir()
+    if index is not None:
+        (tmp_path / "train/index.json").write_text(index)
+    for policy in ("raise", "skip"):
+        with pytest.raises(kind, match=str(tmp_path / "train")):
+            module(tmp_path, on_bad=policy).setup("fit")
+
+
+def test_annotations_that_cannot_be_used_are_raised_or_skipped_with_a_line(tmp_path, caplog):
+    index = write_tree(tmp_path, "chunks", TRAIN, TEST) / "train/index.json"
+    index.write_text(json.dumps(json.loads(index.read_text()) | {"b": "../b.torch"}))
+    with pytest.raises(OutsidePath):
+        module(tmp_path, on_bad="raise").setup("fit")
+    module(tmp_path, on_bad="skip").setup("fit")
+    (message,) = {record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING}
+    assert message.startswith(f"1 annotations cannot be used; the first: {index}, b: ")
+
+
+def test_a_principal_point_outside_matters_to_its_own_crop_only(tmp_path):
+    clip = make_clip("bad")
+    clip.rows[:, 2] = 1.5
+    write_tree(tmp_path, "text", [clip, *TRAIN], TEST)
+    assert check(module(tmp_path).open("train"), workers=1, progress=False).refused == []
+    with pytest.raises(BadCamera, match=r"bad\.txt, bad, frame 0: "):
+        module(tmp_path, crop="principal").open("train")["train"].read("bad")
+
+
+@pytest.fixture
+def loads(monkeypatch):
+    """Names of the chunks in the order they are read, and the largest number of them alive at once."""
+    names, alive, counts = [], [], []
+    original = clips.read_chunk
+
+    def watched(path: Path):
+        chunk = original(path)
+        alive.append(weakref.ref(next(iter(chunk.values()))["timestamps"]))
+        counts.append(sum(ref() is not None for ref in alive))
+        names.append(path.name)
+        return chunk
+
+    monkeypatch.setattr(clips, "read_chunk", watched)
+    return names, counts
+
+
+def test_two_chunks_in_memory_and_each_read_once_an_epoch(tmp_path, loads):
+    names, counts = loads
+    write_chunk_form(tmp_path / "few", TEST[:3], clips_per_chunk=1)
+    result = clips.ChunkedClips(tmp_path / "few")
+    for number in (0, 1, 0, 2, 0, 1):
+        result.clip(f"test{number}")
+    assert names == [f"{number:06}.torch" for number in (0, 1, 2, 1)]  # The chunk of the longest ago went.
+    del result
+    for split in ("train", "test"):
+        write_chunk_form(tmp_path / split, [make_clip(f"{i:02}", frames=3) for i in range(18)], clips_per_chunk=3)
+    data = module(tmp_path, image_size=8, batch_size=4, references_per_sequence=2, val_fraction=0.0)
+    loader = data.train_dataloader()
+    names.clear()
+    assert sum(len(batch.names) for batch in epoch(loader, 0)) == 34
+    assert sorted(names) == [f"{i:06}.torch" for i in range(6)]
+    assert names != sorted(names)
+    list(data.val_dataloader())
+    list(data.train_dataloader())
+    assert max(counts) == 2
 
 
 @pytest.mark.parametrize("experiment", ["paper_diffusion", "toy_diffusion"])

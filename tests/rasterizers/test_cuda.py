@@ -2,8 +2,7 @@
 
 Most tests here run without a GPU. gsplat's own Python front end (`gsplat.rasterization`) is called, and its four CUDA
 operations are replaced by the stand-ins below: gsplat's projection in torch, and a compositor written from the
-definition in `RasterizeToPixels3DGSFwd.cu`, both in float64. Two tests replace all four by gsplat's own torch versions
-in float32, tiles included (the fixture `torch_front_end`). So they prove the adapter's conventions (units, axes,
+definition in `RasterizeToPixels3DGSFwd.cu`, both in float64. So they prove the adapter's conventions (units, axes,
 order and shapes of arguments, batches, what is culled, what is kept from gsplat), not gsplat's CUDA kernels, their
 float32 arithmetic or their gradients. The tests marked `gpu` compare those with the reference.
 """
@@ -21,7 +20,6 @@ import numpy as np
 import pytest
 import torch
 from degenerate_gaussians import DRAWN, NEVER_DRAWN, SIZE, camera, changed, healthy
-from gsplat_on_cpu import TILE_SIZE, pairs, weights_along_rays
 from hydra.utils import instantiate
 from rasterizer_scenes import scenes
 from support import compose_config
@@ -29,7 +27,7 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, merge_gaussians
-from completesplat.geometry.cameras import Cameras, transform_points
+from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer, RenderingConstants, cuda
 from completesplat.rasterizers.cuda import FARTHEST, CudaRasterizer
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -125,52 +123,6 @@ def front_end(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     return calls
 
 
-@pytest.fixture
-def torch_front_end(front_end: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """`front_end` with gsplat's torch versions of its CUDA operations, and stand-ins for two parts."""
-    import gsplat
-    from gsplat.cuda import _torch_impl, _wrapper
-
-    def projection(means, covars, quats, scales, *cameras, packed, sparse_grad, radius_clip, opacities, **options):
-        assert covars is None
-        assert (packed, sparse_grad, radius_clip) == (False, False, 0)
-        covariances, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-        return _torch_impl._fully_fused_projection(means, covariances, *cameras, **options)
-
-    def pixels(*arguments, packed, absgrad, **options):
-        assert (packed, absgrad) == (False, False)
-        return _torch_impl._rasterize_to_pixels(*arguments, **options)
-
-    monkeypatch.setattr(gsplat.rendering, "fully_fused_projection", projection)
-    monkeypatch.setattr(gsplat.rendering, "isect_tiles", lambda *arguments, **_: _torch_impl._isect_tiles(*arguments))
-    monkeypatch.setattr(gsplat.rendering, "isect_offset_encode", _torch_impl._isect_offset_encode)
-    monkeypatch.setattr(gsplat.rendering, "rasterize_to_pixels", pixels)
-    monkeypatch.setattr(_wrapper, "rasterize_to_indices_in_range", indices_in_range)
-    nerfacc = ModuleType("nerfacc")
-    monkeypatch.setitem(sys.modules, "nerfacc", nerfacc)
-    monkeypatch.setattr(nerfacc, "render_weight_from_alpha", weights_and_transmittances, raising=False)
-    monkeypatch.setattr(nerfacc, "accumulate_along_rays", sums_along_rays, raising=False)
-    return front_end
-
-
-def indices_in_range(start, end, left, means2d, conics, opacities, width, height, tile_size, offsets, indices):
-    assert (start, tile_size) == (0, TILE_SIZE)
-    assert (left == 1).all()
-    splats = means2d.flatten(0, 2), conics.flatten(0, 2), opacities.flatten()
-    grid, constants = tuple(offsets.shape[-2:]), RenderingConstants()
-    numbers, places = pairs(*splats, indices, offsets.flatten(), grid, (height, width), constants)
-    return numbers % means2d.shape[2], places % (height * width), places // (height * width)
-
-
-def weights_and_transmittances(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, None]:
-    return weights_along_rays(alphas, ray_indices), None
-
-
-def sums_along_rays(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
-    values = weights[:, None] if values is None else weights[:, None] * values
-    return torch.zeros(n_rays, values.shape[1]).index_add(0, ray_indices, values)
-
-
 def pretend_a_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
@@ -206,31 +158,6 @@ def test_images_and_gradients_agree_with_the_float64_reference(seed: int, front_
     gaussians, cameras = scenes(seed, 2, 3, size, constants, count=[40, 64][seed % 4 == 0])
     assert_agrees(gaussians, cameras, constants, 2e-6, 1e-5)
     assert len(front_end) == 1  # for all scenes and views
-
-
-@pytest.mark.parametrize(("batch", "views", "size", "near"), [(2, 3, (33, 20), 0.01), (1, 2, (17, 40), 1.6)])
-def test_gsplats_torch_versions_agree_with_the_reference(batch, views, size, near, torch_front_end: list) -> None:
-    """In float32, with several tiles, scenes and views, and a near plane that cuts through the scene."""
-    constants = RenderingConstants(near_plane=near)
-    gaussians, cameras = scenes(1, batch, views, size, constants, count=45)
-    depths = transform_points(cameras.world_to_camera, gaussians.means[:, None])[..., 2]
-    assert (depths > near).any()
-    assert (depths < near).any() == (near > 1)
-    assert_agrees(gaussians, cameras, constants, 1e-5, 1e-5)
-    assert len(torch_front_end) == 1  # for all scenes and views
-    assert torch_front_end[0]["packed"] is False
-
-
-def test_a_background_is_gsplats(torch_front_end: list) -> None:
-    """gsplat draws over a background itself; the adapter returns images that can be laid over any."""
-    gaussians, cameras = scenes(2, 2, 2, (20, 33), RenderingConstants())
-    rendering = CudaRasterizer()(gaussians, cameras)
-    background = torch.tensor([0.2, 0.5, 0.9])
-    (arguments,) = torch_front_end
-    expected, alphas, _ = sys.modules["gsplat"].rasterization(**arguments, backgrounds=background.expand(2, 2, 3))
-    assert torch.allclose(rendering.over(background[:, None, None]), expected[..., :3].movedim(-1, -3), atol=1e-6)
-    assert torch.equal(rendering.alpha, alphas.movedim(-1, -3))
-    assert rendering.alpha.min() < 0.5 < rendering.alpha.max()
 
 
 @pytest.mark.parametrize(("count", "given"), [(0, 32), (32, 32), (33, 64)])

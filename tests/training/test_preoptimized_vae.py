@@ -104,8 +104,11 @@ def test_files_that_are_there_are_taken_unless_the_settings_are_others(store, tm
     assert len(list(tmp_path.iterdir())) == len(calls)
 
 
-def test_encoded_images_are_refused(monkeypatch):
-    module = instantiate(compose_config("fit", *SETTINGS).model, _convert_="all")
-    monkeypatch.setattr(type(module), "data", SimpleNamespace(latent_cache="folder"))
+@pytest.mark.parametrize("settings", [["experiment=toy_var", *SMALL], SETTINGS])
+def test_encoded_images_are_refused(monkeypatch, settings):
+    module = instantiate(compose_config("fit", *settings).model, _convert_="all")
+    data = SimpleNamespace(latent_cache="folder", targets=3, image_size=32)
+    monkeypatch.setattr(type(module), "data", data)
+    monkeypatch.setattr(type(module), "trainer", SimpleNamespace(datamodule=data))
     with pytest.raises(CompleteSplatError, match=r"data\.latent_cache is for model=latent_diffusion"):
         module.on_fit_start()

@@ -88,7 +88,7 @@ def on_gpu(config: DictConfig) -> Training:
         return Training(instantiate(config.model, _convert_="all"), "bf16-mixed")
 
 
-SMALL = ("data.image_size=32", *NETWORKS)
+SMALL = ("data.image_size=32", *NETWORKS, "optimizer=adam")  # Muon has thousands of operations
 LARGE = [pytest.param((experiment,), marks=pytest.mark.slow) for experiment in PAPER[1:3]]
 
 
