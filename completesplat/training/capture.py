@@ -82,6 +82,7 @@ class CaptureFit(Stage):
         formats, videos, frames: as in `OutputFiles`, without `ply`. A format that cannot be written is left out.
     """
 
+    first_novel = 0  # all held-out photos count as one
     without_effect = ("optimizer", "schedule")
 
     def __init__(
@@ -191,9 +192,16 @@ class CaptureFit(Stage):
 
     def on_test_start(self) -> None:
         """Note for tables what the Gaussians were fitted to."""
-        training, held_out = (len(self.sequence(split).frames) for split in ("train", "test"))
-        self.fitted_to = f"the {training} training frames of the capture, and scored on the {held_out} held-out ones"
+        fitted, held_out = (self.sequence(split).photos for split in ("train", "test"))
+        photos, rule = len(fitted) + len(held_out), self.data.describe()["split"]
+        self.fitted_to = f"{len(fitted)} of {photos} photos; {rule}: {', '.join(held_out)}"
         super().on_test_start()
+
+    def test_results(self) -> dict[str, dict[str, Any]]:
+        """Return the scores, with the names of the photos."""
+        results, parts = super().test_results(), {"fitted": "train", "held_out": "test"}
+        results["model"]["photos"] = {part: list(self.sequence(split).photos) for part, split in parts.items()}
+        return results
 
     def scene_scored(self, name: str, gaussians: Gaussians, cameras: Cameras, images: Renders, truth: Views) -> None:
         """Write the scene, the held-out frames beside their renders, videos and other formats."""
