@@ -69,6 +69,8 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
     assert metrics["train/gaussians"] == int(int(int(200 * 1.05) * 1.05) * 1.05)  # at steps 2, 4 and 6
     one, other = (torch.load(tmp_path / run / "checkpoints/last.ckpt", weights_only=True) for run in ("run", "parts"))
     assert all(tensor.equal(other["state_dict"][name]) for name, tensor in one["state_dict"].items())
+    rates = [group["initial_lr"] for group in one["optimizer_states"][0]["param_groups"]]
+    assert rates[1:] == pytest.approx([4 * 5e-3, 4 * 1e-3, 1 * 5e-2, 4 * 2.5e-3])  # opacities at 3DGS's own rate
     # The files are in the world and units of transforms.json.
     sequence = CaptureDataModule(str(capture)).source("test").read("capture")
     means = one["state_dict"]["raw.means"][:231] / sequence.scale + torch.tensor(sequence.origin)
