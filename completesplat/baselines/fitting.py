@@ -136,7 +136,7 @@ def fit_gaussians(
     with torch.inference_mode(False), torch.enable_grad():
         raw = initial_gaussians(views, depth_range, settings.count, settings.opacity, generator)
         parameters = {name: tensor.requires_grad_() for name, tensor in vars(raw).items()}
-        optimizer = adam(parameters, depth_range, settings.position_rate, settings.other_rates)
+        optimizer = adam(parameters, depth_range, settings.position_rate, settings.other_rates, settings.other_rates)
         positions = optimizer.param_groups[0]
         decay = POSITION_DECAY ** (1 / max(settings.steps, 1))
         for step in range(settings.steps):
@@ -153,7 +153,7 @@ def fit_gaussians(
 
 
 def adam(
-    raw: Mapping[str, Tensor], depth_ranges: Float[Tensor, "_ 2"], position_rate: float, other_rates: float
+    raw: Mapping[str, Tensor], depth_ranges: Float[Tensor, "_ 2"], positions: float, opacities: float, others: float
 ) -> torch.optim.Adam:
     """Return Adam for tensors of `RawGaussians` by name, with factors on 3DGS's rates; the positions come first.
 
@@ -161,8 +161,8 @@ def adam(
     """
     # Half of the mean depth range: the spread of the initial Gaussians (3DGS uses the spread of the cameras).
     extent = (0.5 * (depth_ranges[:, 1] - depth_ranges[:, 0])).mean().item()
-    rates = {"means": position_rate * POSITION_RATE * extent}
-    rates |= {name: other_rates * rate for name, rate in RATES.items()}
+    rates = {"means": positions * POSITION_RATE * extent}
+    rates |= {name: (opacities if name == "logits" else others) * rate for name, rate in RATES.items()}
     return torch.optim.Adam([{"params": [raw[name]], "lr": rate} for name, rate in rates.items()], eps=1e-15)
 
 

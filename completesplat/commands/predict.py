@@ -70,7 +70,7 @@ def run(config: DictConfig, out: Path) -> None:
     count, failed = sum(count for count, _ in results), [name for _, names in results for name in names]
     seconds = time.perf_counter() - start
     if count > 1:
-        print(f"{count} photos in {seconds:.0f} s by {config.devices} process(es): {60 * count / seconds:.1f} a minute")
+        print(f"{count} photos in {seconds:.0f} s, {60 * count / seconds:.1f} a minute (devices={config.devices})")
     if failed:
         text = f"{len(failed)} of {count + len(failed)} images failed ({', '.join(failed)})"
         raise CompleteSplatError(f"{text}; the others are in {out}" if count else text)

@@ -36,6 +36,7 @@ class PosedSequence:
         points: points of a reconstruction in the cameras' world and units, if the data set has them.
         scale: units of the cameras in one unit of the data set's own files, where it is known.
         origin: the cameras' origin in the coordinates and units of these files.
+        photos: names of the frames' files, where they are known.
     """
 
     name: str
@@ -47,6 +48,7 @@ class PosedSequence:
     points: Float[Tensor, "n 3"] | None = None
     scale: float = 1.0
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
+    photos: tuple[str, ...] = ()
 
 
 @runtime_checkable

@@ -71,6 +71,8 @@ class Evaluation:
         absent = [metric for metric in (*given.values(), *candidates) if isinstance(metric, MissingMetrics)]
         self.missing = {name: str(metric) for metric in absent for name in metric.names}
         self.samples, self.criterion, self.seed = samples, criterion, seed
+        self.first_novel = 1
+        """Views before the novel ones: 1, the reference that the model is given, or 0, if it is given none."""
         self._check_settings()
         self.set_metrics = [
             metric for metric in candidates if metric is not None and not isinstance(metric, MissingMetrics)
@@ -150,7 +152,7 @@ class Evaluation:
 
     def score(self, images: Float[Tensor, "view 3 height width"], truth: Views) -> Scores:
         """Score one prediction (values in [0, 1]) of one scene: means over the novel views, and their `sharpness`."""
-        scores: Scores = {}
+        scores, first = Scores(), self.first_novel
         for region in REGIONS:
             predicted, true = _region(images, truth, region), _region(truth.images, truth, region)
             counted = _counted(truth, region)
@@ -160,9 +162,10 @@ class Evaluation:
                 if values.shape != images.shape[:1]:
                     shapes = f"its values are {list(values.shape)}, not one for each of {len(images)} images"
                     raise CompleteSplatError(f"evaluation.metrics.{name}: {shapes}")
-                scores[region, "reference", name] = values[0].item()
-                scores[region, "novel", name] = values[1:].mean().item()
-            sharp = sharpness(images[1:].float(), truth.images[1:], counted[1:])
+                if first:
+                    scores[region, "reference", name] = values[0].item()
+                scores[region, "novel", name] = values[first:].mean().item()
+            sharp = sharpness(images[first:].float(), truth.images[first:], counted[first:])
             scores |= {} if sharp is None else {(region, "novel", "sharpness"): sharp}
         return scores
 
@@ -172,7 +175,7 @@ class Evaluation:
         assert true.depths is not None
         for region in REGIONS:
             errors = depth_errors(predicted, true.depths.to(predicted), _counted(true, region))
-            for kind, views in (("reference", errors[:1]), ("novel", errors[1:])):
+            for kind, views in (("reference", errors[: self.first_novel]), ("novel", errors[self.first_novel :])):
                 known = [view for view in views if view is not None]
                 for metric in known[0] if known else ():
                     mean = sum(view[metric] for view in known) / len(known)
@@ -181,11 +184,11 @@ class Evaluation:
     def _add(self, predictor: str, name: str, scores: Scores, images: Mapping[str, Tensor], truth: Views) -> None:
         """Keep a scene's scores, and describe its images [view 3 height width] in each region for set metrics."""
         self.scores[predictor][name] = scores
-        self.views[name] = len(truth.images) - 1
+        self.views[name] = len(truth.images) - self.first_novel
         for region in REGIONS:
             for owner, views in ((predictor, images[region]), (ImageSets.TRUE, truth.images)):
                 with torch.autocast(views.device.type, enabled=False):
-                    self.sets.add(owner, region, name, _region(views.float(), truth, region)[1:])
+                    self.sets.add(owner, region, name, _region(views.float(), truth, region)[self.first_novel :])
 
     def gather(self) -> None:
         """Merge the scores of all processes; each of them must call this."""

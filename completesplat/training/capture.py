@@ -57,6 +57,7 @@ class CaptureSettings:
         refine_every: steps between relocations of dead Gaussians, which add the share `growth` of new ones.
         opacity_weight, scale_weight: weights of mean opacity and mean scale in the loss.
         position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
+        opacity_rate: factor on that of the opacities; with 4, captures of flat floors and walls collapse.
     """
 
     initial: Count = 20_000
@@ -67,6 +68,7 @@ class CaptureSettings:
     opacity_weight: Annotated[float, Range(0)] = 0.01
     scale_weight: Annotated[float, Range(0)] = 0.01
     position_rate: Annotated[float, Range(1e-3)] = 10.0
+    opacity_rate: Annotated[float, Range(0)] = 1.0
     other_rates: Annotated[float, Range(0)] = 4.0
 
 
@@ -82,6 +84,7 @@ class CaptureFit(Stage):
         formats, videos, frames: as in `OutputFiles`, without `ply`. A format that cannot be written is left out.
     """
 
+    first_novel = 0  # all held-out photos count as one
     without_effect = ("optimizer", "schedule")
 
     def __init__(
@@ -180,7 +183,8 @@ class CaptureFit(Stage):
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Build Adam with 3DGS's rates and epsilon; the rate of the positions decays to a hundredth."""
         depth_ranges, settings = self.sequence("train").depth_ranges, self.fitting
-        optimizer = adam(dict(self.raw.items()), depth_ranges, settings.position_rate, settings.other_rates)
+        rates = settings.position_rate, settings.opacity_rate, settings.other_rates
+        optimizer = adam(dict(self.raw.items()), depth_ranges, *rates)
         steps = max(1, self.trainer.estimated_stepping_batches)
         decays = [lambda step: POSITION_DECAY ** (step / steps), *[lambda step: 1.0] * (len(self.raw) - 1)]
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": Schedule(optimizer, decays), "interval": "step"}}
@@ -191,9 +195,16 @@ class CaptureFit(Stage):
 
     def on_test_start(self) -> None:
         """Note for tables what the Gaussians were fitted to."""
-        training, held_out = (len(self.sequence(split).frames) for split in ("train", "test"))
-        self.fitted_to = f"the {training} training frames of the capture, and scored on the {held_out} held-out ones"
+        fitted, held_out = (self.sequence(split).photos for split in ("train", "test"))
+        photos, rule = len(fitted) + len(held_out), self.data.describe()["split"]
+        self.fitted_to = f"{len(fitted)} of {photos} photos; {rule}: {', '.join(held_out)}"
         super().on_test_start()
+
+    def test_results(self) -> dict[str, dict[str, Any]]:
+        """Return the scores, with the names of the photos."""
+        results, parts = super().test_results(), {"fitted": "train", "held_out": "test"}
+        results["model"]["photos"] = {part: list(self.sequence(split).photos) for part, split in parts.items()}
+        return results
 
     def scene_scored(self, name: str, gaussians: Gaussians, cameras: Cameras, images: Renders, truth: Views) -> None:
         """Write the scene, the held-out frames beside their renders, videos and other formats."""

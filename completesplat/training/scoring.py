@@ -75,6 +75,9 @@ class Scorer(LightningModule):
     fitted_to: str | None = None
     """What Gaussians are fitted to, if scenes are fitted rather than predicted; for tables."""
 
+    first_novel = 1
+    """Views of a scene before the novel ones: 1, the reference that the model is given, or 0, if it is given none."""
+
     without_effect: tuple[str, ...] = ()
     """Beginnings of the names of settings that this model does not use, which are refused where a user gives them."""
 
@@ -125,6 +128,7 @@ class Scorer(LightningModule):
 
     def on_test_start(self) -> None:
         self.evaluation.reset()
+        self.evaluation.first_novel = self.first_novel
         self.seconds = defaultdict(list)
         self.mean_image = self.data.mean_image()
         if self.mean_image is None:
@@ -147,8 +151,9 @@ class Scorer(LightningModule):
             self.scene_scored(name, samples, cameras[b], images, truth[b])
         if self.mean_image is not None:
             evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
-        evaluation.update("copy_reference", copy_reference(scenes), scenes)
-        evaluation.update("mirrored_reference", mirror_reference(scenes), scenes)
+        if self.first_novel:
+            evaluation.update("copy_reference", copy_reference(scenes), scenes)
+            evaluation.update("mirrored_reference", mirror_reference(scenes), scenes)
 
     def timed(self, name: str, work: Callable[[], Result], scenes: int) -> Result:
         """Do the work for this number of scenes, and note its seconds for each."""

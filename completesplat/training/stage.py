@@ -124,8 +124,9 @@ class Stage(Scorer):
         self.log_dict(mean_of_processes(values), batch_size=batch_size)
 
     def novel_psnr(self, gaussians: Gaussians, scenes: SceneBatch) -> Float[Tensor, "batch target"]:
-        images, truth = self.render(gaussians, scenes.targets.cameras).clamp(0, 1), scenes.targets.images
-        return psnr(images.flatten(0, 1), truth.flatten(0, 1)).view(images.shape[:2])
+        novel = scenes.all_views()[:, self.first_novel :]
+        images = self.render(gaussians, novel.cameras).clamp(0, 1)
+        return psnr(images.flatten(0, 1), novel.images.flatten(0, 1)).view(images.shape[:2])
 
     def validation_step(self, scenes: SceneBatch, index: int) -> None:
         values = self.novel_psnr(self.reconstruct(scenes, seed=index), scenes)

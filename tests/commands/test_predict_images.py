@@ -207,7 +207,7 @@ def test_two_processes_predict_each_image_once_and_go_on_after_one_failed(comman
         2,
         f"error: 1 of 4 images failed (b.png); the others are in {tmp_path / 'out'}",
     )
-    assert re.search(r"^3 photos in \d+ s by 2 process\(es\): [\d.]+ a minute$", finished.out, re.M)
+    assert re.search(r"^3 photos in \d+ s, [\d.]+ a minute \(devices=2\)$", finished.out, re.M)
     assert {path.parent.name for path in (tmp_path / "out").glob("*/scene.json")} == {"a", "c", "d"}
 
 

@@ -57,6 +57,17 @@ def test_reference_and_novel_views_are_apart_and_values_out_of_range_are_clipped
     assert results["novel"]["psnr"] == 100
 
 
+def test_without_a_given_view_all_views_are_novel():
+    images = torch.full((3, 3, 16, 16), 0.5)
+    images[0] = 0.6
+    evaluation = Evaluation()
+    evaluation.first_novel = 0
+    evaluation.update("model", images[None], scenes(1, 2))
+    results = evaluation.results()["model"]
+    assert (results["views"], set(results["full"])) == (3, {"novel"})
+    assert results["full"]["novel"]["psnr"] == pytest.approx((20 + 100 + 100) / 3, abs=1e-3)
+
+
 def test_object_scores_ignore_the_background():
     images = torch.full((2, 3, 16, 16), 0.6)
     images[..., 8:, :] = 0.0

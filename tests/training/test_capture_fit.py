@@ -46,21 +46,31 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
     with monkeypatch.context() as patch:
         patch.setattr(CaptureFit, "training_step", interrupted_step)
         assert command("fit", *QUICK, "out=parts").status != 0
-    assert set(read) == set(range(FRAMES)) - {0, 4, 8}  # At least two of nine are held out, so every fourth is.
+    assert set(read) == set(range(FRAMES)) - {0, 4, 8}  # At least three of nine are held out, so every fourth is.
     assert command("fit", *QUICK, "ckpt_path=last", "out=parts").status == 0
     finished = command("fit", *QUICK, "ckpt_path=last", "out=run")
     assert finished.status == 0, finished.err
     assert f"there is no checkpoint in {tmp_path / 'run'}, so the training begins" in finished.out
-    fitted = "the 6 training frames of the capture, and scored on the 3 held-out ones"
-    assert f"fitted to {fitted}" in finished.out
+    held_out = [f"frame{number}.png" for number in (0, 4, 8)]
+    rule = "one of 8 photos is held out, from the first on, and at least 3"
+    fitted = f"6 of 9 photos; {rule}: {', '.join(held_out)}"
+    assert f"fitted to {fitted}." in " ".join(finished.out.split())
     files = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"scene.ply", "scene.splat", "sheet.png", "orbit.mp4", "scene.json"} < files
     assert finished.out.count("left out: no Node.js") == 1
     metrics = strict_json(tmp_path / "run/metrics.json")
     assert metrics["test"]["protocol"]["fitted_to"] == fitted
+    # One number for all held-out photos, the reference among them, which is no input of the model.
+    model = metrics["test"]["model"]
+    assert set(metrics["test"]) == {"protocol", "model", "mean_image"}
+    assert (model["views"], set(model["full"])) == (3, {"novel"})
+    assert set(model["photos"]["fitted"]) | set(held_out) == {f"frame{number}.png" for number in range(FRAMES)}
+    assert model["photos"]["held_out"] == held_out
     assert metrics["train/gaussians"] == int(int(int(200 * 1.05) * 1.05) * 1.05)  # at steps 2, 4 and 6
     one, other = (torch.load(tmp_path / run / "checkpoints/last.ckpt", weights_only=True) for run in ("run", "parts"))
     assert all(tensor.equal(other["state_dict"][name]) for name, tensor in one["state_dict"].items())
+    rates = [group["initial_lr"] for group in one["optimizer_states"][0]["param_groups"]]
+    assert rates[1:] == pytest.approx([4 * 5e-3, 4 * 1e-3, 1 * 5e-2, 4 * 2.5e-3])  # opacities at 3DGS's own rate
     # The files are in the world and units of transforms.json.
     sequence = CaptureDataModule(str(capture)).source("test").read("capture")
     means = one["state_dict"]["raw.means"][:231] / sequence.scale + torch.tensor(sequence.origin)

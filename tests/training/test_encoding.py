@@ -23,6 +23,7 @@ from completesplat.training.encoding import (
     check_cache,
     encode_training_set,
     fingerprint,
+    fingerprints,
     moment_sums,
 )
 
@@ -179,6 +180,12 @@ def test_the_fingerprint_depends_on_names_types_shapes_and_values():
     digests = [fingerprint(nn.ParameterDict({name: value})) for name, value in every]
     assert len(set(digests)) == len(every)
     assert digests[0] == fingerprint(nn.ParameterDict({"a": weights.T.contiguous().T}))  # of any memory layout
+
+
+def test_latents_that_see_views_depend_on_the_weights_that_see_them():
+    encoder, blind, seeing = (nn.Linear(2, 2) for _ in range(3))
+    models = [SimpleNamespace(encoder=encoder, view_encoder=part) for part in (None, blind, seeing)]
+    assert len({fingerprints(model, None)[0] for model in models}) == 3
 
 
 def test_the_cache_of_this_model_is_accepted_and_stale_ones_are_refused(root, cache, tmp_path):

@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 # Points whose distance from the median point exceeds this multiple of the median distance are outliers, because the
 # farthest point determines the scale of the scene. Beyond the second multiple, they are errors of the reconstruction.
 FARTHEST, FARTHEST_USED = 5.0, 100_000
-FEWEST_HELD_OUT = 2
+FEWEST_HELD_OUT = 3
 TRANSFORMS = ("transforms.json", "transforms_train.json")  # the second is NeRF's (synthetic)
 # Of COLMAP, nerfstudio, and COLMAP's undistorter.
 MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "dense/*/sparse", "dense/sparse")
@@ -47,9 +47,9 @@ Members = Callable[[int], Sequence[int]]
 def members(hold_out: int, held_out: bool, frames: int) -> list[int]:
     """Return the held-out frames, or the others.
 
-    Every `hold_out`-th frame is held out, from the first on (as LLFF and NeRF), or more for at least two frames.
+    Every `hold_out`-th frame is held out, from the first on (as LLFF and NeRF), or more for `FEWEST_HELD_OUT` frames.
     """
-    step = min(hold_out, frames // FEWEST_HELD_OUT)
+    step = min(hold_out, (frames - 1) // (FEWEST_HELD_OUT - 1))
     return [frame for frame in range(frames) if (frame % step == 0) == held_out]
 
 
@@ -171,7 +171,8 @@ class CaptureSource(SequenceSource):
         placement = placement._replace(center=torch.zeros_like(center))
         sequence = placed_sequence(name, numbers, selected, placement, self.framing, read)
         seeds = None if points is None else (scale * (torch.from_numpy(points) - center)).float()
-        return replace(sequence, points=seeds, scale=scale, origin=tuple(center.tolist()))
+        photos = tuple(capture.frames[number].image.name for number in numbers)
+        return replace(sequence, points=seeds, scale=scale, origin=tuple(center.tolist()), photos=photos)
 
 
 def _read(name: str, frames: list[CapturedFrame], size: int, index: int) -> MaskedImage:
@@ -203,7 +204,7 @@ class CaptureDataModule(ObjectDataModule):
         targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
         return {
             "data_set": "capture",
-            "split": f"one of {self.hold_out} frames of each capture is held out",
+            "split": f"one of {self.hold_out} photos is held out, from the first on, and at least {FEWEST_HELD_OUT}",
             "crop": "largest square around the principal point",
             "protocol_views": f"reference: a capture's first held-out frame; targets: {targets}",
         }
