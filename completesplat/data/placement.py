@@ -90,7 +90,8 @@ def from_cameras(cameras: Sequence[Cameras]) -> Placement:
     extents = [0.5 * square_of(camera).side / camera.intrinsics.diagonal()[:2].max().item() for camera in cameras]
     half_size = (depths * torch.tensor(extents, dtype=depths.dtype)).median().item()
     if not (half_size > 0 and np.isfinite(half_size)):
-        raise BadPlacement("no point cloud, no depth maps, and optical axes that meet behind the cameras")
+        advice = "if matrices in transforms.json have OpenCV's axes, negate their second and third columns"
+        raise BadPlacement(f"no point cloud, no depth maps, and optical axes that meet behind the cameras: {advice}")
     return Placement(center, half_size)
 
 
