@@ -212,6 +212,7 @@ def test_two_processes_predict_each_image_once_and_go_on_after_one_failed(comman
 
 
 @pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_prediction_on_a_gpu_is_that_on_the_cpu_up_to_rounding(command, tiny_weights, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     given = [f"image={save(tmp_path / 'a.png')}", f"weights={tiny_weights}", "samples=2", "steps=2", "color_fits=0"]

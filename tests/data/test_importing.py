@@ -74,7 +74,7 @@ def test_cameras_are_those_that_the_photos_were_drawn_with_and_a_photo_of_someth
     given = str(tmp_path / "my corner"), "colmap", 100, 1000, tmp_path / "out"
     command, capture = import_capture(*given), tmp_path / "out/my corner"
     assert "COLMAP finds poses for 8 of 9 images, and leaves out: noise.png" in caplog.text
-    assert "my corner: 8 images with cameras, of which 2 are held out" in caplog.text
+    assert "my corner: 8 images with cameras, of which 3 are held out" in caplog.text
     assert command == f"go on with: completesplat fit experiment=capture 'data.root={capture}'"
     assert sorted(path.name for path in capture.iterdir()) == ["images", "sparse"]
     frames = read_capture(capture).frames
