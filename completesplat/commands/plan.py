@@ -192,7 +192,7 @@ def parts_beside_steps(
         seconds: of a step.
         loading: seconds in which one process loads a scene; None: unknown.
     """
-    data, trainer, checkpoint = config.data, config.trainer, config.callbacks.get("checkpoint") or {}
+    data, trainer, checkpoint = config.data, config.trainer, config.get("callbacks", {}).get("checkpoint") or {}
     workers = min(MOST_WORKERS, os.cpu_count() or 1) if data.workers is None else data.workers
     load = None if loading is None else loading * data.batch_size / config.devices / max(workers, 1)
     waiting = load if load is None or workers == 0 else max(0.0, load - seconds)
