@@ -18,15 +18,8 @@ from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryV
 from completesplat.commands import jobs, new
 from completesplat.errors import CompleteSplatError
 from completesplat.files import file_refusal
-from completesplat.settings import help
+from completesplat.settings import composition, help
 from completesplat.settings.arguments import SWEEP, behind_dashes, for_hydra
-from completesplat.settings.composition import (
-    compose,
-    nearest_names,
-    sweep_arguments,
-    use_working_folder,
-    without_unused_parts,
-)
 from completesplat.settings.options import conf_folder
 from completesplat.signals import end_with, ended_by_signals
 
@@ -44,7 +37,7 @@ UNHELPFUL_WARNINGS = (
 
 def launch(verb: str, arguments: list[str]) -> None:
     """Compose the config of `conf/<verb>.yaml` with the arguments (`for_hydra`), and run it, once or as a sweep."""
-    use_working_folder()
+    composition.use_working_folder()
     # Lightning starts a further process of the job for each device.
     if arguments and arguments[0].startswith(jobs.PROCESS_OF_JOB):
         return _join_job(verb, arguments[0])
@@ -53,18 +46,17 @@ def launch(verb: str, arguments: list[str]) -> None:
     if any(flag in arguments for flag in help.FLAGS) or (verb == "bench" and not arguments):
         return print(help.help_page(verb, arguments))
     if verb == "new":  # its files are the user's, and it has no folder for a job
-        return new.run(compose(verb, *arguments))
+        return new.run(composition.compose(verb, *arguments))
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     # Logging stays silent on a full disk, because the next file that is written reports it in one line.
     logging.raiseExceptions = False
     arguments = for_hydra(verb, arguments)
-    if verb == "fit" and [text for text in arguments if text.startswith("-")] in (["--cfg=job"], ["-c=job"]):
-        settings = [text for text in arguments if not text.startswith("-")]
-        return print(OmegaConf.to_yaml(without_unused_parts(compose(verb, *settings))))
+    if verb == "fit" and _shows_config(arguments):
+        return None
     sweep = any(flag in arguments for flag in SWEEP)
     _check_together(arguments, sweep)
-    sys.argv = [f"completesplat {verb}", *arguments, *(sweep_arguments(verb, arguments) if sweep else [])]
+    sys.argv = [f"completesplat {verb}", *arguments, *(composition.sweep_arguments(verb, arguments) if sweep else [])]
     failures: list[Exception] = []
 
     def job(config: DictConfig) -> float | None:
@@ -77,10 +69,20 @@ def launch(verb: str, arguments: list[str]) -> None:
             failures.append(error)
             return None
 
-    with nearest_names(verb, arguments):
+    with composition.nearest_names(verb, arguments):
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=verb)(job)()
     if failures:
         raise failures[0]
+
+
+def _shows_config(arguments: Sequence[str]) -> bool:
+    """Print the settings of `fit` for `--cfg job`, without parts that its stage does not use; return whether it did."""
+    flags = [text for text in arguments if text.startswith("-")]
+    asked = flags in (["--cfg=job"], ["-c=job"])
+    if asked:
+        config = composition.compose("fit", *(text for text in arguments if text not in flags))
+        print(OmegaConf.to_yaml(composition.without_unused_parts(config)))
+    return asked
 
 
 def _check_together(arguments: Sequence[str], sweep: bool) -> None:
