@@ -201,9 +201,13 @@ class CaptureFit(Stage):
         super().on_test_start()
 
     def test_results(self) -> dict[str, dict[str, Any]]:
-        """Return the scores, with the names of the photos."""
+        """Return the scores, with the names of the photos; warn if the photos' mean scores as well."""
         results, parts = super().test_results(), {"fitted": "train", "held_out": "test"}
         results["model"]["photos"] = {part: list(self.sequence(split).photos) for part, split in parts.items()}
+        fitted, mean = (results[name]["full"]["novel"]["psnr"] for name in ("model", "mean_image"))
+        if fitted <= mean:
+            scores = f"{fitted:.2f} dB, the mean image {mean:.2f} dB"
+            logger.warning("%s: are these the cameras of these photos, and are the steps enough?", scores)
         return results
 
     def scene_scored(self, name: str, gaussians: Gaussians, cameras: Cameras, images: Renders, truth: Views) -> None:

@@ -66,6 +66,8 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
     assert (model["views"], set(model["full"])) == (3, {"novel"})
     assert set(model["photos"]["fitted"]) | set(held_out) == {f"frame{number}.png" for number in range(FRAMES)}
     assert model["photos"]["held_out"] == held_out
+    below = f"{model['full']['novel']['psnr']:.2f} dB, the mean image "
+    assert f"{below}{metrics['test']['mean_image']['full']['novel']['psnr']:.2f} dB: are these the" in finished.out
     assert metrics["train/gaussians"] == int(int(int(200 * 1.05) * 1.05) * 1.05)  # at steps 2, 4 and 6
     one, other = (torch.load(tmp_path / run / "checkpoints/last.ckpt", weights_only=True) for run in ("run", "parts"))
     assert all(tensor.equal(other["state_dict"][name]) for name, tensor in one["state_dict"].items())
