@@ -12,7 +12,7 @@ import torch
 import completesplat
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.selection import auto
-from completesplat.scene_model import distances_to_shipped
+from completesplat.scene_model import match_shipped
 
 ROUNDS, rasterizer = (0, 2, 5, 10, 20, 40), auto()
 models, results = {}, {rounds: [] for rounds in ROUNDS}
@@ -47,7 +47,7 @@ if sys.argv[1].startswith("weights="):
         score(reference.images, reference.cameras, batch.depth_range, batch.targets, model, background)
 else:
     for name in sys.argv[1:]:
-        model, background = model_of(next(iter(distances_to_shipped(name))))
+        model, background = model_of(next(iter(match_shipped(name))))
         photo = model.read(name)
         inputs = photo.image[None], model.camera(photo)[None], model.depth_range_of(photo)[None]
         score(*inputs, None, model, background)

@@ -34,7 +34,7 @@ from completesplat.export.splat_transform import find_splat_transform
 from completesplat.files import folder_names, printable, safe_name
 from completesplat.generator import CompleteSplat
 from completesplat.rasterizers import Rasterizer
-from completesplat.scene_model import SceneModel, distance_to_training, distances_to_shipped
+from completesplat.scene_model import SceneModel, distance_to_training, match_shipped
 from completesplat.settings.checks import REMOVE
 from completesplat.version import __version__
 from completesplat.weights import sha256_of
@@ -334,7 +334,7 @@ def photo_warnings(photograph: Photograph, model: SceneModel, whole: bool) -> li
 
 def nearer_weights(photograph: Photograph, distance: float) -> str:
     """Name the shipped weights whose training images are nearer to a photo, and `ELSEWHERE` if these are far, too."""
-    name, other = next(iter(distances_to_shipped(photograph.image).items()), ("", math.inf))
+    name, (_, other) = next(iter(match_shipped(photograph.image).items()), ("", (0.0, math.inf)))
     nearer = other < distance - RESIZING
     lines = [f"weights={name} are nearer ({other:.1f})"] if nearer else []
     return "; ".join([*lines, ELSEWHERE] if min(other, distance) > UNLIKE else lines)

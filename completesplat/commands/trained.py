@@ -1,6 +1,8 @@
 """Models for commands, from a run's checkpoint, from weights or from files of scenes, and the data to use with them."""
 
 import logging
+import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +18,7 @@ from completesplat.errors import CompleteSplatError, ImageError, WeightsError
 from completesplat.files import printable
 from completesplat.generator import CompleteSplat
 from completesplat.run_configs import config_of_run
-from completesplat.scene_model import SceneModel, distances_to_shipped
+from completesplat.scene_model import SceneModel, match_shipped
 from completesplat.settings.checks import REMOVE
 from completesplat.tensors import used_device
 from completesplat.weights import AUTO, RUN_CHECKPOINT, sha256_of, shipped
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from completesplat.training.scoring import SceneFiles, Scorer
 
 logger = logging.getLogger(__name__)
+LOOKED_AT = 8  # images, of which weights=auto is chosen
 WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no effect"
 
 
@@ -131,8 +134,8 @@ class TrainedModel:
         return ReconstructionScorer(self.model.reconstruction_model, **rendering)
 
 
-def nearest_weights(images: Sequence[Path], remove_background: bool) -> tuple[str, str]:
-    """Return the name of the shipped weights nearest to the first readable image, and the reason as a clause.
+def likeliest_weights(images: Sequence[Path], remove_background: bool) -> tuple[str, str]:
+    """Return the name of the likeliest shipped weights for `LOOKED_AT` of the images, and the reason as a clause.
 
     Without an image, they are the first ones of the package.
 
@@ -141,23 +144,25 @@ def nearest_weights(images: Sequence[Path], remove_background: bool) -> tuple[st
     """
     if not shipped():
         raise WeightsError("weights=auto: this package has no weights; give weights=DIR")
-    for image in images:
+    sums, read = Counter[str](), list[str]()
+    for image in images[:: math.ceil(len(images) / LOOKED_AT) or 1]:
         with suppress(ImageError, OSError):  # which ends the prediction of this image alone, when its turn comes
-            distances = distances_to_shipped(image, remove_background)
-            (name, distance), *others = distances.items()
-            far = f"{distance:.1f} standard deviations{''.join(f', {other} {x:.1f}' for other, x in others)}"
-            far += "".join(f", {other} needs a plain background" for other in shipped() if other not in distances)
-            photo = f"{'the first image, ' if len(images) > 1 else ''}{printable(image.name)}"
-            return name, f"; their training images are most like {photo} ({far})"
-    name, *names = shipped()
-    return name, f"; there is no image to choose by (weights=NAME takes others: {', '.join(names)})"
+            sums.update({name: x.probability for name, x in match_shipped(image, remove_background).items()})
+            read.append(printable(image.name))
+    if not read:
+        name, *names = shipped()
+        return name, f"; there is no image to choose by (weights=NAME takes others: {', '.join(names)})"
+    shares = [f"{name} {total / len(read):.0%}" for name, total in sums.most_common()]
+    shares += [f"{name} needs a plain background" for name in shipped() if name not in sums]
+    whose = read[0] if len(images) == 1 else f"{len(read)} of {len(images)} images"
+    return sums.most_common(1)[0][0], f"; likeliest for {whose} ({', '.join(shares)})"
 
 
 def open_generator(config: Any, images: Sequence[Path], announced: bool = True) -> SceneModel:
     """Return the model of `config.weights`, with `config.sampler` if given, on `used_device`; print its limits.
 
-    Of several processes, one prints them (`announced`). `weights=auto` is replaced by `nearest_weights` of the images.
-    If the model draws no samples, `config.samples` is set to 1.
+    Of several processes, one prints them (`announced`). `weights=auto` is replaced by the
+    `likeliest_weights` for the images. If the model draws no samples, `config.samples` is set to 1.
 
     Raises:
         WeightsError: as `from_pretrained`.
@@ -165,7 +170,7 @@ def open_generator(config: Any, images: Sequence[Path], announced: bool = True) 
     """
     reason, say = "", print if announced else logger.debug
     if config.weights == AUTO:
-        config.weights, reason = nearest_weights(images, config.background == REMOVE)
+        config.weights, reason = likeliest_weights(images, config.background == REMOVE)
     model = CompleteSplat.from_pretrained(config.weights, config.trust)
     if config.weights in shipped():
         content = model.architecture["training"]["content"]

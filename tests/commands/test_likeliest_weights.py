@@ -1,4 +1,4 @@
-"""`weights=auto`: the weights in the package whose training images are nearest to the photo."""
+"""`weights=auto`: the weights in the package that are likeliest for the photos."""
 
 import json
 from pathlib import Path
@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.stats import norm
 from support import compose_config, strict_json
 
-from completesplat.commands.trained import nearest_weights, open_generator
+from completesplat.commands.trained import likeliest_weights, open_generator
 from completesplat.errors import WeightsError
-from completesplat.scene_model import distances_to_shipped
+from completesplat.scene_model import match_shipped
 from completesplat.weights import SHIPPED, shipped
 
 COUCH = SHIPPED / "rendered_couches/held_out.jpg"
@@ -35,33 +36,46 @@ def photo(path: Path, color: str) -> Path:
     return path
 
 
-def test_the_nearest_to_the_first_image_that_can_be_read_are_chosen_and_the_others_are_named(package, tmp_path):
+def test_the_likeliest_for_the_images_that_can_be_read_are_chosen_and_the_others_are_named(package, tmp_path):
     red, green = (photo(tmp_path / f"{color}.png", color) for color in ("red", "lime"))
     (tmp_path / "broken.png").write_text("no image")
-    name, reason = nearest_weights([green], remove_background=False)
-    assert name == "greens"
+    name, reason = likeliest_weights([green], remove_background=False)
+    assert (name, reason) == ("greens", "; likeliest for lime.png (greens 100%, blues 0%, reds 0%)")
     # Two of eight features differ by 1 from the other weights' mean, and deviations are 0.1: sqrt(2 / 8) / 0.1 = 5.
-    distances = "(0.0 standard deviations, blues 5.0, reds 5.0)"
-    assert reason == f"; their training images are most like lime.png {distances}"
-    name, reason = nearest_weights([tmp_path / "broken.png", tmp_path / "gone.png", red, green], False)
-    assert name == "reds"
-    assert "most like the first image, red.png (0.0" in reason
-    name, reason = nearest_weights([tmp_path / "broken.png"], False)
+    assert [x.distance for x in match_shipped(green).values()] == pytest.approx([0, 5, 5], abs=1e-3)
+    images = [tmp_path / "broken.png", tmp_path / "gone.png", green, red, red]
+    name, reason = likeliest_weights(images, False)
+    assert (name, reason) == ("reds", "; likeliest for 3 of 5 images (reds 67%, greens 33%, blues 0%)")
+    name, reason = likeliest_weights(images[:2], False)
     assert (name, reason) == ("blues", "; there is no image to choose by (weights=NAME takes others: greens, reds)")
     package.clear()
     with pytest.raises(WeightsError, match="this package has no weights; give weights=DIR"):
-        nearest_weights([red], False)
+        likeliest_weights([red], False)
 
 
-def test_weights_of_anything_are_for_images_that_are_like_no_others(package, tmp_path):
+def test_of_many_images_a_few_from_all_over_are_looked_at(package, tmp_path):
+    many = [photo(tmp_path / f"{number}.png", "red" if number < 20 else "lime") for number in range(50)]
+    name, reason = likeliest_weights(many, False)
+    assert (name, reason) == ("greens", "; likeliest for 8 of 50 images (greens 62%, reds 38%, blues 0%)")
+
+
+def test_probabilities_are_those_of_normal_distributions_and_log_odds(package, tmp_path, monkeypatch):
     config = json.loads((package["blues"] / "config.json").read_text())
     config["training"] = {"picture_mean": [0.5] * 3 + [0.0] * 5, "picture_std": [0.5] * 8}
     (package["blues"] / "config.json").write_text(json.dumps(config))
-    # For the darker red the others are nearer, but its own are likelier.
-    for color, chosen, distances in (("#b70000", "reds", [1.0, 0.5, 4.4]), ("black", "blues", [0.6, 3.5, 3.5])):
-        found = distances_to_shipped(photo(tmp_path / "photo.png", color))
-        assert next(iter(found)) == chosen
-        assert list(found.values()) == pytest.approx(distances, abs=0.05)
+    monkeypatch.setattr("completesplat.scene_model.LOG_ODDS", {"reds": 1.5})
+    found = match_shipped(photo(tmp_path / "photo.png", "#b70000"))  # nearer to blues, but likelier among reds
+    features = np.array([0xB7 / 255, 0, 0, 0, 0, 0, 0, 0])
+    broad, narrow = np.full(8, 0.5), np.full(8, 0.1)
+    kinds = {"reds": ([1, 0, 0], narrow, 1.5), "blues": ([0.5] * 3, broad, 0), "greens": ([0, 1, 0], narrow, 0)}
+    densities = {
+        name: norm.pdf(features, [*mean, 0, 0, 0, 0, 0], deviation).prod() * np.exp(odds)
+        for name, (mean, deviation, odds) in kinds.items()
+    }
+    assert list(found) == ["reds", "blues", "greens"]
+    assert found["blues"].distance < found["reds"].distance
+    for name, match in found.items():
+        assert match.probability == pytest.approx(densities[name] / sum(densities.values()), rel=1e-3, abs=1e-12)
 
 
 @pytest.mark.parametrize(("border", "chosen"), [("white", "reds"), ("red", "blues")])
@@ -72,14 +86,13 @@ def test_weights_of_objects_on_white_are_for_images_whose_border_is_white(packag
     image = Image.new("RGB", (60, 60), border)
     image.paste("red", (3, 3, 60, 57))  # the object touches the right side
     image.save(tmp_path / "object.png")
-    assert next(iter(distances_to_shipped(tmp_path / "object.png"))) == chosen
+    assert next(iter(match_shipped(tmp_path / "object.png"))) == chosen
 
 
 def test_distances_are_of_the_image_at_the_size_of_each_model(package, tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (48, 48, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(tmp_path / "noise.png")
-    distances = distances_to_shipped(tmp_path / "noise.png")
-    assert list(distances.values()) == sorted(distances.values())
+    matches = match_shipped(tmp_path / "noise.png")
     for name, folder in package.items():
         config = json.loads((folder / "config.json").read_text())
         side = config["image_size"]
@@ -87,7 +100,7 @@ def test_distances_are_of_the_image_at_the_size_of_each_model(package, tmp_path)
         detail = [np.abs(np.diff(values, axis=axis)).mean() for axis in (1, 0)]
         features = np.array([*values.mean((0, 1)), *values.std((0, 1)), *detail])
         expected = np.sqrt(np.square((features - config["training"]["picture_mean"]) / 0.1).mean())
-        assert distances[name] == pytest.approx(expected, rel=1e-5)
+        assert matches[name].distance == pytest.approx(expected, rel=1e-5)
 
 
 def test_the_default_chooses_and_says_so_in_one_line(command, tmp_path):
@@ -95,14 +108,14 @@ def test_the_default_chooses_and_says_so_in_one_line(command, tmp_path):
     finished = command.succeeds("predict", f"image={COUCH}", f"out={tmp_path / 'out'}", *quick)
     (line,) = [line for line in finished.out.splitlines() if line.startswith("weights: ")]
     assert line.startswith("weights: rendered_couches, which come with the package and know renders of ")
-    assert "most like held_out.jpg (" in line
+    assert "; likeliest for held_out.jpg (rendered_couches " in line
     assert all(name in line for name in shipped())
     assert strict_json(tmp_path / "out/held_out/scene.json")["settings"]["weights"] == "rendered_couches"
 
 
 @pytest.mark.parametrize("verb", ["predict", "view"])
 def test_weights_by_name_are_taken_as_they_are(verb, capsys, monkeypatch):
-    monkeypatch.setattr("completesplat.commands.trained.nearest_weights", lambda *_: pytest.fail("chosen"))
+    monkeypatch.setattr("completesplat.commands.trained.likeliest_weights", lambda *_: pytest.fail("chosen"))
     config = compose_config(verb, f"image={COUCH}", "weights=toy_objects")
     open_generator(config, [COUCH])
     assert config.weights == "toy_objects"
