@@ -2,6 +2,7 @@
 
 import copy
 import json
+import logging
 import math
 import os
 import statistics
@@ -22,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from completesplat.data.loading.data_module import MOST_WORKERS
 from completesplat.data.loading.distributed import batch_per_process
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import write_json
 from completesplat.results.tables import Table, records_table, show
 from completesplat.scene import Batch, SceneBatch
@@ -34,6 +35,7 @@ from completesplat.training.stage import Stage
 from completesplat.training.step_counts import Operation, StepCounts, count_step, with_latents
 from completesplat.training.steps import MEBIBYTE, Training, peak_megabytes, synthetic_batch
 
+logger = logging.getLogger(__name__)
 HERE = "this"
 MOST_TIMED = 1e9  # bytes that a timed step may take on a CPU
 UNTIMED_STEPS, TIMED_STEPS, TIMED_BATCHES = 2, 5, 5
@@ -118,9 +120,8 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
         raise CompleteSplatError(f"gpu={config.gpu}: there are {', '.join(names)}{did_you_mean(config.gpu, names)}")
     data, accumulated = config.data, config.trainer.accumulate_grad_batches
     batch = batch_per_process(data.batch_size, config.devices, accumulated)
-    sequences, frames = data.get("scenes", config.sequences), data.get("frames", config.frames)
-    if not OmegaConf.is_missing(data, "root") and Path(data.root).is_dir():
-        sequences = len(build(data, _convert_="all").source("train").names)
+    there = sequences_there(data)
+    sequences, frames = there or data.get("scenes", config.sequences), data.get("frames", config.frames)
     steps, counts, limit = steps_of(config, sequences), count_work(config, batch), memory_limit(config)
     flops, measured, fits = counts.flops * config.devices, None, counts.peak <= limit
     if config.gpu == HERE:
@@ -128,7 +129,7 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
         step = {"steps as timed here": seconds * accumulated}
     else:
         step = parts_of_step(counts, speeds_of_gpu(config))
-    seconds, loading = sum(step.values()), loading_seconds(config)
+    seconds, loading = sum(step.values()), loading_seconds(config) if there else None
     parts = {**step, **parts_beside_steps(config, counts, batch, seconds, loading)}
     total, views = sum(filter(None, parts.values())), 1 if data.latent_cache is not None else 1 + data.targets
     rate = data.batch_size * views / seconds
@@ -210,12 +211,21 @@ def parts_beside_steps(
     return {"waiting for data": waiting, "validation": validation, "checkpoints": writing}
 
 
-def loading_seconds(config: DictConfig) -> float | None:
-    """Return the seconds in which one process loads a scene on this machine, or None if there are no data."""
-    if OmegaConf.is_missing(config.data, "root"):
+def sequences_there(data: DictConfig) -> int | None:
+    """Return the number of training sequences in `data.root`; None, with a warning, if there are none to read yet."""
+    if OmegaConf.is_missing(data, "root") or not Path(data.root).is_dir():
         return None
-    folders = [config.data.root, config.data.get("latent_cache")]
-    if not all(Path(folder).is_dir() for folder in folders if folder is not None):
+    try:
+        return len(build(data, _convert_="all").source("train").names)
+    except DataError as error:
+        logger.warning("%s; the plan is made as if there were no data", error)
+        return None
+
+
+def loading_seconds(config: DictConfig) -> float | None:
+    """Return the seconds in which one process loads a scene on this machine, or None if there are no latents yet."""
+    latents = config.data.get("latent_cache")
+    if latents is not None and not Path(latents).is_dir():
         return None
     data = build({**config.data, "workers": 0}, _convert_="all")
     data.setup("fit")

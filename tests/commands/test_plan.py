@@ -13,6 +13,7 @@ from completesplat.commands.plan import (
     plan_of,
     precision,
     seconds_of,
+    sequences_there,
     speeds_of_gpu,
     steps_of,
 )
@@ -105,7 +106,7 @@ def test_the_papers_step_is_beside_ours_where_the_data_are_its(experiment):
 
 
 def test_data_that_are_here_are_loaded_and_waited_for_if_that_takes_longer(toy_root, tmp_path):
-    assert loading_seconds(compose_config("plan", *SMALL, f"data.root={tmp_path / 'absent'}")) is None
+    assert loading_seconds(compose_config("plan", *SMALL, f"data.latent_cache={tmp_path / 'absent'}")) is None
     settings = ["optimizer=adam", "data.batch_size=2", "data.targets=3", "data.workers=2", f"data.root={toy_root}"]
     config = compose_config("plan", "experiment=toy_var", *settings)
     seconds = loading_seconds(config)
@@ -121,6 +122,18 @@ def test_data_that_are_here_are_loaded_and_waited_for_if_that_takes_longer(toy_r
     assert beside[1]["validation"] == pytest.approx(2 * seconds / 3 * 16 / config.trainer.val_check_interval, rel=0.2)
     del config.callbacks  # as `~callbacks`
     assert parts_beside_steps(config, counts, 2, seconds, seconds)["checkpoints"] == 0
+
+
+def test_an_absent_or_unfinished_folder_of_data_is_planned_with_assumptions(toy_root, tmp_path, caplog):
+    (tmp_path / "unfinished").mkdir()
+    for name in ("absent", "unfinished"):
+        config = compose_config("plan", "experiment=toy_var", f"data.root={tmp_path / name}")
+        assert sequences_there(config.data) is None
+    assert len(caplog.messages) == 1
+    assert "unfinished/toy_objects: no such CO3D category; the plan is made as if" in caplog.text
+    plan = plan_of(compose_config("plan", *SMALL, f"data.root={tmp_path / 'unfinished'}"))
+    assert (plan["assumptions"]["sequences"], plan["parts"]["waiting for data"]) == (400, None)
+    assert sequences_there(compose_config("plan", "experiment=toy_var", f"data.root={toy_root}").data) > 0
 
 
 def test_epochs_of_the_papers_data_are_the_papers_steps():
