@@ -37,7 +37,7 @@ LAST = RUN_CHECKPOINT
 LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
 OF_MACHINES = ("trainer.devices", "trainer.num_nodes", "trainer.strategy")
-MAY_CHANGE = ("ckpt_path", "data.allow_changed", "optimized_metric", *OF_MACHINES)
+MAY_CHANGE = ("ckpt_path", "data.allow_changed", "optimized_metric", "test", *OF_MACHINES)
 """Settings that may differ when a run continues, with all settings below them; also its end (`ENDS`)."""
 ENDS = ("trainer.max_steps", "trainer.max_epochs", "trainer.max_time")
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
@@ -207,6 +207,8 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
     if finished and _ends(config) != _ends(earlier):
         _refuse_earlier_end(out, _ends(config), _ends(earlier))
         return False
+    if finished and config.get("test") and not earlier.get("test", True):
+        raise CompleteSplatError(f"{out} is finished, without a test: completesplat test ckpt={out}")
     return finished
 
 
@@ -218,13 +220,14 @@ def _refuse_another_run(out: Path, config: Mapping[str, object], earlier: object
         return
     other_model = "model._target_" in others
     # `model` repeats settings from outside it.
-    first = "model" if other_model else min(others, key=lambda key: (key.count("."), key))
+    named = ["model"] if other_model else sorted(others, key=lambda key: (key.count("."), key))
+    shown = ", ".join(named[:3]) + (f" and {len(named) - 3} more" if len(named) > 3 else "")
     advice = "choose another out=DIR"
     if (out / LAST).is_file() and not other_model:
         same = [argument for argument in overrides if not argument.startswith(("out=", "ckpt_path="))]
         again = shlex.join(["completesplat", "fit", *same, f"ckpt_path={out / LAST}", "out=MORE"])
-        advice = f"continue in another folder: {again}"
-    raise CompleteSplatError(f"{out} holds a run with another {first}: {advice}")
+        advice = f"give all settings of {out / RECORD} again, or continue in another folder: {again}"
+    raise CompleteSplatError(f"{out} holds a run with another {shown}: {advice}")
 
 
 def _refuse_earlier_end(out: Path, ends: Mapping[str, Any], earlier: Mapping[str, Any]) -> None:

@@ -119,19 +119,22 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / jobs.LAST).touch()
 
-    def config(rate=1, **end):
+    def config(rate=1, test=False, **end):
         trainer, model = {"max_steps": 20, "max_time": None} | end, {"_target_": "a.A"}
-        return {"ckpt_path": "last", "optimizer": {"lr": rate}, "trainer": trainer, "model": model}
+        return {"ckpt_path": "last", "test": test, "optimizer": {"lr": rate}, "trainer": trainer, "model": model}
 
     OmegaConf.save(config(), tmp_path / "config.yaml")
     assert jobs.is_finished(tmp_path, config())
-    for longer in ({"max_steps": 40}, {"max_steps": -1}, {"max_time": {"hours": 1}, "max_steps": 21}):
+    for longer in ({"max_steps": 40, "test": True}, {"max_steps": -1}, {"max_time": {"hours": 1}, "max_steps": 21}):
         assert not jobs.is_finished(tmp_path, config(**longer))
+    advice = f"give all settings of {tmp_path}/run.json again, or continue in another folder"
     again = f"completesplat fit optimizer.lr=2 ckpt_path={tmp_path}/checkpoints/last.ckpt out=MORE"
     for changed, message in (
         (config(max_steps=10), r"max_steps=10: .* has 20 steps; give more"),
         (config(max_steps=40, max_epochs=3), "max_epochs=3 may end before the run in"),
-        (config(rate=2, max_steps=40), f"another optimizer.lr: continue in another folder: {again}$"),
+        (config(test=True), f"is finished, without a test: completesplat test ckpt={tmp_path}$"),
+        (config(rate=2, max_steps=40), f"another optimizer.lr: {advice}: {again}$"),
+        (config(rate=2) | {"a": 1, "b": 2, "c": 3, "d": 4}, "another a, b, c and 2 more: "),
         (config() | {"model": {"_target_": "a.B"}}, "another model: choose another out=DIR"),
     ):
         with pytest.raises(CompleteSplatError, match=message):

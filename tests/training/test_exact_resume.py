@@ -98,7 +98,8 @@ def test_a_finished_run_whose_end_moves_is_the_run_that_had_this_end_from_the_st
     for given, status in ((first, 0), ([*settings["var"], "optimizer.lr=1", f"out={run}", "ckpt_path=last"], 2)):
         finished = command(*given)
         assert finished.status == status, finished.err
-    assert "holds a run with another optimizer.lr: continue in another folder: completesplat fit " in finished.err
+    assert f"{run} holds a run with another optimizer.lr: give all settings of {run}/run.json again" in finished.err
+    assert ", or continue in another folder: completesplat fit " in finished.err
     assert finished.err.endswith(f" ckpt_path={run}/checkpoints/last.ckpt out=MORE\n")
     went_on = command(*settings["var"], f"out={run}", "ckpt_path=last")
     assert went_on.status == 0, went_on.err
