@@ -16,7 +16,7 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
-from completesplat.export.formats import FORMATS, write_formats
+from completesplat.export.formats import FORMATS, write_format
 from completesplat.export.formats import suffix as format_suffix
 from completesplat.export.images import (
     SheetCell,
@@ -253,7 +253,7 @@ def write_scene(
     files: dict[str, str] = {}
     for kind in wanted.formats:
         on_file(name + format_suffix(kind))
-        files |= write_formats(folder, name, stored, [kind], view, wanted.converter, comments, rasterizer)
+        files |= write_format(folder, name, kind, stored, view, wanted.converter, comments, rasterizer)
     for kind in wanted.videos:
         files[f"{kind}{suffix}"] = f"{kind}{suffix}.mp4"
         on_file(f"{kind}{suffix}.mp4")

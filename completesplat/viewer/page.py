@@ -14,7 +14,7 @@ import viser
 
 from completesplat.data.images.files import open_image, refused_as_bad
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import CONVERTED, FORMATS, suffix, write_formats
+from completesplat.export.formats import CONVERTED, FORMATS, suffix, write_format
 from completesplat.export.images import to_pixels
 from completesplat.export.prediction import PHOTO_FILE
 from completesplat.export.splat_transform import PageView, find_splat_transform
@@ -136,7 +136,7 @@ class Saver:
         front = PageView(sample.reference, sample.pivot(), torch.tensor(self.view.up), self.background)
         rasterizer = self.rasterizer() if kind == "mesh" else None
         name = path.name.removesuffix(suffix(kind))
-        write_formats(self.folder, name, sample.for_viewers(), [kind], front, converter, comments, rasterizer)
+        write_format(self.folder, name, kind, sample.for_viewers(), front, converter, comments, rasterizer)
         return path
 
     def _video(self, sample: Sample) -> Path:

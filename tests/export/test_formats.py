@@ -11,7 +11,7 @@ from fake_converter import COPY, calls, install
 from support import some_gaussians
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import FORMATS, write_formats, write_glb, write_splat
+from completesplat.export.formats import FORMATS, write_format, write_glb, write_splat
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform, upright_rotation, viewer_settings
 from completesplat.gaussians import Gaussians
@@ -40,19 +40,23 @@ def converter(program):
 def test_the_formats_that_are_wanted_are_written_and_no_others(tmp_path, program, converter, formats):
     out, scene = tmp_path / "out", some_gaussians(1)[0]
     out.mkdir()
-    files = write_formats(out, "sample_00", scene, formats, VIEW, converter)
+    files = {}
+    for kind in formats:
+        files |= write_format(out, "sample_00", kind, scene, VIEW, converter)
     assert sorted(files.values()) == sorted(path.name for path in out.iterdir())
     assert set(files) == {"sample_00" if kind == "ply" else f"sample_00_{kind}" for kind in formats}
     needed = set(formats) - {"ply", "splat", "glb"}
     assert len(calls(program)) == len(needed)
-    with pytest.raises(CompleteSplatError, match="a converter is needed for") if needed else nullcontext():
-        write_formats(out, "other", scene, formats, VIEW, None)
+    for kind in formats:
+        with pytest.raises(CompleteSplatError, match=f"needed for {kind}") if kind in needed else nullcontext():
+            write_format(out, "other", kind, scene, VIEW, None)
 
 
 def test_all_formats_but_the_page_are_made_of_the_ply_itself(tmp_path, converter):
     scene = some_gaussians(1)[0]
     scene.means[:] = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
-    write_formats(tmp_path, "a", scene, ["ply", "spz", "sog", "html"], VIEW, converter)
+    for kind in ("ply", "spz", "sog", "html"):
+        write_format(tmp_path, "a", kind, scene, VIEW, converter)
     write_ply(tmp_path / "turned.ply", scene.transform(upright_rotation(UP)))
     names = "a.ply", "a.spz", "a.sog", "a.html", "turned.ply"
     ply, spz, sog, html, turned = ((tmp_path / name).read_bytes() for name in names)
@@ -62,7 +66,8 @@ def test_all_formats_but_the_page_are_made_of_the_ply_itself(tmp_path, converter
 
 def test_colours_are_clipped_alike_in_all_formats_but_ply(tmp_path, converter):
     scene = replace(some(), opacities=torch.full((20,), 0.5))
-    write_formats(tmp_path, "a", scene, SPLATS, VIEW, converter)
+    for kind in SPLATS:
+        write_format(tmp_path, "a", kind, scene, VIEW, converter)
     clipped = scene.colors.clamp(0, 1)
     assert not torch.equal(clipped, scene.colors)
     torch.testing.assert_close(read_ply(tmp_path / "a.ply").colors, scene.colors.clamp(min=0), rtol=0, atol=1e-6)
@@ -77,11 +82,12 @@ def test_colours_are_clipped_alike_in_all_formats_but_ply(tmp_path, converter):
 def test_spz_goes_without_opacities_that_round_to_nothing(tmp_path, converter):
     """An opacity of 0 in 8 bits would be read as a logit of minus infinity."""
     opacities = torch.tensor([0.5 / 255 - 1e-6, 0.0, 1.0, 0.6 / 255] * 5)
-    write_formats(tmp_path, "a", replace(some(), opacities=opacities), ["ply", "spz"], VIEW, converter)
+    for kind in ("ply", "spz"):
+        write_format(tmp_path, "a", kind, replace(some(), opacities=opacities), VIEW, converter)
     assert read_ply(tmp_path / "a.ply").count == 20
     torch.testing.assert_close(read_ply(tmp_path / "a.spz").opacities, torch.tensor([1.0, 0.6 / 255] * 5))
     with pytest.raises(CompleteSplatError, match=r"b.spz: all 20 Gaussians are transparent"):
-        write_formats(tmp_path, "b", replace(some(), opacities=opacities / 1000), ["spz"], VIEW, converter)
+        write_format(tmp_path, "b", "spz", replace(some(), opacities=opacities / 1000), VIEW, converter)
 
 
 @pytest.mark.parametrize("up", [[0.1, -0.9, -0.4], [0.0, 0.0, -1.0], [0.0, 0.0, 3.0], [1.0, 0.0, 0.0]])
@@ -96,7 +102,7 @@ def test_a_scene_is_turned_until_up_points_to_minus_y(up):
 
 
 def test_a_page_begins_at_the_reference_camera_and_shows_its_whole_image(tmp_path, converter):
-    write_formats(tmp_path, "a", some_gaussians(1)[0], ["html"], VIEW, converter)
+    write_format(tmp_path, "a", "html", some_gaussians(1)[0], VIEW, converter)
     settings = json.loads((tmp_path / "bin/splat-transform.settings").read_text())
     assert settings == json.loads(json.dumps(viewer_settings(VIEW, upright_rotation(UP))))
     initial = settings["cameras"][0]["initial"]
