@@ -23,17 +23,8 @@ from completesplat.files import SPLATS, printable, write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit
 from completesplat.rasterizers import Rasterizer
+from completesplat.viewer import panel
 from completesplat.viewer.access import GuardedServer, show_status, stop_server, with_head
-from completesplat.viewer.panel import (
-    SIDE_BY_SIDE,
-    VIDEO,
-    Pixels,
-    add_looking,
-    add_opening,
-    add_saving,
-    preview_of,
-    thumbnail_row,
-)
 from completesplat.viewer.sample import Sample, read_scene
 from completesplat.viewer.splat_view import SplatView
 
@@ -115,9 +106,9 @@ class Saver:
         self.folder.mkdir(parents=True, exist_ok=True)
         if kind == "html":
             return [write_viewer_page(self.view.server, self._next("page", ".html"))]
-        return [self._video(sample) if kind == VIDEO else self._scene(kind, sample) for sample in samples]
+        return [self._video(sample) if kind == panel.VIDEO else self._scene(kind, sample) for sample in samples]
 
-    def thumbnail(self, sample: Sample, size: int) -> Pixels:
+    def thumbnail(self, sample: Sample, size: int) -> panel.Pixels:
         """Render a sample from behind, where samples differ, with `size` px on the longer side."""
         up = torch.from_numpy(self.view.up).to(sample.reference.intrinsics)
         camera, scene = orbit(sample.reference, sample.pivot(), up, 2)[1], sample.for_viewers()
@@ -162,21 +153,21 @@ class Page:
         self.server, self.view, self.saver, self.scenes = server, view, saver, scenes
         self.complete: Callable[[Path, str, viser.ClientHandle | None], None] | None = None
         self.worker = Worker(self.tell)
-        self.opening = add_opening(server.gui, [*scenes])
+        self.opening = panel.add_opening(server.gui, [*scenes])
         self.opening.upload.on_upload(self._upload)
         self.opening.chosen.on_update(self._choose)
         self.photo = server.gui.add_html("", order=0.4)
-        self.looking = add_looking(server.gui)
+        self.looking = panel.add_looking(server.gui)
         self._connect_looking()
-        self.saving = add_saving(server.gui, FORMATS)
+        self.saving = panel.add_saving(server.gui, FORMATS)
         self.saving.save.on_click(self._save)
-        self._thumbnails: list[Pixels] = []
+        self._thumbnails: list[panel.Pixels] = []
         self.show(view.samples)
 
     def show(self, samples: Sequence[Sample], status: str = "") -> None:
         """Show samples in all browsers, and their thumbnails when all of them are finished."""
         self.view.show(samples)
-        options = (*(f"sample {i + 1}" for i in range(max(1, len(samples)))), SIDE_BY_SIDE)
+        options = (*(f"sample {i + 1}" for i in range(max(1, len(samples)))), panel.SIDE_BY_SIDE)
         if self.looking.chosen.options != options:
             self.looking.chosen.options = options
         layers = max((sample.layers for sample in samples), default=0)
@@ -200,7 +191,8 @@ class Page:
         self.photo.content = ""
         if file.is_file():
             with refused_as_bad(str(file)), open_image(file, ("PNG",)) as image:
-                self.photo.content = preview_of(np.asarray(image.convert("RGB").resize((THUMBNAIL,) * 2)), "photo")
+                pixels = np.asarray(image.convert("RGB").resize((THUMBNAIL, THUMBNAIL)))
+                self.photo.content = panel.preview_of(pixels, "photo")
 
     def _choose(self, _: viser.GuiEvent[Any]) -> None:
         name = self.opening.chosen.value
@@ -242,7 +234,7 @@ class Page:
         self._mark_thumbnail()
 
     def _mark_thumbnail(self) -> None:
-        row = thumbnail_row(self._thumbnails, self.view.chosen) if self._thumbnails else ""
+        row = panel.thumbnail_row(self._thumbnails, self.view.chosen) if self._thumbnails else ""
         if self.looking.thumbnails.content != row:
             self.looking.thumbnails.content = row
 
