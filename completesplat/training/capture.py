@@ -33,8 +33,7 @@ from completesplat.export.prediction import FileUnits, OutputFiles, Shot, write_
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.losses import WeightedSum
-from completesplat.losses.weighted_sum import Prediction
+from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import Batch, SceneBatch, Views
 from completesplat.settings.schema import Positive, Range, Share
 from completesplat.tensors import stack
