@@ -23,7 +23,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import cleaned, transparent
 from completesplat.export.mesh import VOXELS, Mesh, mesh_of
 from completesplat.export.ply import write_ply
-from completesplat.export.splat_transform import PageView, SplatTransform, write_turning_page
+from completesplat.export.splat_transform import PageView, convert, find_splat_transform, write_turning_page
 from completesplat.files import write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import transform_points
@@ -58,7 +58,6 @@ def write_format(
     kind: str,
     gaussians: Gaussians,
     view: PageView,
-    converter: SplatTransform | None,
     comments: Sequence[str] = (),
     rasterizer: Rasterizer | None = None,
 ) -> dict[str, str]:
@@ -91,10 +90,8 @@ def write_format(
         if rasterizer is None:
             raise CompleteSplatError(f"a rasterizer is needed for {kind}")
         write_mesh(path, mesh_of(rasterizer, clipped, view.reference, view.pivot), comments)
-    elif converter is None:
-        raise CompleteSplatError(f"a converter is needed for {kind}")
     elif kind == "html":
-        write_turning_page(path, clipped, view, converter)
+        write_turning_page(path, clipped, view)
     else:
         stored = clipped[~transparent(clipped)] if kind == "spz" else clipped
         if not stored.count:
@@ -102,7 +99,7 @@ def write_format(
         with tempfile.TemporaryDirectory() as temporary:
             source = Path(temporary) / f"{path.stem}.ply"
             write_ply(source, stored, comments)
-            converter.convert(source, path)
+            convert(find_splat_transform(), source, path)
     return {f"{name}_{kind}": path.name}
 
 

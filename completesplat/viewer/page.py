@@ -14,10 +14,10 @@ import viser
 
 from completesplat.data.images.files import open_image, refused_as_bad
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import CONVERTED, FORMATS, suffix, write_format
+from completesplat.export.formats import FORMATS, suffix, write_format
 from completesplat.export.images import to_pixels
 from completesplat.export.prediction import PHOTO_FILE
-from completesplat.export.splat_transform import PageView, find_splat_transform
+from completesplat.export.splat_transform import PageView
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.files import SPLATS, printable, write_text
 from completesplat.geometry.cameras import Cameras
@@ -97,7 +97,6 @@ class Saver:
     ) -> None:
         self.folder, self.view, self.frames, self.background = folder, view, frames, background
         self.rasterizer = cache(make_rasterizer)
-        self._converter = cache(find_splat_transform)
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
         """Write samples in a format, as videos, or the page (`html`); raise CompleteSplatError if there are none."""
@@ -123,11 +122,10 @@ class Saver:
         """Write all layers of a sample, in its reference camera's frame."""
         path = self._next("sample", suffix(kind))
         comments = [f"{name} {value}" for name, value in sample.settings.items()]
-        converter = self._converter() if kind in CONVERTED else None
         front = PageView(sample.reference, sample.pivot(), torch.tensor(self.view.up), self.background)
         rasterizer = self.rasterizer() if kind == "mesh" else None
         name = path.name.removesuffix(suffix(kind))
-        write_format(self.folder, name, kind, sample.for_viewers(), front, converter, comments, rasterizer)
+        write_format(self.folder, name, kind, sample.for_viewers(), front, comments, rasterizer)
         return path
 
     def _video(self, sample: Sample) -> Path:

@@ -41,7 +41,7 @@ def sphere(center: tuple[float, ...], radius: float, count: int) -> np.ndarray:
 
 def written(folder, scene: Gaussians) -> tuple[trimesh.Trimesh, np.ndarray]:
     """The mesh, and its colours in linear light."""
-    file = write_format(folder, "a", "mesh", scene, VIEW, None, ["seed 7"], TiledRasterizer())
+    file = write_format(folder, "a", "mesh", scene, VIEW, ["seed 7"], TiledRasterizer())
     assert file == {"a_mesh": "a_mesh.glb"}
     (result,) = trimesh.load(folder / "a_mesh.glb", process=False).geometry.values()
     colors = result.visual.vertex_attributes["color"]
@@ -109,10 +109,10 @@ def test_every_field_gives_a_closed_surface():
 def test_where_there_is_nothing_there_is_no_mesh(tmp_path):
     behind = blobs(sphere((0, 0, -3), 0.3, 50), (1.0, 0, 0))
     with pytest.raises(CompleteSplatError, match="no surface in the middle"):
-        write_format(tmp_path, "a", "mesh", behind, VIEW, None, rasterizer=TiledRasterizer())
+        write_format(tmp_path, "a", "mesh", behind, VIEW, rasterizer=TiledRasterizer())
     speck = blobs(sphere((0, 0, 3), 1e-9, 1), (1.0, 0, 0))
     with pytest.raises(CompleteSplatError, match="too thin to be a solid"):
-        write_format(tmp_path, "a", "mesh", speck, VIEW, None, rasterizer=TiledRasterizer())
+        write_format(tmp_path, "a", "mesh", speck, VIEW, rasterizer=TiledRasterizer())
     with pytest.raises(CompleteSplatError, match="a rasterizer is needed for mesh"):
-        write_format(tmp_path, "a", "mesh", behind, VIEW, None)
+        write_format(tmp_path, "a", "mesh", behind, VIEW)
     assert not list(tmp_path.iterdir())
