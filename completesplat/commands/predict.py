@@ -163,7 +163,9 @@ def output_files(config: DictConfig) -> OutputFiles:
         maps=config.maps,
         screen_space_dilation=config.screen_space_dilation,
     )
-    return replace(wanted, converter=find_splat_transform() if set(formats) & set(CONVERTED) else None)
+    if set(formats) & set(CONVERTED):
+        find_splat_transform()  # before the model runs
+    return wanted
 
 
 def _names(value: object) -> tuple[str, ...]:

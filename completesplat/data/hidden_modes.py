@@ -4,7 +4,7 @@ The data are in CO3D's layout. Beside its `images`, a sequence has a folder with
 after the mode.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,6 @@ from torch import Tensor
 from completesplat.data.co3d.source import CO3DSource
 from completesplat.data.loading.scenes import SceneStore, with_true_depths
 from completesplat.data.loading.view_selection import evaluation_views
-from completesplat.data.sequences import PosedSequence
 from completesplat.data.validation import BadAnnotation, field, finite_array, read_json
 from completesplat.errors import DataError, errors_at
 from completesplat.geometry.surfaces import hidden_from
@@ -88,16 +87,19 @@ class HiddenModeScenes:
         Raises:
             DataError: it is unreadable, its reference view distinguishes the modes, or no view shows them well.
         """
-        name, sequence, spread = self._read(index)
-        truths = self._truths(name, range(len(sequence.frames)))
+        name = self.store.names[index]
+        sequence = self.store.source.read(name)
+        truths = self._truths(name, len(sequence.frames))
         differences = truths.amax(0) - truths.amin(0)
+        if (differences[0] > LEAK).any():
+            raise DataError("the reference view tells the mode", sequence=name)
         regions = (differences > DIFFERENCE).any(1)
         best_first = differences.sum((1, 2, 3)).argsort(descending=True, stable=True).tolist()
         large = [view for view in best_first if view and regions[view].float().mean() >= SMALLEST_REGION]
         shown = large[: self.views]
         if not shown:
             raise DataError("no view shows enough of what the reference image hides", sequence=name)
-        targets = sorted({*shown, *spread})
+        targets = sorted({*shown, *evaluation_views(len(sequence.frames), self.spread)[1]})
         scene = with_true_depths(self.store.scene(sequence, 0, targets), sequence, 0, targets)
         front, others = scene.reference, scene.targets
         assert front.depths is not None
@@ -118,19 +120,6 @@ class HiddenModeScenes:
             true_mode=true_mode,
         )
 
-    def versions(self, index: int) -> SceneBatch:
-        """Return one scene in every mode [mode], with evenly spread targets; raise the errors of `__getitem__`."""
-        name, _, spread = self._read(index)
-        return stack([store.scene(store.source.read(name), 0, spread) for store in self.modes])
-
-    def _read(self, index: int) -> tuple[str, PosedSequence, list[int]]:
-        """Return the name of a scene, its sequence, and evenly spread views."""
-        name = self.store.names[index]
-        sequence, reference = self.store.source.read(name), self._truths(name, [0])
-        if (reference.amax(0) - reference.amin(0) > LEAK).any():
-            raise DataError("the reference view tells the mode", sequence=name)
-        return name, sequence, evaluation_views(len(sequence.frames), self.spread)[1]
-
     def _modes_of(self, name: str) -> tuple[int, Float[Tensor, " mode"]]:
         """Return the index of a scene's true mode, and the probabilities of all modes."""
         record, modes = self.record(name), list(self.chances)
@@ -142,7 +131,7 @@ class HiddenModeScenes:
             chances = finite_array(content.get("chances", list(self.chances.values())), (len(modes),), "chances")
         return modes.index(hidden), torch.from_numpy(chances).float()
 
-    def _truths(self, name: str, views: Iterable[int]) -> Float[Tensor, "mode view 3 size size"]:
+    def _truths(self, name: str, views: int) -> Float[Tensor, "mode view 3 size size"]:
         sequences = [(store, store.source.read(name)) for store in self.modes]
-        images = [[store.image(sequence, view) for store, sequence in sequences] for view in views]
-        return torch.stack([torch.stack(modes) for modes in images], dim=1).float() / 255
+        images = [torch.stack([store.image(sequence, view) for view in range(views)]) for store, sequence in sequences]
+        return torch.stack(images).float() / 255

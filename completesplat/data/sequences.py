@@ -1,10 +1,11 @@
 """Posed image sequences: the common form of all data sets, independent of their files and conventions."""
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -51,8 +52,7 @@ class PosedSequence:
     photos: tuple[str, ...] = ()
 
 
-@runtime_checkable
-class SequenceSource(Protocol):
+class SequenceSource(ABC):
     """Sequences of one split, in any form of storage.
 
     Attributes:
@@ -62,14 +62,12 @@ class SequenceSource(Protocol):
         listed: number of sequences that the data set has for this split, usable or not.
     """
 
-    names: list[str]
-    refused: list[DataError]
-    left_out: dict[str, list[str]]
-    listed: int
+    def __init__(self, names: list[str], listed: int, refused: list[DataError], left_out: dict[str, list[str]]) -> None:
+        self.names, self.listed, self.refused, self.left_out = names, listed, refused, left_out
 
+    @abstractmethod
     def read(self, name: str) -> PosedSequence:
         """Read a sequence's cameras, or raise a DataError; `PosedSequence.read` reads its images later."""
-        ...
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
         """Return groups of indices into `names` that are best read one after the other; by default one group."""
@@ -79,9 +77,9 @@ class SequenceSource(Protocol):
         """Return the files that differ from their checksums; by default there are no checksums."""
         return []
 
+    @abstractmethod
     def fingerprint(self) -> str:
         """Return a SHA-256 (hexadecimal) of the sequences' sources, which changes with the data."""
-        ...
 
 
 def shared_names(splits: Mapping[str, Collection[str]]) -> dict[str, list[str]]:

@@ -23,7 +23,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import cleaned, transparent
 from completesplat.export.mesh import VOXELS, Mesh, mesh_of
 from completesplat.export.ply import write_ply
-from completesplat.export.splat_transform import PageView, SplatTransform, write_turning_page
+from completesplat.export.splat_transform import PageView, convert, find_splat_transform, write_turning_page
 from completesplat.files import write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import transform_points
@@ -52,17 +52,16 @@ TO_GLTF = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 log = logging.getLogger(__name__)
 
 
-def write_formats(
+def write_format(
     folder: Path,
     name: str,
+    kind: str,
     gaussians: Gaussians,
-    formats: Sequence[str],
     view: PageView,
-    converter: SplatTransform | None,
     comments: Sequence[str] = (),
     rasterizer: Rasterizer | None = None,
 ) -> dict[str, str]:
-    """Write one scene as `NAME.ply`, `NAME.spz` and so on, its mesh as `NAME_mesh.glb`.
+    """Write one scene in the format `kind`, as `NAME.ply`, `NAME.spz` and so on, or its mesh as `NAME_mesh.glb`.
 
     All formats except `.ply` get colours clipped to [0, 1], because only some formats and readers would clip them, and
     the colours that the reference camera sees, if these depend on the direction. The `.ply` keeps colours above 1,
@@ -71,52 +70,37 @@ def write_formats(
     `.spz` prescribe +y up and +z towards the viewer; readers of `.spz` undo this. `.spz` omits `transparent` Gaussians.
 
     Returns:
-        File names by purpose: `NAME` for the `.ply`, `NAME_spz` and so on for the others.
+        The file's name by its purpose: `NAME` for the `.ply`, `NAME_spz` and so on for the others.
 
     Raises:
         CompleteSplatError: there is nothing to write, the converter (for `CONVERTED` formats) or the rasterizer (for a
             mesh) is missing, or one of them fails.
     """
+    path = folder / f"{name}{suffix(kind)}"
+    if kind == "ply":
+        write_ply(path, gaussians, comments)
+        return {name: path.name}
     seen = gaussians.seen_from(view.reference.centers)
     clipped = replace(seen, colors=seen.colors.clamp(0, 1))
-    files = {kind: name + suffix(kind) for kind in formats}
-    for kind, file in files.items():
-        if kind == "ply":
-            write_ply(folder / file, gaussians, comments)
-        else:
-            _write_format(folder / file, kind, clipped, view, converter, comments, rasterizer)
-    return {name if kind == "ply" else f"{name}_{kind}": file for kind, file in files.items()}
-
-
-def _write_format(
-    path: Path,
-    kind: str,
-    gaussians: Gaussians,
-    view: PageView,
-    converter: SplatTransform | None,
-    comments: Sequence[str],
-    rasterizer: Rasterizer | None,
-) -> None:
     if kind == "splat":
-        write_splat(path, gaussians)
+        write_splat(path, clipped)
     elif kind == "glb":
-        write_glb(path, gaussians, comments)
+        write_glb(path, clipped, comments)
     elif kind == "mesh":
         if rasterizer is None:
             raise CompleteSplatError(f"a rasterizer is needed for {kind}")
-        write_mesh(path, mesh_of(rasterizer, gaussians, view.reference, view.pivot), comments)
-    elif converter is None:
-        raise CompleteSplatError(f"a converter is needed for {kind}")
+        write_mesh(path, mesh_of(rasterizer, clipped, view.reference, view.pivot), comments)
     elif kind == "html":
-        write_turning_page(path, gaussians, view, converter)
+        write_turning_page(path, clipped, view)
     else:
-        stored = gaussians[~transparent(gaussians)] if kind == "spz" else gaussians
+        stored = clipped[~transparent(clipped)] if kind == "spz" else clipped
         if not stored.count:
             raise CompleteSplatError(f"{path}: all {gaussians.count} Gaussians are transparent")
         with tempfile.TemporaryDirectory() as temporary:
             source = Path(temporary) / f"{path.stem}.ply"
             write_ply(source, stored, comments)
-            converter.convert(source, path)
+            convert(find_splat_transform(), source, path)
+    return {f"{name}_{kind}": path.name}
 
 
 def suffix(kind: str) -> str:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
-from completesplat.export.formats import FORMATS, write_formats
+from completesplat.export.formats import FORMATS, write_format
 from completesplat.export.formats import suffix as format_suffix
 from completesplat.export.images import (
     SheetCell,
@@ -30,7 +30,7 @@ from completesplat.export.images import (
 )
 from completesplat.export.mesh import check_available
 from completesplat.export.ply import write_ply
-from completesplat.export.splat_transform import PageView, SplatTransform
+from completesplat.export.splat_transform import PageView
 from completesplat.export.video import Frames, orbit_views, render_views, write_video
 from completesplat.files import make_folder, write_text
 from completesplat.gaussians import Gaussians
@@ -66,7 +66,7 @@ class OutputFiles:
         CompleteSplatError: a format or video is unknown, or a format needs a package that is missing.
 
     Args:
-        formats: scene formats, from `completesplat.export.formats.FORMATS`; some need the converter.
+        formats: scene formats, from `completesplat.export.formats.FORMATS`; some need `find_splat_transform`.
         videos: camera paths, from `completesplat.geometry.trajectories.PATHS`; each video has `frames` frames.
         background: grey value behind the scene.
         pivot_depth: depth on the optical axis around which orbits turn; None: `seen_center` finds it.
@@ -80,7 +80,6 @@ class OutputFiles:
     background: float = 0.5
     pivot_depth: float | None = None
     maps: bool = False
-    converter: SplatTransform | None = None
     screen_space_dilation: bool = True
 
     def __post_init__(self) -> None:
@@ -253,7 +252,7 @@ def write_scene(
     files: dict[str, str] = {}
     for kind in wanted.formats:
         on_file(name + format_suffix(kind))
-        files |= write_formats(folder, name, stored, [kind], view, wanted.converter, comments, rasterizer)
+        files |= write_format(folder, name, kind, stored, view, comments, rasterizer)
     for kind in wanted.videos:
         files[f"{kind}{suffix}"] = f"{kind}{suffix}.mp4"
         on_file(f"{kind}{suffix}.mp4")

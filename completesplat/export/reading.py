@@ -23,7 +23,7 @@ from completesplat.errors import PlyError
 from completesplat.export.cleaning import bounded, cleaned
 from completesplat.export.formats import RECORD
 from completesplat.export.ply import read_ply
-from completesplat.export.splat_transform import PROGRAM, SplatTransform
+from completesplat.export.splat_transform import PROGRAM, convert
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.harmonics import SH_C0
 from completesplat.ply_files import LONGEST_HEADER, PACKED
@@ -74,7 +74,7 @@ def _read_by_splat_transform(path: Path, kind: str) -> Gaussians:
         advice = f"`{PROGRAM} {path.name} x.ply` unpacks it, or install {PROGRAM} to read it here"
         raise PlyError(f"{path}: {kind}; {advice}")
     with tempfile.TemporaryDirectory() as folder:
-        SplatTransform(program).convert(path.absolute(), Path(folder) / "unpacked.ply")
+        convert(program, path.absolute(), Path(folder) / "unpacked.ply")
         return read_ply(Path(folder) / "unpacked.ply")
 
 

@@ -10,6 +10,7 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,25 +34,22 @@ IN_A_ROOM = b"const isObjectExperience = !bbox.containsPoint(resetCamera.positio
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class SplatTransform:
-    """An installed `splat-transform`."""
-
-    program: str
-
-    def convert(self, source: Path, target: Path, options: Sequence[str] = ()) -> None:
-        """Write `target` in its suffix's format, whole or not at all; raise CompleteSplatError if the program fails."""
-        with atomic_path(target) as temporary:
-            _run([self.program, "--quiet", "--overwrite", *options, str(source), str(temporary)])
-            if not temporary.is_file():
-                raise CompleteSplatError(f"{PROGRAM} has not written {target.name}")
+def convert(program: str, source: Path, target: Path, options: Sequence[str] = ()) -> None:
+    """Write `target` in its suffix's format, whole or not at all; raise CompleteSplatError if the program fails."""
+    with atomic_path(target) as temporary:
+        _run([program, "--quiet", "--overwrite", *options, str(source), str(temporary)])
+        if not temporary.is_file():
+            raise CompleteSplatError(f"{PROGRAM} has not written {target.name}")
 
 
-def find_splat_transform() -> SplatTransform:
+def find_splat_transform() -> str:
     """Return the program on PATH or npm's (`npx` downloads 200 MB once); raise CompleteSplatError if neither works."""
-    program = shutil.which(PROGRAM)
+    return _find(shutil.which(PROGRAM), shutil.which("npx"))
+
+
+@cache
+def _find(program: str | None, npx: str | None) -> str:
     if program is None:
-        npx = shutil.which("npx")
         if npx is None:
             raise CompleteSplatError(
                 "formats spz, sog and html need Node.js 20 or newer with npm (https://nodejs.org);"
@@ -59,7 +57,7 @@ def find_splat_transform() -> SplatTransform:
             )
         program = _run([npx, "--yes", f"--package={PACKAGE}", "-c", f"command -v {PROGRAM}"]).strip()
     _run([program, "--version"])
-    return SplatTransform(program)
+    return program
 
 
 def _run(command: Sequence[str]) -> str:
@@ -98,7 +96,7 @@ class PageView:
     background: float
 
 
-def write_turning_page(path: Path, gaussians: Gaussians, view: PageView, converter: SplatTransform) -> None:
+def write_turning_page(path: Path, gaussians: Gaussians, view: PageView) -> None:
     """Write a page with the upright scene, seen from the front and turning until a person touches it."""
     turn = upright_rotation(view.up)
     with tempfile.TemporaryDirectory() as folder:
@@ -106,7 +104,7 @@ def write_turning_page(path: Path, gaussians: Gaussians, view: PageView, convert
         write_ply(scene, gaussians.transform(turn))
         settings.write_text(json.dumps(viewer_settings(view, turn)))
         html = Path(folder) / "page.html"
-        converter.convert(scene, html, ["--viewer-settings", str(settings)])
+        convert(find_splat_transform(), scene, html, ["--viewer-settings", str(settings)])
         # The viewer hides its controls after 4 seconds, and a person may not find them.
         write_bytes(path, around_the_target(html.read_bytes()).replace(b"</head>", CONTROLS + b"</head>", 1))
 

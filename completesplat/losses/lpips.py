@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.errors import WeightsError
-from completesplat.losses.weighted_sum import Prediction
+from completesplat.losses.terms import Prediction
 from completesplat.scene import Views
 from completesplat.weights import weights_file
 from completesplat.weights.checkpoint_reading import mismatch

@@ -1,11 +1,75 @@
-"""Unweighted loss terms of the reconstruction stage (paper, Eq. 1)."""
+"""Unweighted loss terms of the reconstruction stage (paper, Eq. 1), and their weighted sum."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Protocol, TypedDict
+
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from completesplat.autoreconstructor.posterior import Posterior
+from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians
 from completesplat.losses.ssim import structural_similarity
-from completesplat.losses.weighted_sum import Prediction
 from completesplat.scene import Views
+from completesplat.settings.schema import Natural, Range
+from completesplat.tensors import TensorDataclass
+
+
+@dataclass(frozen=True)
+class Prediction(TensorDataclass):
+    """Rendered images of the reference and all targets (sRGB), their Gaussians, and the posterior if any."""
+
+    images: Float[Tensor, "batch view 3 height width"]
+    gaussians: Gaussians
+    posterior: Posterior | None
+
+
+class LossTerm(Protocol):
+    """Loss term: a scalar from a prediction and the true views of the same cameras."""
+
+    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]: ...
+
+
+class Term(TypedDict, total=False):
+    """Loss term, its weight in the sum, and the optimizer step from which on it counts (by default 0)."""
+
+    weight: Annotated[float, Range(0)]
+    term: LossTerm
+    start_step: Natural
+
+
+class WeightedSum:
+    """Weighted sum of named loss terms.
+
+    Args:
+        terms: name -> {weight, term, start_step (default 0)}; None (an ablation) or weight 0 leaves it out.
+
+    Raises:
+        CompleteSplatError: no term counts at step 0, or an entry lacks its term or has other keys.
+    """
+
+    def __init__(self, terms: Mapping[str, Term | None]) -> None:
+        self.terms = {name: entry for name, entry in terms.items() if entry and entry["weight"]}
+        for name, entry in self.terms.items():
+            if "term" not in entry or entry.keys() - Term.__annotations__:
+                given = ", ".join(entry)
+                raise CompleteSplatError(f"loss.terms.{name}: give weight, term and perhaps start_step, not {given}")
+        if all(entry.get("start_step", 0) > 0 for entry in self.terms.values()):
+            raise CompleteSplatError("no loss at step 0: loss.terms needs a term with start_step=0")
+
+    def __call__(
+        self, prediction: Prediction, truth: Views, step: int = 0
+    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        """Return the weighted sum at an optimizer step, and each term's unweighted value for logging.
+
+        A term is not computed before its `start_step`.
+        """
+        active = {name: entry for name, entry in self.terms.items() if step >= entry.get("start_step", 0)}
+        values = {name: entry["term"](prediction, truth) for name, entry in active.items()}
+        total = torch.stack([self.terms[name]["weight"] * value for name, value in values.items()]).sum()
+        return total, {name: value.detach() for name, value in values.items()}
 
 
 class MeanSquaredError:

@@ -9,6 +9,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
+from completesplat.results import tables
 from completesplat.results.measured import (
     ALIKE,
     BEST_BY_METRIC,
@@ -27,19 +28,6 @@ from completesplat.results.measured import (
 )
 from completesplat.results.runs import HOW, MODES, SCORES, Job, RunTree, collect
 from completesplat.results.sweeps import sweep_rows
-from completesplat.results.tables import (
-    ABSENT,
-    BEST,
-    BLANK,
-    LEGEND,
-    SECOND,
-    UNMARKED,
-    Cell,
-    Heading,
-    Notes,
-    Table,
-    TableRow,
-)
 
 FILE = Path(__file__).with_name("figures.yaml")
 PAPER = "Liao et al., Complete Gaussian Splats from a Single Image with Denoising Diffusion Models, 3DV 2026"
@@ -64,7 +52,7 @@ def read_tables() -> list[PublishedTable]:
     return list(OmegaConf.load(FILE).tables)
 
 
-def printed_rows(table: PublishedTable) -> list[list[Cell]]:
+def printed_rows(table: PublishedTable) -> list[list[tables.Cell]]:
     return [[parse_cell(cell) for cell in line.split("|")] for line in table.rows.splitlines()]
 
 
@@ -74,20 +62,21 @@ def score_columns(table: PublishedTable) -> list[tuple[int, Any, str]]:
     return [(n, x, x.get("data_set", table.get("data_set"))) for n, x in numbered if x.key in METRICS]
 
 
-def parse_cell(cell: str) -> Cell:
+def parse_cell(cell: str) -> tables.Cell:
     """Convert `17.93 best` to the text `17.93` with the mark `best`; dagger and star become signs behind the text."""
     words = cell.split()
-    text = " ".join(word for word in words if word not in (BEST, SECOND, *SIGNS)) or BLANK
+    text = " ".join(word for word in words if word not in (tables.BEST, tables.SECOND, *SIGNS)) or tables.BLANK
     signs = [SIGNS[word] for word in words if word in SIGNS]
-    return Cell(" ".join([text, *signs]), next((word for word in words if word in (BEST, SECOND)), UNMARKED))
+    mark = next((word for word in words if word in (tables.BEST, tables.SECOND)), tables.UNMARKED)
+    return tables.Cell(" ".join([text, *signs]), mark)
 
 
-def comparison_table(table: PublishedTable, entries: Sequence[Entry]) -> Table:
+def comparison_table(table: PublishedTable, entries: Sequence[Entry]) -> tables.Table:
     """Return the published rows, followed by entries of ours.
 
     Times are of one sequence, warm, for the complete pipeline.
     """
-    notes, keys = Notes(), ["method"]
+    notes, keys = tables.Notes(), ["method"]
     is_ablation = bool(table.get("options"))
     if not is_ablation:
         keys = [key for key in LEADING if key in OF_RUNS or any(column.key == key for column in table.columns)]
@@ -95,23 +84,23 @@ def comparison_table(table: PublishedTable, entries: Sequence[Entry]) -> Table:
     names = [f"{table.region}_{table.view}_{column.key}" for _, column, _ in scored]
     data_sets = [None if is_ablation else data_set for *_, data_set in scored]
     ours = score_rows(entries, keys, list(zip(names, data_sets, strict=True)), notes, marked=False)
-    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in scored)]
+    headings = [*leading_headings(keys), *(tables.Heading(column.heading) for _, column, _ in scored)]
     source = f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
     signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.get("legend", {}).items()]
     of_ours = [APART] if entries else []
-    remarks = [source, *signs, LEGEND, *(of_ours if is_ablation else [VIEWS]), *table.get("remarks", [])]
+    remarks = [source, *signs, tables.LEGEND, *(of_ours if is_ablation else [VIEWS]), *table.get("remarks", [])]
     rows = [*_published_rows(table, keys), *ours]
-    return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
+    return tables.Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
 
 
-def _published_rows(table: PublishedTable, keys: Sequence[str]) -> list[TableRow]:
+def _published_rows(table: PublishedTable, keys: Sequence[str]) -> list[tables.TableRow]:
     """Return the paper's rows: first the cells of `keys`, then the scores."""
     rows = []
     for row in printed_rows(table):
-        cells = {"resolution": Cell(table.get("resolution", ABSENT))}
+        cells = {"resolution": tables.Cell(table.get("resolution", tables.ABSENT))}
         cells |= {column.key: cell for column, cell in zip(table.columns, row, strict=True)}
         scores = [row[number] for number, _, _ in score_columns(table)]
-        rows.append(TableRow("paper", [*(cells.get(key, Cell(ABSENT)) for key in keys), *scores]))
+        rows.append(tables.TableRow("paper", [*(cells.get(key, tables.Cell(tables.ABSENT)) for key in keys), *scores]))
     return rows
 
 
@@ -153,7 +142,7 @@ def sweep_entries(table: PublishedTable, name: str, jobs: Sequence[Job]) -> list
     return entries
 
 
-def published_tables(tree: RunTree | None) -> list[Table]:
+def published_tables(tree: RunTree | None) -> list[tables.Table]:
     """Return the published tables with the runs below a folder, or the published figures alone for None.
 
     A run is listed below published rows only if it was measured like them, else in a table for its protocol. The jobs

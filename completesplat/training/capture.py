@@ -28,13 +28,10 @@ from completesplat.baselines.fitting import (
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.sequences import PosedSequence, first_names
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import CONVERTED
 from completesplat.export.prediction import FileUnits, OutputFiles, Shot, write_fitted_scene, write_scene
-from completesplat.export.splat_transform import find_splat_transform
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.losses import WeightedSum
-from completesplat.losses.weighted_sum import Prediction
+from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import Batch, SceneBatch, Views
 from completesplat.settings.schema import Positive, Range, Share
 from completesplat.tensors import stack
@@ -219,12 +216,9 @@ class CaptureFit(Stage):
         placed, up = replace(cameras, world_to_camera=poses), normalize(-poses[:, 1, :3].mean(0), dim=-1)
         self.scene_folder.mkdir(parents=True, exist_ok=True)
         shot = Shot(scene, placed[0], up, FileUnits(sequence.scale, sequence.origin))
-        files = dict[str, str]()
+        files, comments, on_file = dict[str, str](), [f"scene {name}"], partial(logger.info, "writing %s")
         for part in (replace(wanted, formats=()), *(replace(wanted, formats=[x], videos=()) for x in wanted.formats)):
             try:
-                converter = find_splat_transform() if set(part.formats) & set(CONVERTED) else None
-                part, comments = replace(part, converter=converter), [f"scene {name}"]
-                on_file = partial(logger.info, "writing %s")
                 files |= write_scene(self.scene_folder, "scene", "", shot, self.rasterizer, part, comments, on_file)[-1]
             except CompleteSplatError as error:
                 logger.warning("left out: %s", error)

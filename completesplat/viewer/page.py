@@ -14,26 +14,17 @@ import viser
 
 from completesplat.data.images.files import open_image, refused_as_bad
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import CONVERTED, FORMATS, suffix, write_formats
+from completesplat.export.formats import FORMATS, suffix, write_format
 from completesplat.export.images import to_pixels
 from completesplat.export.prediction import PHOTO_FILE
-from completesplat.export.splat_transform import PageView, find_splat_transform
+from completesplat.export.splat_transform import PageView
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.files import SPLATS, printable, write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit
 from completesplat.rasterizers import Rasterizer
+from completesplat.viewer import panel
 from completesplat.viewer.access import GuardedServer, show_status, stop_server, with_head
-from completesplat.viewer.panel import (
-    SIDE_BY_SIDE,
-    VIDEO,
-    Pixels,
-    add_looking,
-    add_opening,
-    add_saving,
-    preview_of,
-    thumbnail_row,
-)
 from completesplat.viewer.sample import Sample, read_scene
 from completesplat.viewer.splat_view import SplatView
 
@@ -106,7 +97,6 @@ class Saver:
     ) -> None:
         self.folder, self.view, self.frames, self.background = folder, view, frames, background
         self.rasterizer = cache(make_rasterizer)
-        self._converter = cache(find_splat_transform)
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
         """Write samples in a format, as videos, or the page (`html`); raise CompleteSplatError if there are none."""
@@ -115,9 +105,9 @@ class Saver:
         self.folder.mkdir(parents=True, exist_ok=True)
         if kind == "html":
             return [write_viewer_page(self.view.server, self._next("page", ".html"))]
-        return [self._video(sample) if kind == VIDEO else self._scene(kind, sample) for sample in samples]
+        return [self._video(sample) if kind == panel.VIDEO else self._scene(kind, sample) for sample in samples]
 
-    def thumbnail(self, sample: Sample, size: int) -> Pixels:
+    def thumbnail(self, sample: Sample, size: int) -> panel.Pixels:
         """Render a sample from behind, where samples differ, with `size` px on the longer side."""
         up = torch.from_numpy(self.view.up).to(sample.reference.intrinsics)
         camera, scene = orbit(sample.reference, sample.pivot(), up, 2)[1], sample.for_viewers()
@@ -132,11 +122,10 @@ class Saver:
         """Write all layers of a sample, in its reference camera's frame."""
         path = self._next("sample", suffix(kind))
         comments = [f"{name} {value}" for name, value in sample.settings.items()]
-        converter = self._converter() if kind in CONVERTED else None
         front = PageView(sample.reference, sample.pivot(), torch.tensor(self.view.up), self.background)
         rasterizer = self.rasterizer() if kind == "mesh" else None
         name = path.name.removesuffix(suffix(kind))
-        write_formats(self.folder, name, sample.for_viewers(), [kind], front, converter, comments, rasterizer)
+        write_format(self.folder, name, kind, sample.for_viewers(), front, comments, rasterizer)
         return path
 
     def _video(self, sample: Sample) -> Path:
@@ -162,21 +151,21 @@ class Page:
         self.server, self.view, self.saver, self.scenes = server, view, saver, scenes
         self.complete: Callable[[Path, str, viser.ClientHandle | None], None] | None = None
         self.worker = Worker(self.tell)
-        self.opening = add_opening(server.gui, [*scenes])
+        self.opening = panel.add_opening(server.gui, [*scenes])
         self.opening.upload.on_upload(self._upload)
         self.opening.chosen.on_update(self._choose)
         self.photo = server.gui.add_html("", order=0.4)
-        self.looking = add_looking(server.gui)
+        self.looking = panel.add_looking(server.gui)
         self._connect_looking()
-        self.saving = add_saving(server.gui, FORMATS)
+        self.saving = panel.add_saving(server.gui, FORMATS)
         self.saving.save.on_click(self._save)
-        self._thumbnails: list[Pixels] = []
+        self._thumbnails: list[panel.Pixels] = []
         self.show(view.samples)
 
     def show(self, samples: Sequence[Sample], status: str = "") -> None:
         """Show samples in all browsers, and their thumbnails when all of them are finished."""
         self.view.show(samples)
-        options = (*(f"sample {i + 1}" for i in range(max(1, len(samples)))), SIDE_BY_SIDE)
+        options = (*(f"sample {i + 1}" for i in range(max(1, len(samples)))), panel.SIDE_BY_SIDE)
         if self.looking.chosen.options != options:
             self.looking.chosen.options = options
         layers = max((sample.layers for sample in samples), default=0)
@@ -200,7 +189,8 @@ class Page:
         self.photo.content = ""
         if file.is_file():
             with refused_as_bad(str(file)), open_image(file, ("PNG",)) as image:
-                self.photo.content = preview_of(np.asarray(image.convert("RGB").resize((THUMBNAIL,) * 2)), "photo")
+                pixels = np.asarray(image.convert("RGB").resize((THUMBNAIL, THUMBNAIL)))
+                self.photo.content = panel.preview_of(pixels, "photo")
 
     def _choose(self, _: viser.GuiEvent[Any]) -> None:
         name = self.opening.chosen.value
@@ -242,7 +232,7 @@ class Page:
         self._mark_thumbnail()
 
     def _mark_thumbnail(self) -> None:
-        row = thumbnail_row(self._thumbnails, self.view.chosen) if self._thumbnails else ""
+        row = panel.thumbnail_row(self._thumbnails, self.view.chosen) if self._thumbnails else ""
         if self.looking.thumbnails.content != row:
             self.looking.thumbnails.content = row
 

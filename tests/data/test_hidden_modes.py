@@ -64,18 +64,6 @@ def test_modes_differ_in_the_patch_and_nowhere_else_and_the_reference_does_not_s
     assert scene.unseen[list(scene.views)][scene.region].all()
 
 
-def test_versions_share_the_reference_and_show_the_stored_images_in_the_true_mode(toy_root, scene):
-    versions = scenes_of(toy_root)[0].versions(0)
-    assert versions.names == scene.scene.names * len(PATCH_COLORS)
-    assert (versions.reference.images == scene.scene.reference.images).all()
-    stored, shown = (part.targets.cameras.world_to_camera[0] for part in (scene.scene, versions))
-    places = [(stored == pose).all((1, 2)).nonzero().item() for pose in shown]
-    assert len(places) == 3
-    errors = (versions.targets.images - scene.scene.targets.images[:, places]).square().mean((1, 2, 3, 4)).sqrt()
-    assert errors.argmin() == scene.true_mode
-    assert errors[scene.true_mode] == 0
-
-
 def test_views_look_at_the_back_and_a_front_that_tells_the_colour_is_refused(toy_root, tmp_path):
     scenes, _ = scenes_of(toy_root, views=1)
     (view,) = scenes[0].views

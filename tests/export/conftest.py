@@ -1,11 +1,11 @@
 import pytest
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.splat_transform import SplatTransform, find_splat_transform
+from completesplat.export.splat_transform import find_splat_transform
 
 
 @pytest.fixture(scope="module")
-def converter() -> SplatTransform:
+def converter() -> str:
     """The real converter, where there is Node.js."""
     try:
         return find_splat_transform()

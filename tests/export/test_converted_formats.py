@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from completesplat.export.formats import write_formats
+from completesplat.export.formats import write_format
 from completesplat.export.ply import read_ply
-from completesplat.export.splat_transform import PageView
+from completesplat.export.splat_transform import PageView, convert
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 
@@ -42,9 +42,10 @@ def some(count: int = 400) -> Gaussians:
 def written(converter, tmp_path_factory):
     """A folder with the scene in all formats, and each of them converted back."""
     folder = tmp_path_factory.mktemp("formats")
-    write_formats(folder, "a", some(), ["ply", "splat", "spz", "sog"], VIEW, converter)
+    for kind in ("ply", "splat", "spz", "sog"):
+        write_format(folder, "a", kind, some(), VIEW)
     for kind in PRECISION:
-        converter.convert(folder / f"a.{kind}", folder / f"{kind}.ply")
+        convert(converter, folder / f"a.{kind}", folder / f"{kind}.ply")
     return folder
 
 
@@ -73,7 +74,7 @@ def test_spz_has_y_up_and_z_to_the_viewer_as_its_format_says(written, converter)
     Files are version 4, by nianticlabs/spz, README: magic number NGSP, then the version.
     """
     assert (written / "a.spz").read_bytes()[:8] == b"NGSP\x04\0\0\0"
-    converter.convert(written / "a.ply", written / "three.spz", ["--spz-version", "3"])
+    convert(converter, written / "a.ply", written / "three.spz", ["--spz-version", "3"])
     data = gzip.decompress((written / "three.spz").read_bytes())
     raw = np.frombuffer(data[16 : 16 + 400 * 9], np.uint8).reshape(400, 3, 3).astype(np.int32)
     fixed = raw[..., 0] | raw[..., 1] << 8 | raw[..., 2] << 16
@@ -84,8 +85,8 @@ def test_spz_has_y_up_and_z_to_the_viewer_as_its_format_says(written, converter)
 
 def test_no_opacity_comes_back_from_spz_as_minus_infinity(tmp_path, converter):
     opacities = torch.linspace(0, 1.2 / 255, 400)
-    write_formats(tmp_path, "a", dataclasses.replace(some(), opacities=opacities), ["spz"], VIEW, converter)
-    converter.convert(tmp_path / "a.spz", tmp_path / "back.ply")
+    write_format(tmp_path, "a", "spz", dataclasses.replace(some(), opacities=opacities), VIEW)
+    convert(converter, tmp_path / "a.spz", tmp_path / "back.ply")
     back = read_ply(tmp_path / "back.ply")  # which refuses infinity
     assert 200 < back.count < 250
     torch.testing.assert_close(back.opacities, torch.full((back.count,), 1 / 255))
@@ -115,7 +116,7 @@ def test_three_js_reads_the_same_gaussians_from_glb(tmp_path):
         pytest.skip("three.js cannot be had from npm")
     (tmp_path / "read.mjs").write_text(READER)
     own = some()
-    write_formats(tmp_path, "a", own, ["glb"], VIEW, None)
+    write_format(tmp_path, "a", "glb", own, VIEW)
     done = subprocess.run(["node", "read.mjs"], cwd=tmp_path, capture_output=True, text=True, check=True)
     means, covariances, colors = (torch.tensor(values).view(400, -1) for values in json.loads(done.stdout))
     turn = torch.diag(torch.tensor([1.0, -1, -1]))

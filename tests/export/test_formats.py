@@ -1,6 +1,7 @@
 """Files of a scene, written by a stand-in for the converter; initial view of a page."""
 
 import json
+import os
 import struct
 from contextlib import nullcontext
 from dataclasses import replace
@@ -11,9 +12,9 @@ from fake_converter import COPY, calls, install
 from support import some_gaussians
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import FORMATS, write_formats, write_glb, write_splat
+from completesplat.export.formats import FORMATS, write_format, write_glb, write_splat
 from completesplat.export.ply import read_ply, write_ply
-from completesplat.export.splat_transform import PageView, SplatTransform, upright_rotation, viewer_settings
+from completesplat.export.splat_transform import PageView, upright_rotation, viewer_settings
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.geometry.rotations import normalize_quaternion
@@ -27,32 +28,35 @@ KEEP_SETTINGS = f'{COPY}[ "$3" = --viewer-settings ] && cp "$4" "$0.settings" ||
 
 
 @pytest.fixture
-def program(tmp_path):
-    return install(tmp_path / "bin", "splat-transform", KEEP_SETTINGS)
-
-
-@pytest.fixture
-def converter(program):
-    return SplatTransform(str(program))
+def program(tmp_path, monkeypatch):
+    program = install(tmp_path / "bin", "splat-transform", KEEP_SETTINGS)
+    monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
+    return program
 
 
 @pytest.mark.parametrize("formats", [["splat"], SPLATS])
-def test_the_formats_that_are_wanted_are_written_and_no_others(tmp_path, program, converter, formats):
+def test_the_formats_that_are_wanted_are_written_and_no_others(tmp_path, program, monkeypatch, formats):
     out, scene = tmp_path / "out", some_gaussians(1)[0]
     out.mkdir()
-    files = write_formats(out, "sample_00", scene, formats, VIEW, converter)
+    files = {}
+    for kind in formats:
+        files |= write_format(out, "sample_00", kind, scene, VIEW)
     assert sorted(files.values()) == sorted(path.name for path in out.iterdir())
     assert set(files) == {"sample_00" if kind == "ply" else f"sample_00_{kind}" for kind in formats}
     needed = set(formats) - {"ply", "splat", "glb"}
-    assert len(calls(program)) == len(needed)
-    with pytest.raises(CompleteSplatError, match="a converter is needed for") if needed else nullcontext():
-        write_formats(out, "other", scene, formats, VIEW, None)
+    assert calls(program)[:1] == ["--version"][: len(needed)]
+    assert len(calls(program)[1:]) == len(needed)
+    monkeypatch.setenv("PATH", str(out))
+    for kind in formats:
+        with pytest.raises(CompleteSplatError, match=r"need Node\.js") if kind in needed else nullcontext():
+            write_format(out, "other", kind, scene, VIEW)
 
 
-def test_all_formats_but_the_page_are_made_of_the_ply_itself(tmp_path, converter):
+def test_all_formats_but_the_page_are_made_of_the_ply_itself(tmp_path, program):
     scene = some_gaussians(1)[0]
     scene.means[:] = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
-    write_formats(tmp_path, "a", scene, ["ply", "spz", "sog", "html"], VIEW, converter)
+    for kind in ("ply", "spz", "sog", "html"):
+        write_format(tmp_path, "a", kind, scene, VIEW)
     write_ply(tmp_path / "turned.ply", scene.transform(upright_rotation(UP)))
     names = "a.ply", "a.spz", "a.sog", "a.html", "turned.ply"
     ply, spz, sog, html, turned = ((tmp_path / name).read_bytes() for name in names)
@@ -60,9 +64,10 @@ def test_all_formats_but_the_page_are_made_of_the_ply_itself(tmp_path, converter
     assert html == turned != ply
 
 
-def test_colours_are_clipped_alike_in_all_formats_but_ply(tmp_path, converter):
+def test_colours_are_clipped_alike_in_all_formats_but_ply(tmp_path, program):
     scene = replace(some(), opacities=torch.full((20,), 0.5))
-    write_formats(tmp_path, "a", scene, SPLATS, VIEW, converter)
+    for kind in SPLATS:
+        write_format(tmp_path, "a", kind, scene, VIEW)
     clipped = scene.colors.clamp(0, 1)
     assert not torch.equal(clipped, scene.colors)
     torch.testing.assert_close(read_ply(tmp_path / "a.ply").colors, scene.colors.clamp(min=0), rtol=0, atol=1e-6)
@@ -74,14 +79,15 @@ def test_colours_are_clipped_alike_in_all_formats_but_ply(tmp_path, converter):
     assert (tmp_path / "a.splat").read_bytes() == (tmp_path / "other.splat").read_bytes()
 
 
-def test_spz_goes_without_opacities_that_round_to_nothing(tmp_path, converter):
+def test_spz_goes_without_opacities_that_round_to_nothing(tmp_path, program):
     """An opacity of 0 in 8 bits would be read as a logit of minus infinity."""
     opacities = torch.tensor([0.5 / 255 - 1e-6, 0.0, 1.0, 0.6 / 255] * 5)
-    write_formats(tmp_path, "a", replace(some(), opacities=opacities), ["ply", "spz"], VIEW, converter)
+    for kind in ("ply", "spz"):
+        write_format(tmp_path, "a", kind, replace(some(), opacities=opacities), VIEW)
     assert read_ply(tmp_path / "a.ply").count == 20
     torch.testing.assert_close(read_ply(tmp_path / "a.spz").opacities, torch.tensor([1.0, 0.6 / 255] * 5))
     with pytest.raises(CompleteSplatError, match=r"b.spz: all 20 Gaussians are transparent"):
-        write_formats(tmp_path, "b", replace(some(), opacities=opacities / 1000), ["spz"], VIEW, converter)
+        write_format(tmp_path, "b", "spz", replace(some(), opacities=opacities / 1000), VIEW)
 
 
 @pytest.mark.parametrize("up", [[0.1, -0.9, -0.4], [0.0, 0.0, -1.0], [0.0, 0.0, 3.0], [1.0, 0.0, 0.0]])
@@ -95,8 +101,8 @@ def test_a_scene_is_turned_until_up_points_to_minus_y(up):
     assert turn[2, 2] > -1e-6
 
 
-def test_a_page_begins_at_the_reference_camera_and_shows_its_whole_image(tmp_path, converter):
-    write_formats(tmp_path, "a", some_gaussians(1)[0], ["html"], VIEW, converter)
+def test_a_page_begins_at_the_reference_camera_and_shows_its_whole_image(tmp_path, program):
+    write_format(tmp_path, "a", "html", some_gaussians(1)[0], VIEW)
     settings = json.loads((tmp_path / "bin/splat-transform.settings").read_text())
     assert settings == json.loads(json.dumps(viewer_settings(VIEW, upright_rotation(UP))))
     initial = settings["cameras"][0]["initial"]

@@ -10,7 +10,7 @@ from support import round_gaussians
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export import mesh
-from completesplat.export.formats import write_formats
+from completesplat.export.formats import write_format
 from completesplat.export.splat_transform import PageView
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
@@ -41,8 +41,8 @@ def sphere(center: tuple[float, ...], radius: float, count: int) -> np.ndarray:
 
 def written(folder, scene: Gaussians) -> tuple[trimesh.Trimesh, np.ndarray]:
     """The mesh, and its colours in linear light."""
-    files = write_formats(folder, "a", scene, ["glb", "mesh"], VIEW, None, ["seed 7"], TiledRasterizer())
-    assert files == {"a_glb": "a.glb", "a_mesh": "a_mesh.glb"}
+    file = write_format(folder, "a", "mesh", scene, VIEW, ["seed 7"], TiledRasterizer())
+    assert file == {"a_mesh": "a_mesh.glb"}
     (result,) = trimesh.load(folder / "a_mesh.glb", process=False).geometry.values()
     colors = result.visual.vertex_attributes["color"]
     assert (colors.dtype, set(colors[:, 3])) == (np.uint16, {65535})
@@ -109,10 +109,10 @@ def test_every_field_gives_a_closed_surface():
 def test_where_there_is_nothing_there_is_no_mesh(tmp_path):
     behind = blobs(sphere((0, 0, -3), 0.3, 50), (1.0, 0, 0))
     with pytest.raises(CompleteSplatError, match="no surface in the middle"):
-        write_formats(tmp_path, "a", behind, ["mesh"], VIEW, None, rasterizer=TiledRasterizer())
+        write_format(tmp_path, "a", "mesh", behind, VIEW, rasterizer=TiledRasterizer())
     speck = blobs(sphere((0, 0, 3), 1e-9, 1), (1.0, 0, 0))
     with pytest.raises(CompleteSplatError, match="too thin to be a solid"):
-        write_formats(tmp_path, "a", speck, ["mesh"], VIEW, None, rasterizer=TiledRasterizer())
+        write_format(tmp_path, "a", "mesh", speck, VIEW, rasterizer=TiledRasterizer())
     with pytest.raises(CompleteSplatError, match="a rasterizer is needed for mesh"):
-        write_formats(tmp_path, "a", behind, ["mesh"], VIEW, None)
+        write_format(tmp_path, "a", "mesh", behind, VIEW)
     assert not list(tmp_path.iterdir())

@@ -99,7 +99,7 @@ def test_a_phone_shows_all_that_the_photo_shows_and_controls_that_stay(tmp_path,
     means = torch.tensor([[1.2, 0.0, 3.0], [-1.2, 0.0, 3.0], [0.0, 0.0, 3.0]])
     edges = round_gaussians(means, 0.15, 0.99, torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]))
     view = PageView(REFERENCE, means[2], torch.tensor([0.0, -1.0, 0.0]), 0.25)
-    write_turning_page(tmp_path / "scene.html", edges, view, converter)
+    write_turning_page(tmp_path / "scene.html", edges, view)
     with opened(tmp_path / "scene.html", [], "", 390, 844) as page:
         seen = at_rest(page)
         page.wait_for_timeout(6000)  # after four seconds the viewer would hide them
@@ -111,7 +111,7 @@ def test_a_phone_shows_all_that_the_photo_shows_and_controls_that_stay(tmp_path,
 
 def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path, converter):
     view = PageView(REFERENCE, PIVOT, UP, 0.25)
-    write_turning_page(tmp_path / "scene.html", scene(), view, converter)
+    write_turning_page(tmp_path / "scene.html", scene(), view)
     requests: list[str] = []
     theirs, ours = screenshot(tmp_path / "scene.html", requests), our_image(view)
     assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
@@ -122,7 +122,7 @@ def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path, converter):
 
 
 def test_dragging_turns_the_page_s_camera_about_the_object_also_within_walls(tmp_path, converter):
-    write_turning_page(tmp_path / "scene.html", room(), PageView(REFERENCE, PIVOT, UP, 0.25), converter)
+    write_turning_page(tmp_path / "scene.html", room(), PageView(REFERENCE, PIVOT, UP, 0.25))
     before, after = (screenshot(tmp_path / "scene.html", [], drag) for drag in (0, 150))
     for color in torch.eye(3):  # the balls around the pivot
         assert abs(place(before, color) - place(after, color)) < 0.1

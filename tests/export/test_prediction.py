@@ -1,6 +1,7 @@
 """The files of one prediction beside its splats: contact sheet, maps and description."""
 
 import dataclasses
+import os
 
 import numpy as np
 import pytest
@@ -22,7 +23,6 @@ from completesplat.export.prediction import (
     write_prediction,
     write_scene_json,
 )
-from completesplat.export.splat_transform import SplatTransform
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -91,12 +91,12 @@ def test_the_camera_comes_back_exactly_and_numbers_that_are_not_finite_leave_the
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path):
+def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path, monkeypatch):
+    program = install(tmp_path / "bin", "splat-transform")
+    monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
     bright = dataclasses.replace(scene_at(2, 0.9), colors=torch.tensor([[0.2, 0.4, 1.5], [0.0, 0.5, 1.0]]))
     faint = dataclasses.replace(scene_at(2, 0.9), opacities=torch.tensor([0.9, 1e-4]))
-    wanted = OutputFiles(
-        formats=("ply", "spz"), videos=(), converter=SplatTransform(str(install(tmp_path, "converter")))
-    )
+    wanted = OutputFiles(formats=("ply", "spz"), videos=())
     shots, settings = [Shot(bright, CAMERA), Shot(faint, CAMERA)], {"seed": 0, "image": "a.png"}
     write_prediction(tmp_path / "a", torch.zeros(3, 16, 16), shots, ReferenceRasterizer(), wanted, settings)
     recorded = strict_json(tmp_path / "a/scene.json")["settings"]

@@ -5,7 +5,7 @@ from fake_converter import calls, install
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export import splat_transform
-from completesplat.export.splat_transform import PACKAGE, SplatTransform, around_the_target, find_splat_transform
+from completesplat.export.splat_transform import PACKAGE, around_the_target, convert, find_splat_transform
 
 pytestmark = pytest.mark.processes
 
@@ -29,11 +29,11 @@ def test_without_node_the_message_names_what_to_install(bin_folder):
 def test_the_program_on_path_comes_first_else_npx_provides_the_pinned_package(bin_folder, tmp_path):
     elsewhere = install(tmp_path / "npm", "splat-transform")
     npx = install(bin_folder, "npx", f'echo "$@" >> "$0.log"\necho {elsewhere}')
-    assert find_splat_transform() == SplatTransform(str(elsewhere))
+    assert find_splat_transform() == str(elsewhere)
     assert calls(npx) == [f"--yes --package={PACKAGE} -c command -v splat-transform"]
     assert PACKAGE.endswith("@2.7.1")
     program = install(bin_folder, "splat-transform")
-    assert find_splat_transform() == SplatTransform(str(program))
+    assert find_splat_transform() == str(program)
     assert calls(program) == ["--version"]
     assert len(calls(npx)) == 1
 
@@ -65,7 +65,7 @@ def test_a_file_is_converted_in_place_of_an_older_one(bin_folder, tmp_path):
     program = install(bin_folder, "splat-transform")
     (tmp_path / "a.ply").write_text("splats")
     (tmp_path / "a.spz").write_text("older")
-    SplatTransform(str(program)).convert(tmp_path / "a.ply", tmp_path / "a.spz", ["--rotate", "0,0,180"])
+    convert(str(program), tmp_path / "a.ply", tmp_path / "a.spz", ["--rotate", "0,0,180"])
     assert (tmp_path / "a.spz").read_text() == "splats"
     (call,) = calls(program)
     assert call.startswith(f"--quiet --overwrite --rotate 0,0,180 {tmp_path / 'a.ply'} ")
@@ -85,7 +85,7 @@ def test_a_failure_is_one_line_and_leaves_the_older_file(bin_folder, tmp_path, s
     (tmp_path / "a.ply").write_text("splats")
     (tmp_path / "a.spz").write_text("older")
     with pytest.raises(CompleteSplatError, match=message) as caught:
-        SplatTransform(str(program)).convert(tmp_path / "a.ply", tmp_path / "a.spz")
+        convert(str(program), tmp_path / "a.ply", tmp_path / "a.spz")
     assert "\n" not in str(caught.value)
     assert (tmp_path / "a.spz").read_text() == "older"
 
@@ -95,5 +95,5 @@ def test_slow_converters_are_killed_with_their_children(bin_folder, tmp_path, mo
     # Would write the file after a minute, and holds the pipes open until then.
     program = install(bin_folder, "splat-transform", f"(sleep 60; touch {tmp_path / 'late'}) & sleep 100")
     with pytest.raises(CompleteSplatError, match=r"splat-transform has not finished within 0\.3 seconds"):
-        SplatTransform(str(program)).convert(tmp_path / "a.ply", tmp_path / "a.spz")
+        convert(str(program), tmp_path / "a.ply", tmp_path / "a.spz")
     assert not (tmp_path / "late").exists()

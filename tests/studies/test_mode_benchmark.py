@@ -101,9 +101,6 @@ def test_scenes_of_no_use_are_counted():
                 raise DataError("broken", sequence="bad")
             return self.scenes[index]
 
-        def versions(self, index):
-            raise AssertionError("only single modes are wanted")
-
     scenes = Broken([SCENES[0], None, SCENES[1]])
     assert usable_scenes(scenes, None) == (SCENES, ["bad: broken"])
     assert usable_scenes(scenes, 1) == (SCENES[:1], [])

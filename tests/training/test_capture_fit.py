@@ -34,7 +34,7 @@ def no_converter() -> None:
 
 
 def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, capture, tmp_path, monkeypatch):
-    monkeypatch.setattr("completesplat.training.capture.find_splat_transform", no_converter)
+    monkeypatch.setattr("completesplat.export.formats.find_splat_transform", no_converter)
     read, original, step = [], CapturedFrame.read, CaptureFit.training_step
     monkeypatch.setattr(CapturedFrame, "read", lambda self: read.append(self.number) or original(self))
 

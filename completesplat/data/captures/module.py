@@ -116,10 +116,7 @@ class CaptureSource(SequenceSource):
     def __init__(
         self, captures: Mapping[str, Capture], members: Members, framing: ObjectFraming, refused: list[DataError]
     ) -> None:
-        self.names = sorted(captures)
-        self.refused = refused
-        self.left_out: dict[str, list[str]] = {}
-        self.listed = len(captures) + len(refused)
+        super().__init__(sorted(captures), len(captures) + len(refused), refused, {})
         self.framing = framing
         self._captures = captures
         self._members = members

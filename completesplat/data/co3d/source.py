@@ -104,10 +104,7 @@ class CO3DSource(SequenceSource):
     def __init__(
         self, members: SplitMembers, framing: ObjectFraming, files: Sequence[Path], refused: list[DataError]
     ) -> None:
-        self.names = sorted(members.frames)
-        self.left_out = members.left_out
-        self.listed = members.listed
-        self.refused = refused
+        super().__init__(sorted(members.frames), members.listed, refused, members.left_out)
         self.framing = framing
         self._members = members
         self._files = files

@@ -96,13 +96,10 @@ class PackedSource(SequenceSource):
         if split not in splits:
             raise DataError(f"no split {split} in this packed store; there are: {', '.join(splits)}", str(root))
         entry = splits[split]
+        super().__init__(list(entry.names), entry.listed, [], {})
         self.root = root
         self.image_size = image_size
         self.shards = entry.shards
-        self.names = list(entry.names)
-        self.refused: list[DataError] = []
-        self.left_out: dict[str, list[str]] = {}
-        self.listed = entry.listed
         self._fingerprint = entry.fingerprint
         self._places = {
             name: (number, row) for number, shard in enumerate(self.shards) for row, name in enumerate(shard.sequences)

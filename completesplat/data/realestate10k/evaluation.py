@@ -31,11 +31,8 @@ class ChosenSource(SequenceSource):
     """
 
     def __init__(self, source: SequenceSource, clips: dict[str, str], views: dict[str, Choice], listed: int) -> None:
-        self.names = list(clips)
+        super().__init__(list(clips), listed, source.refused, source.left_out)
         self.views = views
-        self.listed = listed
-        self.refused = source.refused
-        self.left_out = source.left_out
         self._source = source
         self._clips = clips
 

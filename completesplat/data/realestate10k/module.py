@@ -51,10 +51,8 @@ class RE10KSource(SequenceSource):
     """Some clips of one folder; see `SequenceSource`. Several sources may share `clips`."""
 
     def __init__(self, clips: Clips, names: list[str], framing: ClipFraming) -> None:
-        self.names = names
-        self.refused: list[DataError] = clips.refused
-        self.left_out = {"frames are missing": clips.missing} if clips.missing else {}
-        self.listed = len(names) + len(clips.missing)
+        left_out = {"frames are missing": clips.missing} if clips.missing else {}
+        super().__init__(names, len(names) + len(clips.missing), clips.refused, left_out)
         self.framing = framing
         self._clips = clips
 

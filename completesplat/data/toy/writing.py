@@ -11,17 +11,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from completesplat.data.co3d import writing
 from completesplat.data.co3d.annotations import viewpoint
-from completesplat.data.co3d.writing import (
-    FOLDERS,
-    Annotation,
-    is_written,
-    sequence_annotation,
-    write_annotations,
-    write_frame,
-    write_points,
-    write_set_list,
-)
 from completesplat.data.hidden_modes import in_mode
 from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_mini, draw_object_scene, render_frame
@@ -61,11 +52,11 @@ class DataSetSize(TypedDict):
 
 
 Factors = Annotated[Sequence[Annotated[float, Range(0)]], Entries(3, 3)]
-WrittenScene = tuple[str, list[Annotation], Annotation]
+WrittenScene = tuple[str, list[writing.Annotation], writing.Annotation]
 """Split of a sequence, and annotations of its frames and of itself."""
 
 
-def _write_frame(folder: Path, place: tuple[str, str, int], scene: ToyScene, size: int, split: str) -> Annotation:
+def _write_frame(folder: Path, place: tuple[str, str, int], scene: ToyScene, size: int, split: str) -> dict[str, Any]:
     _, name, frame = place
     # The world has the scene's unit and origin.
     world_to_camera = np.linalg.inv(scene.camera_to_world[frame])
@@ -73,7 +64,7 @@ def _write_frame(folder: Path, place: tuple[str, str, int], scene: ToyScene, siz
     translation = scene.unit * world_to_camera[:3, 3] - rotation @ scene.origin
     focal = float(1 / np.tan(np.radians(scene.fov_degrees) / 2))
     seen_from = viewpoint(rotation, translation, [focal, focal], [0.0, 0.0])
-    annotation = write_frame(folder / name, place, *render_frame(scene, frame, size), seen_from, scene.unit)
+    annotation = writing.write_frame(folder / name, place, *render_frame(scene, frame, size), seen_from, scene.unit)
     return annotation | {"meta": {"frame_type": f"{split}_known"}}
 
 
@@ -102,16 +93,16 @@ def _write_scene(
     index, split = place
     scene = draw_category(category, seed, index, frames, light)
     name = f"{index:05d}_{scene.family}"
-    for folder in FOLDERS:
+    for folder in writing.FOLDERS:
         (root / name / folder).mkdir(parents=True)
     annotations = [_write_frame(root, (category, name, frame), scene, size, split) for frame in range(frames)]
     points = scene.unit * scene.points + scene.origin
-    write_points(root / name / "pointcloud.ply", points, to_uint8(scene.point_colors))
+    writing.write_points(root / name / "pointcloud.ply", points, to_uint8(scene.point_colors))
     if split == "test":
         _write_modes(root / name, scene, size)
     record = {"family": scene.family, "hidden": scene.patch_color, "chances": scene.chances.tolist()}
     (root / name / DESCRIPTION).write_text(json.dumps(record) + "\n")
-    return split, annotations, sequence_annotation(category, name, len(points))
+    return split, annotations, writing.sequence_annotation(category, name, len(points))
 
 
 def _write_modes(folder: Path, scene: ToyScene, size: int) -> None:
@@ -127,8 +118,8 @@ def _write_lists(category: Path, written: list[WrittenScene]) -> None:
     for split, frames, _ in written:
         lists[split] += [[f["sequence_name"], f["frame_number"], f["image"]["path"]] for f in frames]
     annotations = [frame for _, frames, _ in written for frame in frames]
-    write_annotations(category, annotations, [sequence for _, _, sequence in written])
-    write_set_list(category, SUBSET, lists)
+    writing.write_annotations(category, annotations, [sequence for _, _, sequence in written])
+    writing.write_set_list(category, SUBSET, lists)
 
 
 def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed: int, light: Array) -> None:
@@ -183,7 +174,7 @@ def write(
         if reason is not None:
             raise DataError(f"{folder.name}: {name}={number}: {reason}")
     parameters = {"format": FORMAT_VERSION, **numbers} | ({} if tuple(light) == WHITE else {"light": list(light)})
-    if is_written(folder / DESCRIPTION, parameters):
+    if writing.is_written(folder / DESCRIPTION, parameters):
         if progress:
             Console().print(f"{folder} already holds these scenes")
         return folder
