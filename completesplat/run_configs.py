@@ -183,7 +183,8 @@ def check_names(config: Any, source: Path, run: Path, trust: bool, name: object 
     if not trust and not _belongs_to_user(source, run):
         raise WeightsError(f"{refusal}; if it is a module of your own, and you trust who made the file: trust=true")
     if own_part(value) is None:
-        raise WeightsError(f"{refusal}, and not defined in a module of your own (SECURITY.md)")
+        places = "which lies in the working folder or in one of PYTHONPATH"
+        raise WeightsError(f"{refusal}, and not defined in a module of your own, {places} (SECURITY.md)")
     return value
 
 

@@ -131,7 +131,7 @@ def test_trust_allows_only_what_the_users_modules_define(runs, imported, foreign
         written = json.loads((runs / "STAGE2/weights" / CONFIG_FILE).read_text())
         written["autoreconstructor"]["encoder"] = settings
         (weights / CONFIG_FILE).write_text(json.dumps(written))
-        with pytest.raises(WeightsError, match=rf"names {foreign}, .* not defined in a module of your own"):
+        with pytest.raises(WeightsError, match=rf"names {foreign}, .* of your own, which lies in the working folder"):
             CompleteSplat.from_pretrained(weights, trust=True)
 
 

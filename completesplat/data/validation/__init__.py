@@ -195,8 +195,9 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
 
 def require_rotation(matrix: np.ndarray, what: str) -> None:
     """Refuse a 3 x 3 matrix that is no rotation; the tolerance is 1e-3 for each entry of R R^T."""
-    if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROTATION_TOLERANCE:
-        raise BadCamera(f"{what} is not orthonormal")
+    error = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    if error > ROTATION_TOLERANCE:
+        raise BadCamera(f"{what} is not orthonormal (R R^T - I up to {error:.2g}, at most {ROTATION_TOLERANCE:g})")
     if np.linalg.det(matrix) < 0:
         raise BadCamera(f"{what} is a reflection, not a rotation")
 
