@@ -21,6 +21,7 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from completesplat.commands.inputs import check_inputs
 from completesplat.commands.protocol import git_commit
 from completesplat.errors import CompleteSplatError
 from completesplat.files import UNFINISHED, atomic_path, write_bytes, write_json, writing
@@ -182,6 +183,7 @@ def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) 
 def start(verb: str, config: DictConfig, out: Path) -> object:
     """Check the settings and call the config's task or else the verb's `run`; return its result (a text is printed)."""
     with importing(), postponing() if verb == "predict" else nullcontext():
+        check_inputs(verb, config)
         check_verb(verb, config)
         if config.get("task") is None:
             run = partial(import_module(f"completesplat.commands.{verb}").run, config, out)
@@ -207,7 +209,7 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
     if finished and _ends(config) != _ends(earlier):
         _refuse_earlier_end(out, _ends(config), _ends(earlier))
         return False
-    if finished and config.get("test") and not earlier.get("test", True):
+    if finished and config.get("test") and not OmegaConf.select(earlier, "test", default=True):
         raise CompleteSplatError(f"{out} is finished, without a test: completesplat test ckpt={out}")
     return finished
 

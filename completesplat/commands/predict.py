@@ -3,13 +3,11 @@
 import json
 import logging
 import math
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from glob import glob
 from hashlib import sha256
 from pathlib import Path
 
@@ -23,6 +21,7 @@ from rich.markup import escape
 from rich.progress import Progress, TaskID
 from torch import Tensor
 
+from completesplat.commands.inputs import find_images
 from completesplat.commands.trained import open_generator, shown_background
 from completesplat.data.images.photograph import Photograph, outside_of_box, outside_of_mask
 from completesplat.data.validation.processes import map_in_processes, share_of
@@ -39,7 +38,6 @@ from completesplat.settings.checks import REMOVE
 from completesplat.version import __version__
 from completesplat.weights import sha256_of
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 OF_RUNS = ("image", "out", "shard", "shards", "devices")  # settings on which no single prediction depends
 FAR = 1.5  # ratio of tan(fov / 2), photo to training, from which a warning is given
 UNLIKE = 2.0  # distance from the training images (`distance_to_training`) from which a warning is given
@@ -117,38 +115,6 @@ def made_from(config: DictConfig, model: SceneModel, image: Path) -> str:
     files = [sha256_of(Path(file)) for file in (image, config.mask) if file is not None]
     weights = None if model.file is None else sha256_of_weights(Path(model.file))
     return sha256(json.dumps([__version__, settings, files, weights], sort_keys=True, default=str).encode()).hexdigest()
-
-
-def find_images(image: object) -> list[Path]:
-    """Return the files of `image=FILE`, or the images, sorted, of `image=FOLDER` or `image=PATTERN`, or of a list.
-
-    Raises:
-        CompleteSplatError: no file exists, a folder or pattern has no image, the list is empty, or an entry is no name.
-    """
-    entries = image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
-    if not entries:
-        raise CompleteSplatError("image=[]: name at least one image")
-    if any(entry == "" or isinstance(entry, bool) or not isinstance(entry, str | int) for entry in entries):
-        raise CompleteSplatError(f"image={image}: give an image, a folder, or a list of them")
-    images = [path for entry in entries for path in _images_of(Path(str(entry)))]
-    if not any(map(os.path.lexists, images)):
-        raise CompleteSplatError(f"{printable(str(images[0])[:300])}: no such file")
-    return images
-
-
-def _images_of(path: Path) -> list[Path]:
-    # `os.path`, because the methods of `Path` raise an error if a name is too long.
-    folder = os.path.isdir(path)
-    if not folder and (os.path.lexists(path) or not set("*?[") & set(str(path))):
-        return [path]
-    try:
-        files = path.iterdir() if folder else map(Path, glob(str(path), recursive=True))
-        images = sorted(file for file in files if file.suffix.lower() in SUFFIXES and file.is_file())
-    except OSError as error:
-        raise CompleteSplatError(f"{path}: {error.strerror}") from error
-    if not images:
-        raise CompleteSplatError(f"{path}: no image {'in this folder' if folder else 'fits'} ({', '.join(SUFFIXES)})")
-    return images
 
 
 def output_files(config: DictConfig) -> OutputFiles:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from completesplat.commands.inputs import check_one_model
 from completesplat.commands.protocol import checkpoint_facts
 from completesplat.errors import CompleteSplatError, ImageError, WeightsError
 from completesplat.files import printable
@@ -76,8 +77,7 @@ class TrainedModel:
             WeightsError: the checkpoint, its run's config or the weights are missing or not trusted.
             CompleteSplatError: not exactly one of them is given, or data are missing, superfluous or unsuitable.
         """
-        if [self.ckpt, self.weights, self.scenes].count(None) != 2:
-            raise CompleteSplatError("give one of ckpt=FILE, weights=DIR and scenes=DIR; all but ckpt need data=NAME")
+        check_one_model(self.ckpt, self.weights, self.scenes)
         if self.scenes is None and (self.frame, self.align, self.method) != ("opencv", "none", None):
             raise CompleteSplatError("frame, align, method: these apply to files only; give scenes=DIR")
         if self.ckpt is not None and self.data is not None:

@@ -26,6 +26,14 @@ def test_help_needs_no_heavy_import():
 
 
 @pytest.mark.processes
+@pytest.mark.parametrize("given", [["predict", "a.jpg"], ["predict"], ["test"], ["test", "ckpt=a.ckpt"]], ids=" ".join)
+def test_what_is_not_there_is_refused_before_torch_is_imported(given, tmp_path):
+    program = f"import sys; sys.argv = ['', *{given}]; from completesplat.cli import main\n"
+    program += "try: main()\nexcept SystemExit as stop: print(stop.code, 'torch' in sys.modules)"
+    assert python(program, cwd=tmp_path) == "2 False\n"
+
+
+@pytest.mark.processes
 def test_a_reader_that_goes_away_is_no_fault_of_the_program():
     program = "import sys; sys.argv = ['completesplat', 'fit', '--help']; from completesplat.cli import main; main()"
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE)

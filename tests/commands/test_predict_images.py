@@ -17,7 +17,8 @@ from rich.progress import Progress
 from support import compose_config, some_gaussians, strict_json
 
 from completesplat.commands import trained
-from completesplat.commands.predict import find_images, output_files, photo_warnings, run, unusual_field_of_view
+from completesplat.commands.inputs import find_images
+from completesplat.commands.predict import output_files, photo_warnings, run, unusual_field_of_view
 from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.export.reading import read_gaussians
