@@ -62,13 +62,15 @@ PartConfig = Mapping[str, object]  # config of a part: `_target_`, and arguments
 class TrainingImages(TypedDict, total=False):
     """Facts about the training images that are stored with weights; older weights have none.
 
-    `content`: what they show, in words, for weights in the package. `box_masks`: how often parts of an image were
-    hidden. `background`: grey value behind the objects, if images show nothing else. `depth_before`: depth range before
-    the centre of an object of the common size. The others: mean and standard deviation of the training images'
-    features, see `completesplat.data.images.photograph.image_features`.
+    `content`: what they show, in words, for weights in the package. `log_odds`: logarithm of how likely a photo shows
+    this and not anything else, before it is seen (0: no saying); renders are rare, and what lies on white is often
+    fruit. `box_masks`: how often parts of an image were hidden. `background`: grey value behind the objects, if images
+    show nothing else. `depth_before`: depth range before the centre of an object of the common size. The others: mean
+    and standard deviation of the training images' features, see `completesplat.data.images.photograph.image_features`.
     """
 
     content: str
+    log_odds: Annotated[float, Range(-100, 100)]
     box_masks: Share
     background: Share
     depth_before: Annotated[float, Range(0, 1e6)]

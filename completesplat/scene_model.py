@@ -30,9 +30,6 @@ from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, read_small, shipped
 
 Visible = Float[Tensor, "batch 1 height width"]  # masks that are 0 where an image is hidden, and 1 elsewhere
 OBJECT_SHARE = 0.9  # of the image's side that an object on a background fills, as on imported turntables
-# Before a photo is seen: logarithms of how much likelier it is of these weights' kind than of any other (`general`).
-# Photos are no renders, and what lies on white is often fruit. Chosen on the images of notebooks/experiments.md.
-LOG_ODDS = {"fruits": 4.0, "rendered_couches": -3.0, "toy_objects": -3.0}
 _rasterizer = cache(auto)
 
 
@@ -268,7 +265,7 @@ class Match(NamedTuple):
 def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str, Match]:
     """Return how an image fits the weights in the package, the likeliest first.
 
-    Training images are taken as normally distributed, with `LOG_ODDS` before the image is seen. Distances depend on the
+    Training images are taken as normally distributed, with `log_odds` before the image is seen. Distances depend on the
     resolution, so the image, which is read once, is resized for each model. Weights of objects on one background are
     left out if the image's border does not show it.
 
@@ -287,7 +284,7 @@ def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str
             deviations = torch.tensor(config["training"]["picture_std"])
             distances[name] = distance
             density = -deviations.log().sum().item() - len(deviations) * distance**2 / 2
-            logarithms.append(density + LOG_ODDS.get(name, 0.0))
+            logarithms.append(density + config["training"].get("log_odds", 0.0))
     probabilities = torch.tensor(logarithms, dtype=torch.float64).softmax(0).tolist()
     matches = {name: Match(x, distances[name]) for name, x in zip(distances, probabilities, strict=True)}
     return dict(sorted(matches.items(), key=lambda match: -match[1].probability))

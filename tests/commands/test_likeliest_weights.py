@@ -59,11 +59,13 @@ def test_of_many_images_a_few_from_all_over_are_looked_at(package, tmp_path):
     assert (name, reason) == ("greens", "; likeliest for 8 of 50 images (greens 62%, reds 38%, blues 0%)")
 
 
-def test_probabilities_are_those_of_normal_distributions_and_log_odds(package, tmp_path, monkeypatch):
+def test_probabilities_are_those_of_normal_distributions_and_log_odds(package, tmp_path):
     config = json.loads((package["blues"] / "config.json").read_text())
     config["training"] = {"picture_mean": [0.5] * 3 + [0.0] * 5, "picture_std": [0.5] * 8}
     (package["blues"] / "config.json").write_text(json.dumps(config))
-    monkeypatch.setattr("completesplat.scene_model.LOG_ODDS", {"reds": 1.5})
+    config = json.loads((package["reds"] / "config.json").read_text())
+    config["training"]["log_odds"] = 1.5
+    (package["reds"] / "config.json").write_text(json.dumps(config))
     found = match_shipped(photo(tmp_path / "photo.png", "#b70000"))  # nearer to blues, but likelier among reds
     features = np.array([0xB7 / 255, 0, 0, 0, 0, 0, 0, 0])
     broad, narrow = np.full(8, 0.5), np.full(8, 0.1)
