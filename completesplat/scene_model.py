@@ -262,6 +262,12 @@ class Match(NamedTuple):
     distance: float
 
 
+def shipped_configs() -> dict[str, Any]:
+    """Return the configs of the weights in the package by name, those for photos of anything first."""
+    configs = {name: json.loads(read_small(folder / CONFIG_FILE)) for name, folder in shipped().items()}
+    return dict(sorted(configs.items(), key=lambda item: "log_odds" in item[1]["training"]))
+
+
 def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str, Match]:
     """Return how an image fits the weights in the package, the likeliest first.
 
@@ -272,7 +278,7 @@ def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str
     Raises:
         CompleteSplatError: as `read_photograph`.
     """
-    configs = {name: json.loads(read_small(folder / CONFIG_FILE)) for name, folder in shipped().items()}
+    configs = shipped_configs()
     largest = max((config["image_size"] for config in configs.values()), default=1)
     square = read_photograph(image, largest, remove_background=remove_background).image
     distances, logarithms = dict[str, float](), list[float]()

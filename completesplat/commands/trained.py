@@ -19,7 +19,7 @@ from completesplat.errors import CompleteSplatError, ImageError, WeightsError
 from completesplat.files import printable
 from completesplat.generator import CompleteSplat
 from completesplat.run_configs import config_of_run
-from completesplat.scene_model import SceneModel, match_shipped
+from completesplat.scene_model import SceneModel, match_shipped, shipped_configs
 from completesplat.settings.checks import REMOVE
 from completesplat.tensors import used_device
 from completesplat.weights import AUTO, RUN_CHECKPOINT, sha256_of, shipped
@@ -137,7 +137,7 @@ class TrainedModel:
 def likeliest_weights(images: Sequence[Path], remove_background: bool) -> tuple[str, str]:
     """Return the name of the likeliest shipped weights for `LOOKED_AT` of the images, and the reason as a clause.
 
-    Without an image, they are the first ones of the package.
+    Without an image, they are those for photos of anything.
 
     Raises:
         WeightsError: the package has no weights.
@@ -150,7 +150,7 @@ def likeliest_weights(images: Sequence[Path], remove_background: bool) -> tuple[
             sums.update({name: x.probability for name, x in match_shipped(image, remove_background).items()})
             read.append(printable(image.name))
     if not read:
-        name, *names = shipped()
+        name, *names = shipped_configs()
         return name, f"; there is no image to choose by (weights=NAME takes others: {', '.join(names)})"
     shares = [f"{name} {total / len(read):.0%}" for name, total in sums.most_common()]
     shares += [f"{name} needs a plain background" for name in shipped() if name not in sums]

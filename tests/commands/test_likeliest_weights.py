@@ -48,6 +48,11 @@ def test_the_likeliest_for_the_images_that_can_be_read_are_chosen_and_the_others
     assert (name, reason) == ("reds", "; likeliest for 3 of 5 images (reds 67%, greens 33%, blues 0%)")
     name, reason = likeliest_weights(images[:2], False)
     assert (name, reason) == ("blues", "; there is no image to choose by (weights=NAME takes others: greens, reds)")
+    for name in ("blues", "greens"):  # of one kind each
+        config = json.loads((package[name] / "config.json").read_text())
+        config["training"]["log_odds"] = 1.0
+        (package[name] / "config.json").write_text(json.dumps(config))
+    assert likeliest_weights(images[:2], False)[0] == "reds"
     package.clear()
     with pytest.raises(WeightsError, match="this package has no weights; give weights=DIR"):
         likeliest_weights([red], False)
