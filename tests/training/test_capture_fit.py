@@ -55,6 +55,8 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
     rule = "one of 8 photos is held out, from the first on, and at least 3"
     fitted = f"6 of 9 photos; {rule}: {', '.join(held_out)}"
     assert f"fitted to {fitted}." in " ".join(finished.out.split())
+    assert [finished.out.count(f"{split}: 1 sequence\n") for split in ("train", "val", "test")] == [1, 1, 1]
+    assert "1 scene, 3 novel views" in finished.out
     files = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"scene.ply", "scene.splat", "sheet.png", "orbit.mp4", "scene.json"} < files
     assert finished.out.count("left out: no Node.js") == 1
