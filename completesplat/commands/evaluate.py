@@ -22,7 +22,7 @@ from completesplat.commands.trained import TrainedModel
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
-from completesplat.files import printable, write_json
+from completesplat.files import counted, printable, write_json
 from completesplat.results.measured import MODE_COLUMNS, evaluation_table
 from completesplat.results.runs import MODEL, read_record
 from completesplat.results.tables import records_table, show
@@ -191,4 +191,4 @@ def run_hidden_modes(
     records = [{"method": labels.get(name, name), **values} for name, values in results.items()]
     show(records_table(title, records, MODE_COLUMNS), width=140)
     if skipped:
-        print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
+        print(f"{counted(len(skipped), 'scene')} skipped; the first: {skipped[0]}")
