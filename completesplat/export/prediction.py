@@ -218,11 +218,11 @@ def write_fitted_scene(
     stored, reference = units.stored(dilated, shot.camera)
     write_ply(folder / "scene.ply", stored, [f"scene {name}"])
     indices = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
-    fitted = images[indices].clamp(0, 1)
+    true, fitted = (frames[indices].clamp(0, 1) for frames in (truth, images))
     scores = psnr(fitted, truth[indices]).tolist()
     cells = [SheetCell(image, f"fitted: {score:.2f} dB") for image, score in zip(fitted, scores, strict=True)]
     headings = [printable(shot.photos[i], SHEET_NAME) if shot.photos else f"view {i}" for i in indices]
-    write_png(folder / "sheet.png", image_sheet(headings, [strip(truth[indices].clamp(0, 1), "true"), cells], title))
+    write_png(folder / "sheet.png", image_sheet(headings, [strip(true, "true"), [*cells]], title))
     settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True, "up": shot.up.tolist()}
     if any(units.offset):
         settings["offset"] = list(units.offset)
