@@ -174,6 +174,11 @@ def printable(value: object, most: int = MOST_SHOWN) -> str:
     return line if len(line) <= most else f"{line[: most // 2 - 5]} ... {line[-most // 2 :]}"
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number and a noun whose plural ends in s: `1 scene`, `2 scenes`."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def safe_name(text: str, ending: str = "") -> str:
     """Return a name for a file or folder that resembles the text and cannot lead to another folder.
 

@@ -1,5 +1,7 @@
 """`completesplat test`: score a trained model's images against true ones, and its samples against hidden modes."""
 
+import re
+import shlex
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -20,9 +22,9 @@ from completesplat.commands.trained import TrainedModel
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
-from completesplat.files import write_json
+from completesplat.files import counted, printable, write_json
 from completesplat.results.measured import MODE_COLUMNS, evaluation_table
-from completesplat.results.runs import MODEL
+from completesplat.results.runs import MODEL, read_record
 from completesplat.results.tables import records_table, show
 from completesplat.settings.checks import EvaluationSettings, TestSettings
 from completesplat.settings.schema import Natural, Positive, Range
@@ -31,6 +33,8 @@ from completesplat.training.scoring import Scorer
 from completesplat.training.stopping import stopped_together
 
 Config = Mapping[str, Any]
+
+METRIC = re.compile(r"\+*evaluation\.metrics\.(\w+)")
 
 
 def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
@@ -109,6 +113,15 @@ def run(
     show(evaluation_table(results, MODEL if tested.scenes is None else module.method), width=160)
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")
+    if left_out := metrics_left_out(tested.ckpt, evaluation):
+        print(f"metrics of the run are left out; give them again: {shlex.join(left_out)}")
+
+
+def metrics_left_out(ckpt: str | None, evaluation: Config) -> list[str]:
+    """Return the overrides by which a checkpoint's run was given metrics that the evaluation lacks."""
+    record = {} if ckpt is None else read_record(Path(ckpt).absolute().parents[1])
+    given = map(printable, record.get("overrides", []))
+    return [x for x in given if (named := METRIC.match(x)) and named[1] not in evaluation["metrics"]]
 
 
 class HiddenModesEvaluation(TypedDict):
@@ -178,4 +191,4 @@ def run_hidden_modes(
     records = [{"method": labels.get(name, name), **values} for name, values in results.items()]
     show(records_table(title, records, MODE_COLUMNS), width=140)
     if skipped:
-        print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
+        print(f"{counted(len(skipped), 'scene')} skipped; the first: {skipped[0]}")

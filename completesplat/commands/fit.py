@@ -21,7 +21,7 @@ from completesplat.commands.protocol import checkpoint_facts, protocol
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.files import write_json
+from completesplat.files import counted, write_json
 from completesplat.results.measured import evaluation_table
 from completesplat.results.runs import PLAN, read_record
 from completesplat.results.tables import show
@@ -79,7 +79,7 @@ def run(config: DictConfig, out: Path) -> None:
         # The last column and line count floating-point operations, which are 0 before the first step.
         rows = str(ModelSummary(module, max_depth=2)).splitlines()
         print("\n".join(row.rpartition("|")[0] or row for row in rows if not row.endswith("Total Flops")))
-        logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, share)
+        logger.info("batch: %s a step, data.batch_per_process=%d", counted(data.batch_size, "scene"), share)
     metrics = {}
     with wandb_runs(loggers, config):
         if isinstance(module, Stage):

@@ -15,19 +15,22 @@ from completesplat.settings.options import conf_folder
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
 KINDS = ("loss", "metric", "rasterizer", "encoder", "callback", "dataset", "ablation", "experiment")
+CHOICE = re.compile(r"completesplat \w+[\w ]*( [+\w.]+=[\w.]*\w)+")
 FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)  # line of a template that names the file which follows
 
 
 def run(config: DictConfig) -> None:
-    """Write the part's files into the working folder; print their names and the commands that test them."""
+    """Write the part's files into the working folder; print their names and the commands that test and use them."""
     kind, name = str(config.kind), str(config.name)
     files = new_files(kind, name)
     for path, text in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, text)
         print(path)
+    choice = next(CHOICE.finditer("".join(files.values())))[0]
     needed = "" if find_spec("pytest") else " (needs pip install pytest)"
     print("next:", shlex.join([sys.executable, "-m", "pytest", f"test_{kind}_{name}.py"]) + needed)
+    print("then:", choice)
 
 
 def new_files(kind: str, name: str) -> dict[Path, str]:

@@ -15,7 +15,7 @@ from rich.console import Console
 from completesplat.commands import quieten
 from completesplat.commands.trained import TrainedModel, diffusion_of
 from completesplat.export.images import image_sheet, write_png
-from completesplat.files import write_json
+from completesplat.files import counted, write_json
 from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
 from completesplat.settings.checks import ModelSettings
@@ -50,7 +50,7 @@ def controls(
         rows = controls_rows(renderer, weights, scenes, near_degrees, tick)
         tick("the grid")
         sheet = controls_strips(renderer, weights, scenes[0], shown)
-    title = f"Controls: {len(scenes)} scenes, {run['samples']} samples each; (skip, guidance) of the paper in red"
+    title = f"Controls: {counted(len(scenes), 'scene')}, {run['samples']} samples each; the paper's weights in red"
     plot_controls(rows, out / "controls.png", title)
     title = f"{scenes[0].names[0]}: reference view of one sample, far view of {min(shown, run['samples'])}"
     write_png(out / "controls_grid.png", image_sheet(None, sheet, title))
@@ -83,7 +83,7 @@ def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Un
     weights = {"skip_weight": skip_weight, "guidance_weight": guidance_weight}
     with _opened(run) as (renderer, scenes, tick):
         rows = calibration_rows(renderer, scenes, tick, **weights)
-    title = f"{run['samples']} samples of each of {len(scenes)} scenes"
+    title = f"{counted(run['samples'], 'sample')} of each of {counted(len(scenes), 'scene')}"
     plot_calibration(rows, out / "calibration.png", f"{title}; skip {skip_weight:g}, guidance {guidance_weight:g}")
     ideal = f"calibrated: {1 / (1 + run['samples']):.3g} of the true values below and above all samples, ratio 1"
     _report(out / "calibration.json", f"Novel views; {ideal}", rows, run, **weights)
@@ -93,7 +93,7 @@ def ladder(fits: Positive, out: Path, **run: Unpack[Run]) -> None:
     """Write `ladder.json`, and print the table; `ladder_rows` explains its rows."""
     with _opened(run) as (renderer, scenes, tick):
         rows = ladder_rows(renderer, scenes, fits, tick)
-    title = f"Where quality is lost: all views and those from behind, PSNR (dB), {len(scenes)} scenes"
+    title = f"Where quality is lost: all views and those from behind, PSNR (dB), {counted(len(scenes), 'scene')}"
     _report(out / "ladder.json", title, rows, run, fits=fits)
 
 

@@ -32,7 +32,7 @@ from completesplat.export.mesh import check_available
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView
 from completesplat.export.video import Frames, orbit_views, render_views, write_video
-from completesplat.files import make_folder, write_text
+from completesplat.files import make_folder, printable, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.surfaces import normals_from_depth
@@ -41,7 +41,7 @@ from completesplat.rasterizers import Rasterizer
 
 logger = logging.getLogger(__name__)
 
-DIRECTIONS = 8
+DIRECTIONS, SHEET_NAME = 8, 18  # views on a sheet, and characters above a column
 PHOTO_FILE, SCENE_FILE = "photo.png", "scene.json"
 SPLATS, VIDEOS = "|".join(map(format_suffix, FORMATS)), "|".join(PATHS)
 WRITTEN = re.compile(rf"sample_\d+({SPLATS})|({VIDEOS})_\d+\.mp4|(depth|normals|opacity)_\d+\.png|{SCENE_FILE}")
@@ -127,12 +127,14 @@ class Shot:
 
     Attributes:
         up: direction up in the world, the axis of orbits.
+        photos: names of the photos that it is compared with, where they are known.
     """
 
     scene: Gaussians
     camera: Cameras
     up: Float[Tensor, "3"] = field(default_factory=lambda: torch.tensor([0.0, -1.0, 0.0]))
     units: FileUnits = FileUnits()
+    photos: tuple[str, ...] = ()
 
 
 def write_prediction(
@@ -216,10 +218,11 @@ def write_fitted_scene(
     stored, reference = units.stored(dilated, shot.camera)
     write_ply(folder / "scene.ply", stored, [f"scene {name}"])
     indices = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
-    rows = [strip(truth[indices].clamp(0, 1), "true"), strip(images[indices].clamp(0, 1), "fitted")]
-    scores = psnr(images[indices].clamp(0, 1), truth[indices]).tolist()
-    headings = [f"view {i}: {score:.2f} dB" for i, score in zip(indices, scores, strict=True)]
-    write_png(folder / "sheet.png", image_sheet(headings, rows, title))
+    true, fitted = (frames[indices].clamp(0, 1) for frames in (truth, images))
+    scores = psnr(fitted, truth[indices]).tolist()
+    cells = [SheetCell(image, f"fitted: {score:.2f} dB") for image, score in zip(fitted, scores, strict=True)]
+    headings = [printable(shot.photos[i], SHEET_NAME) if shot.photos else f"view {i}" for i in indices]
+    write_png(folder / "sheet.png", image_sheet(headings, [strip(true, "true"), [*cells]], title))
     settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True, "up": shot.up.tolist()}
     if any(units.offset):
         settings["offset"] = list(units.offset)

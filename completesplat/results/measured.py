@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar, cast
 
+from completesplat.files import counted
 from completesplat.metrics import STYLES, Style
 from completesplat.results.runs import MODEL, PROTOCOL, UPPER_BOUND, FlatScores, Protocol, ResultsFile, flat_scores
 from completesplat.results.tables import (
@@ -247,7 +248,7 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = M
         headings.append(Heading(f"{'all' if region == 'full' else region}\npixels\n{view}\n{styles[metric].heading}"))
     fitted = {label: entry.get("fitted_to") for label, entry in zip(records, measured.values(), strict=True)}
     remarks = [f"{label}: fitted to {views}." for label, views in fitted.items() if views]
-    title = f"{first['scenes']:.0f} scenes, {first['views']:.0f} novel views"
+    title = f"{counted(int(first['scenes']), 'scene')}, {counted(int(first['views']), 'novel view')}"
     return Table(title, title, headings, rows, [*remarks, SSIM_NOTE, SHARPNESS_NOTE])
 
 

@@ -159,14 +159,15 @@ def _row_remarks(rows: Sequence[Entry]) -> list[str]:
 
 
 def _program_remarks(records: Sequence[Record]) -> list[str]:
-    commits = list(dict.fromkeys(record["commit"] or "unknown" for record in records))
+    commits = dict.fromkeys(record["commit"] or "unknown" for record in records)
+    source = [f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}."] if set(commits) - {"unknown"} else []
     here = machine()
     gpu = f", {here['gpu']}" if "gpu" in here else ""
     hardware = f"{here['processor']}, {here['cores']} cores{gpu}"
     software = f"{here['system']}, Python {here['python']}, torch {here['torch']}"
     commands = dict.fromkeys(shell_command(record["command"]) for record in records)
     return [
-        f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits) or 'unknown'}.",
+        *source,
         f"Summary of {here['date']}, made on {hardware}, {software}.",
         *(f"Command: {command}" for command in commands),
     ]

@@ -1,16 +1,18 @@
 """Table type of all results, and its writers for Markdown, LaTeX, CSV and the terminal."""
 
 import csv
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from completesplat.files import atomic_path, write_text
 from completesplat.metrics import PSNR_LIMIT, STYLES, Style
 
 if TYPE_CHECKING:
+    from rich.console import Console, ConsoleOptions
     from rich.table import Table as PrintedTable
 
 HEADING_GROUPS = {
@@ -32,6 +34,7 @@ ESCAPES = str.maketrans(
     | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
     | {"±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "†": r"$\dagger$", "★": r"$\star$"}
 )
+WORD = re.compile(r"\S+(?: [↑↓])?")  # a column is at least as wide, so that none breaks
 ABSENT, BLANK = "-", "(blank)"
 LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK}: left blank in the paper."
 
@@ -143,16 +146,35 @@ class Table:
     def below(self) -> list[str]:
         return [*self.remarks, *(f"[{n}] {text}" for n, text in enumerate(self.notes.texts, 1))]
 
-    def __rich__(self) -> "PrintedTable":
+    def __rich_console__(self, console: "Console", options: "ConsoleOptions") -> Iterator["PrintedTable"]:
+        """Yield the table, in parts that repeat the first column if the words of all columns do not fit side by side.
+
+        No column is narrower than its longest word, up to half the width; space that is left goes to the first columns.
+        """
         from rich.table import Table as PrintedTable
         from rich.text import Text
 
-        printed = PrintedTable(title=self.title, title_justify="left")
-        for heading in self.headings:
-            printed.add_column(heading.joined("\n"), justify="right" if heading.figures else "left", overflow="fold")
-        for row, ruled in self.ruled_rows():
-            printed.add_row(*(Text(cell.text, MARKED_TERMINAL[cell.mark]) for cell in row.cells), end_section=ruled)
-        return printed
+        texts = [[x.joined("\n"), *(row.cells[i].text for row in self.rows)] for i, x in enumerate(self.headings)]
+        lines = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
+        room, most = options.max_width - 1, options.max_width // 2 - 4  # without borders; two columns always fit
+        words = [min(most, max(len(word) for text in column for word in WORD.findall(text))) for column in texts]
+        parts: list[list[int]] = [[0]]
+        for index in range(1, len(texts)):
+            if len(parts[-1]) > 1 and sum(words[i] + 3 for i in (*parts[-1], index)) > room:
+                parts.append([0])
+            parts[-1].append(index)
+        for part in parts:
+            spare = room - sum(words[i] + 3 for i in part)
+            printed = PrintedTable(title=self.title if part is parts[0] else None, title_justify="left")
+            for i in part:
+                width = min(lines[i], words[i] + spare)
+                spare -= width - words[i]
+                justify: Any = "right" if self.headings[i].figures else "left"
+                printed.add_column(texts[i][0], justify=justify, overflow="fold", width=width)
+            for row, ruled in self.ruled_rows():
+                cells = [row.cells[i] for i in part]
+                printed.add_row(*(Text(x.text, MARKED_TERMINAL[x.mark]) for x in cells), end_section=ruled)
+            yield printed
 
 
 def records_table(

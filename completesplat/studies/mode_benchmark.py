@@ -16,6 +16,7 @@ from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.diffusion.sampling import in_parts
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.export.images import Sheet, SheetCell, image_sheet, write_png
+from completesplat.files import counted
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.mode_coverage import REJECTED, classify, draw_modes, mean_of, scores
 from completesplat.metrics.proper_scores import energy_score
@@ -219,5 +220,5 @@ def usable_scenes(scenes: HiddenModeScenes, count: int | None) -> tuple[list[Hid
 
 def write_modes(measured: ModeMeasurements, samples: int, path: Path) -> None:
     """Write a PNG with a row for each scene of `ModeMeasurements.rows`."""
-    title = f"Hidden modes: {len(measured.names)} scenes, {samples} samples each. Input; then from behind: every mode, "
-    write_png(path, image_sheet(None, measured.rows, f"{title}samples with their modes"))
+    title = f"Hidden modes: {counted(len(measured.names), 'scene')}, {samples} samples each. Input; then from behind: "
+    write_png(path, image_sheet(None, measured.rows, f"{title}every mode, samples with their modes"))

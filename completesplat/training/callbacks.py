@@ -215,7 +215,8 @@ class Progress(RichProgressBar):
         logged = {name: x.item() for name, x in trainer.callback_metrics.items() if name in IN_PROGRESS_BAR}
         hidden = {"v_num"} if logged.get(BAD_STEPS) else {"v_num", BAD_STEPS}
         metrics = super().get_metrics(trainer, pl_module) | logged
-        return {"step": _steps(trainer), **{name: value for name, value in metrics.items() if name not in hidden}}
+        step = {} if trainer.max_steps > 0 else {"step": trainer.global_step}  # else the bar counts the steps
+        return step | {name: value for name, value in metrics.items() if name not in hidden}
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_validation_end(trainer, pl_module)

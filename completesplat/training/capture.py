@@ -215,7 +215,9 @@ class CaptureFit(Stage):
         poses = cameras.world_to_camera @ sequence.cameras.world_to_camera[0].to(cameras.world_to_camera)
         placed, up = replace(cameras, world_to_camera=poses), normalize(-poses[:, 1, :3].mean(0), dim=-1)
         self.scene_folder.mkdir(parents=True, exist_ok=True)
-        shot = Shot(scene, placed[0], up, FileUnits(sequence.scale, sequence.origin))
+        reference, targets = self.data.evaluation_views(sequence, "test")
+        photos = tuple(sequence.photos[index] for index in (reference, *targets))
+        shot = Shot(scene, placed[0], up, FileUnits(sequence.scale, sequence.origin), photos)
         files, comments, on_file = dict[str, str](), [f"scene {name}"], partial(logger.info, "writing %s")
         for part in (replace(wanted, formats=()), *(replace(wanted, formats=[x], videos=()) for x in wanted.formats)):
             try:

@@ -27,6 +27,7 @@ from completesplat.data.packed.manifest import MANIFEST
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
+from completesplat.files import counted
 from completesplat.scene import SceneBatch
 from completesplat.signals import leave_to_parent
 
@@ -232,7 +233,7 @@ def _encoded_batches(
 def _check_space(frames: int, sequences: int, bytes_per_frame: int, out: Path) -> None:
     """Log the size of the future store; raise DataError if the disk has less space."""
     size, free = frames * bytes_per_frame, shutil.disk_usage(out).free
-    contents = f"{frames:,} frames of {sequences:,} sequences"
+    contents = f"{counted(frames, 'frame')} of {counted(sequences, 'sequence')}"
     needed = f"about {decimal(size)} for {contents}; {decimal(free)} are free"
     if size > free:
         raise DataError(f"not enough space: {needed}; frames=N takes fewer frames of a sequence", str(out))

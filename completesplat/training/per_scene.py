@@ -20,7 +20,7 @@ from completesplat.data.loading.distributed import gather_values, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.errors import CompleteSplatError
 from completesplat.export.prediction import Shot, write_fitted_scene
-from completesplat.files import make_folder, safe_name, write_bytes
+from completesplat.files import counted, make_folder, safe_name, write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.rotations import normalize_quaternion
@@ -142,7 +142,7 @@ class FittedScenes:
         for name in track(missing, "fitting Gaussians to scenes", disable=not progress):
             self._fitted(name)
         if missing:
-            logger.info("fitted Gaussians to %d scenes", len(missing))
+            logger.info("fitted Gaussians to %s", counted(len(missing), "scene"))
 
     def seen_from(self, name: str, frame: int) -> Gaussians:
         """Return a sequence's Gaussians in the frame of one of its cameras, on the CPU."""

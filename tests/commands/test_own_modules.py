@@ -1,5 +1,6 @@
 """Modules and settings of the user's own, in the working folder, as the documents describe them."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -36,6 +37,11 @@ class Bias:
     def __call__(self, predicted, true, masks):
         return ((predicted - true).mean(1, keepdim=True) * masks).mean((1, 2, 3)).abs()
 """
+CHOSEN = {kind: f"fit experiment=toy_var {kind}={{}}" for kind in ("loss", "rasterizer", "ablation")}
+CHOSEN |= {"metric": "test ckpt=RUN +evaluation.metrics.{0}._target_={0}.{1}"}
+CHOSEN |= {"encoder": "fit experiment=toy_var autoreconstructor.encoder._target_={0}.{1}"}
+CHOSEN |= {"callback": "fit experiment=toy_var +callbacks.{0}._target_={0}.{1}"}
+CHOSEN |= {"dataset": "data check data={} data.root=DIR", "experiment": "fit experiment={} data.root=DATA out=RUN"}
 OWN_METRIC = "+evaluation.metrics.my_bias._target_=mymetric.Bias"
 
 
@@ -100,9 +106,10 @@ def test_modules_of_the_working_folder_stand_in_for_no_others(own, name):
 def test_what_is_begun_runs_as_it_is_written(command, own):
     assert all(f" {kind}" in command.succeeds("new", "--help").out for kind in KINDS)
     for kind in KINDS:
-        *written, following = command.succeeds("new", kind, f"my_{kind}").out.splitlines()
+        *written, following, chosen = command.succeeds("new", kind, f"my_{kind}").out.splitlines()
         assert all((own / name).is_file() for name in written)
         assert following == f"next: {sys.executable} -m pytest test_{kind}_my_{kind}.py"
+        assert chosen == f"then: completesplat {CHOSEN[kind].format(f'my_{kind}', f'My{kind.capitalize()}')}"
     assert not (own / "outputs").exists()
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     program = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *sorted(own.glob("test_*.py"))]
@@ -160,9 +167,13 @@ def test_a_metric_that_a_run_names_is_not_imported(command, own_metric, pipeline
     shutil.copytree(pipeline.var, own_metric / "RUN")
     config = OmegaConf.load(own_metric / "RUN/config.yaml")
     config.evaluation.metrics = {"psnr": {"_target_": "mymetric.Bias"}}
+    record = strict_json(own_metric / "RUN/run.json")
+    record["overrides"] += [OWN_METRIC, "evaluation.metrics.ssim=null"]
+    (own_metric / "RUN/run.json").write_text(json.dumps(record))
     OmegaConf.save(config, own_metric / "RUN/config.yaml")
-    command.succeeds("test", "ckpt=RUN", "trainer.accelerator=cpu", "out=OUT")
+    printed = command.succeeds("test", "ckpt=RUN", "trainer.accelerator=cpu", "out=OUT").out
     assert not (own_metric / "imported").exists()
+    assert f"metrics of the run are left out; give them again: {OWN_METRIC}\n" in printed
     config.model.metric = {"_target_": "mymetric.Bias"}
     OmegaConf.save(config, own_metric / "RUN/config.yaml")
     (tmp_path / "elsewhere").mkdir()

@@ -122,7 +122,7 @@ def test_photos_become_upright_keep_their_focal_length_and_the_unusable_are_name
         assert image.getexif().get(274) is None
         assert copy.suffix == ".tiff" or image.getexif().get_ifd(0x8769)[41989] == 28
     assert caplog.text.count("left out: ") == 2
-    assert "left out: 1 files of other formats: notes.txt" in caplog.text
+    assert "left out: 1 file of other formats: notes.txt" in caplog.text
     assert f"left out: {tmp_path / 'cut.jpg'}: cannot be decoded" in caplog.text
     full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     monkeypatch.setattr(importing, "save_image", full)

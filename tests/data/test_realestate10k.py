@@ -172,7 +172,8 @@ def test_missing_clips_are_counted_and_left_out(form, tmp_path, caplog):
     assert sorted(data.store("train").names + data.store("val").names) == sorted(clip.key for clip in TRAIN)
     assert data.source("train").left_out == {"frames are missing": ["x", "y"]}
     assert caplog.messages == [
-        f"{split}: {count} sequences; 2 left out: frames are missing" for split, count in (("train", 6), ("val", 1))
+        f"{split}: {count}; 2 left out: frames are missing"
+        for split, count in (("train", "6 sequences"), ("val", "1 sequence"))
     ]
 
 

@@ -258,11 +258,13 @@ def test_planned_jobs_are_those_of_hydras_sweeper(sweep) -> None:
     assert planned_jobs(sweep.folder) == jobs
 
 
-def test_remarks_name_commits_machine_date_and_commands(sweep) -> None:
+def test_remarks_name_known_commits_machine_date_and_commands(sweep) -> None:
+    sweep.add("seed=9", commit=None)
+    assert not any("ommit" in line for line in remarks(sweep))
     for seed, commit in enumerate(("c0ffee", "decade-dirty", "c0ffee")):
         sweep.add(f"seed={seed}", commit=commit)
     *_, commits, made, command = remarks(sweep)
-    assert commits == "Commits c0ffee, decade-dirty."
+    assert commits == "Commits unknown, c0ffee, decade-dirty."
     assert machine()["processor"] in made
     assert time.strftime("%Y-") in made
     assert command.startswith("Command: completesplat fit -m experiment=small ablation=full,no_skips data.root=")

@@ -118,6 +118,18 @@ def test_an_evaluation_shows_every_predictor_with_all_digits_in_any_width(capsys
     assert "…" not in printed
 
 
+@pytest.mark.parametrize("width", [60, 80, 120, 240])
+def test_tables_break_no_word_in_any_width_and_show_all_columns(runs, run, capsys, width) -> None:
+    run("a", 20.0, {"copy_reference": 10.0})
+    for table in published_tables(find_results(runs)):
+        show(table, width=width)
+        printed = capsys.readouterr().out
+        assert max(map(len, printed.splitlines()[: -len(table.below())])) <= width
+        shown = set(re.split(r"[\s│┃]+", printed))
+        texts = [heading.joined(" ") for heading in table.headings] + [x.text for row in table.rows for x in row.cells]
+        assert {word for text in texts for word in text.split()} <= shown
+
+
 def test_an_evaluation_names_upper_bounds_and_leaves_out_objects_that_are_all_pixels() -> None:
     views = {"novel": {"psnr": 20.0, "ssim": 0.5, "sharpness": 0.5}, "reference": {"psnr": 20.0, "ssim": 0.5}}
     entry = {"scenes": 2, "views": 4, "full": views, "object": views}

@@ -10,6 +10,7 @@ from completesplat.data.captures.capture import CapturedFrame
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_transforms
 from completesplat.errors import CompleteSplatError
+from completesplat.export import prediction
 from completesplat.export.ply import read_ply
 from completesplat.export.reading import read_gaussians
 from completesplat.training.capture import CaptureFit
@@ -36,6 +37,8 @@ def no_converter() -> None:
 def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, capture, tmp_path, monkeypatch):
     monkeypatch.setattr("completesplat.export.formats.find_splat_transform", no_converter)
     read, original, step = [], CapturedFrame.read, CaptureFit.training_step
+    columns, sheet = [], prediction.image_sheet
+    monkeypatch.setattr(prediction, "image_sheet", lambda names, *rest: columns.append(names) or sheet(names, *rest))
     monkeypatch.setattr(CapturedFrame, "read", lambda self: read.append(self.number) or original(self))
 
     def interrupted_step(self, *inputs):
@@ -55,9 +58,12 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
     rule = "one of 8 photos is held out, from the first on, and at least 3"
     fitted = f"6 of 9 photos; {rule}: {', '.join(held_out)}"
     assert f"fitted to {fitted}." in " ".join(finished.out.split())
+    assert [finished.out.count(f"{split}: 1 sequence\n") for split in ("train", "val", "test")] == [1, 1, 1]
+    assert "1 scene, 3 novel views" in finished.out
     files = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"scene.ply", "scene.splat", "sheet.png", "orbit.mp4", "scene.json"} < files
     assert finished.out.count("left out: no Node.js") == 1
+    assert columns[-1] == held_out
     metrics = strict_json(tmp_path / "run/metrics.json")
     assert metrics["test"]["protocol"]["fitted_to"] == fitted
     # One number for all held-out photos, the reference among them, which is no input of the model.

@@ -150,7 +150,7 @@ def test_the_page_draws_the_splats_as_our_rasterizer_does_and_has_our_title_and_
     assert tab.errors == []
 
 
-def test_a_wide_window_shows_more_than_the_photo_above_and_below(chromium, page):
+def test_a_wide_window_shows_more_than_the_photo_above_and_below_and_the_whole_title(chromium, page):
     """The balls reach the photo's upper edge."""
     camera = replace(balls_sample().reference, intrinsics=pinhole(28.0, 64))
     page.show([replace(balls_sample(), reference=camera)])
@@ -159,6 +159,9 @@ def test_a_wide_window_shows_more_than_the_photo_above_and_below(chromium, page)
     green = abs(seen - 255 * np.array(BALLS["green"][1])).max(-1) < 40
     assert green.any()
     assert not green[0].any()
+    show_status(page.server, "3 drawn in 79.7 s")
+    title = wide.get_by_text("completesplat: 3 drawn in 79.7 s")
+    assert title.evaluate("title => title.scrollWidth <= title.clientWidth"), "the title is cut"
     wide.close()
     page.show([balls_sample()])
 

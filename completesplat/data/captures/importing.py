@@ -30,7 +30,7 @@ from completesplat.data.images.files import (
 from completesplat.data.sequences import first_names
 from completesplat.data.validation import refused_to
 from completesplat.errors import DataError
-from completesplat.files import atomic_folder, folder_names
+from completesplat.files import atomic_folder, counted, folder_names
 from completesplat.settings.schema import Positive
 
 logger = logging.getLogger(__name__)
@@ -128,7 +128,7 @@ def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
     files = {path for searched in folders for path in searched.glob("[!.]*") if path.is_file()}
     if others := sorted({path.name for path in files.difference(photos)}):
         advice = "" if "HEIF" in formats else '; HEIC needs: pip install "completesplat[heic]"'
-        logger.warning("left out: %d files of other formats: %s%s", len(others), first_names(others), advice)
+        logger.warning("left out: %s of other formats: %s%s", counted(len(others), "file"), first_names(others), advice)
     return photos
 
 

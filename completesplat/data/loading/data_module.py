@@ -28,6 +28,7 @@ from completesplat.data.placement import ObjectFraming
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import TooFewFrames
 from completesplat.errors import CompleteSplatError, DataError, errors_at
+from completesplat.files import counted
 from completesplat.settings.schema import Natural, Positive, Range, Share, Side, check_value, hints_of
 
 MOST_WORKERS = 4  # if data.workers is null
@@ -183,6 +184,9 @@ class SceneDataModule(LightningDataModule):
         """
         for split in SPLITS_OF_STAGE.get(stage or "", ()):
             self.store(split)
+            source = self.source(split)
+            left_out = "".join(f"; {len(them)} left out: {reason}" for reason, them in source.left_out.items())
+            logger.info("%s: %s%s", split, counted(len(source.names), "sequence"), left_out)
         if stage == "fit":
             _ = self.trained_on  # computed now, because the files could change during the run
             self._check_training()
@@ -211,8 +215,6 @@ class SceneDataModule(LightningDataModule):
             used = self.evaluated(split, source)
             if not used.names:
                 raise DataError(f"no {split} sequences that can be used", str(self.root))
-            left_out = "".join(f"; {len(them)} left out: {reason}" for reason, them in source.left_out.items())
-            logger.info("%s: %d sequences%s", split, len(source.names), left_out)
             if source.refused:
                 logger.warning("%d annotations cannot be used; the first: %s", len(source.refused), source.refused[0])
             self._stores[split] = SceneStore(used, self.mask_threshold, self.cache, self.background)

@@ -31,7 +31,7 @@ from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource
 from completesplat.data.validation import TooFewFrames, field, parsed, read_json, refused_to
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import CompleteSplatError, DataError, errors_at
-from completesplat.files import atomic_path, write_json
+from completesplat.files import atomic_path, counted, write_json
 from completesplat.weights import sha256_of
 
 FEWEST_FRAMES = 2
@@ -264,7 +264,7 @@ def _finish(manifest: PackedManifest, out: Path, max_bad_fraction: float) -> Non
         raise DataError(f"{bad}: see the .json beside the shards, and {remedy}", str(out))
     write_json(out / MANIFEST, {**HEADER, **asdict(manifest)})
     size = decimal(sum(shard.bytes for shard in shards))
-    held = f"{frames:,} frames of {sequences:,} sequences, {size} in {len(shards):,} shards"
+    held = f"{counted(frames, 'frame')} of {counted(sequences, 'sequence')}, {size} in {counted(len(shards), 'shard')}"
     logger.info("%s: %s; refused: %s", out, held, kinds)
 
 

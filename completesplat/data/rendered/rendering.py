@@ -32,7 +32,7 @@ from completesplat.data.rendered.drawing import PAINTS, RenderSettings, check_su
 from completesplat.data.validation import MissingFile, UnreadableFile, read_points
 from completesplat.data.validation.processes import share_of
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.files import atomic_folder, folder_names, write_text
+from completesplat.files import atomic_folder, counted, folder_names, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
 from completesplat.settings.schema import Natural, Positive, Range
 
@@ -207,12 +207,12 @@ def render(
     for name, reason in broken.items():
         logger.warning("left out: %s: %s", name, reason)
     with lock:
-        _write_lists(category, objects, broken)
+        _write_lists(category, objects, broken, len(waiting) - len(broken))
     return category
 
 
-def _write_lists(category: Path, objects: Sequence[Asset], broken: dict[str, str]) -> None:
-    """Write the reasons for objects that are left out, with those of other jobs, and the annotations of all others."""
+def _write_lists(category: Path, objects: Sequence[Asset], broken: dict[str, str], new: int) -> None:
+    """Write reasons for all objects that are left out, and the others' annotations; log how many, `new` by this job."""
     path = category / BROKEN
     reasons = (json.loads(path.read_text()) if path.is_file() else {}) | broken
     missing = sorted(asset.name for asset in objects if not (category / asset.name).exists())
@@ -223,7 +223,7 @@ def _write_lists(category: Path, objects: Sequence[Asset], broken: dict[str, str
         raise DataError(f"none of {len(broken)} objects can be rendered: {next(iter(broken.values()))}", str(category))
     frames = [frame for record in records for frame in record["frames"]]
     writing.write_annotations(category, frames, [record["sequence"] for record in records])
-    logger.info("%d objects in %s/, %d left out", len(records), CATEGORY, len(broken))
+    logger.info("%s in %s/, %d of them new, %d left out", counted(len(records), "object"), CATEGORY, new, len(broken))
 
 
 def _in_threads(

@@ -25,6 +25,7 @@ echo "$name" >> "$(dirname "$0")/started"
 if [ "$name" = c_broken.obj ]; then echo '{"refused": "it has no faces"}' > "$(dirname "$job")/result.json"; exit; fi
 cp "$files"/* "$(dirname "$job")"
 """
+TOTALS = [(0, 0), (2, 2), (4, 2)]  # after each of three jobs, of which the first has the broken mesh
 
 
 @pytest.fixture
@@ -49,8 +50,9 @@ def render(command, tmp_path):
 
 
 def test_a_sweep_of_shards_leaves_the_files_of_one_job_in_whatever_order_they_end(command, render, tmp_path):
-    command.succeeds(*render("whole"))
-    command.succeeds(*render("out", "-m", "shard=2,0,1", "shards=3"))
+    assert "4 objects in rendered/, 4 of them new, 1 left out" in command.succeeds(*render("whole")).out
+    lines = command.succeeds(*render("out", "-m", "shard=2,0,1", "shards=3")).out
+    assert all(f"{count} objects in rendered/, {new} of them new, 1 left out" in lines for count, new in TOTALS)
     assert contents(tmp_path / "out/rendered") == contents(tmp_path / "whole/rendered")
     assert strict_json(tmp_path / "out/shard-2/run.json")["overrides"][-2:] == ["shard=2", "shards=3"]
     assert {path.name for path in (tmp_path / "out").glob("*/")} == {"rendered", "shard-0", "shard-1", "shard-2"}
