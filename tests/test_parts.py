@@ -188,7 +188,8 @@ def test_any_value_in_any_place_is_refused_as_weights_are_or_is_of_the_settings_
             assert len(str(error)) < 1000  # noqa: PT017
     assert not any("_target_" in place for place in accepted)
     if odd not in (None, True, 0, []) or odd is math.nan:
-        meant = {"autoreconstructor.encoder.first_log_variance"} if odd == -1 else {"training"} if odd == {} else set()
+        signed = {"autoreconstructor.encoder.first_log_variance", "training.log_odds"}
+        meant = signed if odd == -1 else {"training"} if odd == {} else set()
         meant |= {"training.content"} if isinstance(odd, str) else set()  # any text, which is only printed
         assert set(accepted) <= meant
 

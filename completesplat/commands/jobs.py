@@ -26,7 +26,7 @@ from completesplat.commands.protocol import git_commit
 from completesplat.errors import CompleteSplatError
 from completesplat.files import UNFINISHED, atomic_path, write_bytes, write_json, writing
 from completesplat.imports import importing, postponing
-from completesplat.settings.checks import check_verb
+from completesplat.settings.checks import check_values, check_verb
 from completesplat.settings.composition import resolved_settings, shard_folder, use_working_folder
 from completesplat.settings.options import did_you_mean
 from completesplat.signals import Interrupted, ended_by_signals
@@ -183,6 +183,7 @@ def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) 
 def start(verb: str, config: DictConfig, out: Path) -> object:
     """Check the settings and call the config's task or else the verb's `run`; return its result (a text is printed)."""
     with importing(), postponing() if verb == "predict" else nullcontext():
+        check_values(verb, config)
         check_inputs(verb, config)
         check_verb(verb, config)
         if config.get("task") is None:

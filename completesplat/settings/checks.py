@@ -146,10 +146,15 @@ VERBS: dict[str, type] = {
 """Settings of verbs; the settings of a task are the arguments of its function."""
 
 
-def check_verb(verb: str, config: DictConfig) -> None:
-    """Raise CompleteSplatError for the first unfit setting of a verb or, except for `view`, of its parts."""
+def check_values(verb: str, config: DictConfig) -> None:
+    """Raise CompleteSplatError for the first unfit setting of a verb itself, without importing torch."""
     if verb in VERBS:
         check_settings(VERBS[verb], config)
+
+
+def check_verb(verb: str, config: DictConfig) -> None:
+    """Raise CompleteSplatError for the first unfit setting of a verb or, except for `view`, of its parts."""
+    check_values(verb, config)
     if "task" in config:
         complete_task(config)
     if verb != "view":  # `view` shows its page before it imports torch, so it checks its parts later

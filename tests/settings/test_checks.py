@@ -82,7 +82,7 @@ ODD = [
 
 @pytest.mark.parametrize(("verb", "setting", "message"), ODD, ids=lambda text: text[:40])
 def test_a_wrong_value_is_refused_with_the_allowed_values(verb, setting, message):
-    given = {"predict": "image=a.png weights=nowhere", "data": "data_task=toy", "test": "ckpt=nowhere"}
+    given = {"predict": f"image={__file__} weights=nowhere", "data": "data_task=toy", "test": f"ckpt={__file__}"}
     given |= {"fit": "trainer.max_steps=1", "report": "report_task=controls ckpt=nowhere", "view": ""}
     given |= {"plan": "experiment=toy_var data.image_size=32"}
     assert message in refused(verb, *given[verb].split(), *setting.split())
