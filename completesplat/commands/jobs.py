@@ -223,7 +223,8 @@ def _refuse_another_run(out: Path, config: Mapping[str, object], earlier: object
         return
     other_model = "model._target_" in others
     # `model` repeats settings from outside it.
-    named = ["model"] if other_model else sorted(others, key=lambda key: (key.count("."), key))
+    own = [key for key in others if not key.startswith("model.") or key.removeprefix("model.") not in others]
+    named = ["model"] if other_model else sorted(own, key=lambda key: (key.count("."), key))
     shown = ", ".join(named[:3]) + (f" and {len(named) - 3} more" if len(named) > 3 else "")
     advice = "choose another out=DIR"
     if (out / LAST).is_file() and not other_model:

@@ -120,7 +120,7 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     (tmp_path / jobs.LAST).touch()
 
     def config(rate=1, test=False, **end):
-        trainer, model = {"max_steps": 20, "max_time": None} | end, {"_target_": "a.A"}
+        trainer, model = {"max_steps": 20, "max_time": None} | end, {"_target_": "a.A", "optimizer": {"lr": rate}}
         return {"ckpt_path": "last", "test": test, "optimizer": {"lr": rate}, "trainer": trainer, "model": model}
 
     OmegaConf.save(config(), tmp_path / "config.yaml")
