@@ -14,7 +14,7 @@ from support import SMALL, call, compose_config
 
 from completesplat.cli import VERBS
 from completesplat.rasterizers import RenderingConstants
-from completesplat.settings.checks import check_image_size, check_verb
+from completesplat.settings.checks import check_image_size, check_parts_of_verb, check_values
 from completesplat.settings.options import conf_folder, options
 
 CONF = conf_folder()
@@ -57,7 +57,8 @@ def complete(chosen: dict[str, str], *more: str):
     given = [f"{group}={option}" for group, option in chosen.items()]
     config = compose_config("fit", *given, *settings, *more, "out=/nowhere")
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    check_verb("fit", config)
+    check_values("fit", config)
+    check_parts_of_verb("fit", config)
     check_image_size(config)
     return config
 

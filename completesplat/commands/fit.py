@@ -25,7 +25,14 @@ from completesplat.files import counted, write_json
 from completesplat.results.measured import evaluation_table
 from completesplat.results.runs import PLAN, read_record
 from completesplat.results.tables import show
-from completesplat.settings.checks import check_image_size, check_optimizer, check_verb, each_part, remove_start_weights
+from completesplat.settings.checks import (
+    check_image_size,
+    check_optimizer,
+    check_parts,
+    check_values,
+    each_part,
+    remove_start_weights,
+)
 from completesplat.settings.schema import start_weights
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs
@@ -49,7 +56,8 @@ def instantiate(config: DictConfig) -> tuple[SceneDataModule, Scorer]:
         WeightsError: weights to start from cannot be used.
     """
     refuse_missing(config)
-    check_verb("fit", config)
+    check_values("fit", config)
+    check_parts(config)
     check_image_size(config)
     check_optimizer(config.optimizer)
     data, module = build(config.data, _convert_="all"), build(config.model, _convert_="all")

@@ -26,7 +26,7 @@ from completesplat.commands.protocol import git_commit
 from completesplat.errors import CompleteSplatError
 from completesplat.files import UNFINISHED, atomic_path, write_bytes, write_json, writing
 from completesplat.imports import importing, postponing
-from completesplat.settings.checks import check_values, check_verb
+from completesplat.settings.checks import check_parts_of_verb, check_values
 from completesplat.settings.composition import resolved_settings, shard_folder, use_working_folder
 from completesplat.settings.options import did_you_mean
 from completesplat.signals import Interrupted, ended_by_signals
@@ -185,7 +185,7 @@ def start(verb: str, config: DictConfig, out: Path) -> object:
     with importing(), postponing() if verb == "predict" else nullcontext():
         check_values(verb, config)
         check_inputs(verb, config)
-        check_verb(verb, config)
+        check_parts_of_verb(verb, config)
         if config.get("task") is None:
             run = partial(import_module(f"completesplat.commands.{verb}").run, config, out)
         else:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Literal
 
 from completesplat.files import atomic_path, write_text
 from completesplat.metrics import PSNR_LIMIT, STYLES, Style
@@ -34,6 +34,7 @@ ESCAPES = str.maketrans(
     | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
     | {"±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "†": r"$\dagger$", "★": r"$\star$"}
 )
+LINE = re.compile(r".+")
 WORD = re.compile(r"\S+(?: [↑↓])?")  # a column is at least as wide, so that none breaks
 ABSENT, BLANK = "-", "(blank)"
 LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK}: left blank in the paper."
@@ -154,27 +155,37 @@ class Table:
         from rich.table import Table as PrintedTable
         from rich.text import Text
 
-        texts = [[x.joined("\n"), *(row.cells[i].text for row in self.rows)] for i, x in enumerate(self.headings)]
-        lines = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
+        columns = [[x.joined("\n"), *(row.cells[i].text for row in self.rows)] for i, x in enumerate(self.headings)]
         room, most = options.max_width - 1, options.max_width // 2 - 4  # without borders; two columns always fit
-        words = [min(most, max(len(word) for text in column for word in WORD.findall(text))) for column in texts]
-        parts: list[list[int]] = [[0]]
-        for index in range(1, len(texts)):
-            if len(parts[-1]) > 1 and sum(words[i] + 3 for i in (*parts[-1], index)) > room:
-                parts.append([0])
-            parts[-1].append(index)
+        lines = [_longest(LINE, column) for column in columns]
+        words = [min(most, _longest(WORD, column)) for column in columns]
+        parts = _side_by_side(words, room)
         for part in parts:
             spare = room - sum(words[i] + 3 for i in part)
             printed = PrintedTable(title=self.title if part is parts[0] else None, title_justify="left")
             for i in part:
                 width = min(lines[i], words[i] + spare)
                 spare -= width - words[i]
-                justify: Any = "right" if self.headings[i].figures else "left"
-                printed.add_column(texts[i][0], justify=justify, overflow="fold", width=width)
+                side: Literal["left", "right"] = "right" if self.headings[i].figures else "left"
+                printed.add_column(columns[i][0], justify=side, overflow="fold", width=width)
             for row, ruled in self.ruled_rows():
                 cells = [row.cells[i] for i in part]
                 printed.add_row(*(Text(x.text, MARKED_TERMINAL[x.mark]) for x in cells), end_section=ruled)
             yield printed
+
+
+def _longest(pattern: re.Pattern[str], texts: Sequence[str]) -> int:
+    return max((len(found) for text in texts for found in pattern.findall(text)), default=0)
+
+
+def _side_by_side(widths: Sequence[int], room: int) -> list[list[int]]:
+    """Return the columns of each part of a table; all parts begin with column 0 and fit into the room if two do."""
+    parts = [[0]]
+    for index in range(1, len(widths)):
+        if len(parts[-1]) > 1 and sum(widths[i] + 3 for i in (*parts[-1], index)) > room:
+            parts.append([0])
+        parts[-1].append(index)
+    return parts
 
 
 def records_table(

@@ -152,9 +152,8 @@ def check_values(verb: str, config: DictConfig) -> None:
         check_settings(VERBS[verb], config)
 
 
-def check_verb(verb: str, config: DictConfig) -> None:
-    """Raise CompleteSplatError for the first unfit setting of a verb or, except for `view`, of its parts."""
-    check_values(verb, config)
+def check_parts_of_verb(verb: str, config: DictConfig) -> None:
+    """Complete a verb's task; raise CompleteSplatError for the first unfit setting of its parts, except for `view`."""
     if "task" in config:
         complete_task(config)
     if verb != "view":  # `view` shows its page before it imports torch, so it checks its parts later

@@ -7,7 +7,13 @@ from support import compose_config, refused
 
 from completesplat.cli import VERBS
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.checks import check_image_size, check_parts, check_verb, complete_task
+from completesplat.settings.checks import (
+    check_image_size,
+    check_parts,
+    check_parts_of_verb,
+    check_values,
+    complete_task,
+)
 
 ONE = "give one of ckpt=FILE, weights=DIR and scenes=DIR; all but ckpt need data=NAME"
 NO_DATA = "weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR"
@@ -91,7 +97,9 @@ def test_a_wrong_value_is_refused_with_the_allowed_values(verb, setting, message
 @pytest.mark.parametrize("chosen", [*VERBS, "data_task=check", "bench_task=paper", "report_task=summary"])
 def test_the_defaults_of_each_verb_pass_the_checks(chosen):
     verb = chosen.partition("_")[0]
-    check_verb(verb, compose_config(verb, *([chosen] if "=" in chosen else [])))
+    config = compose_config(verb, *([chosen] if "=" in chosen else []))
+    check_values(verb, config)
+    check_parts_of_verb(verb, config)
 
 
 def test_a_task_takes_the_settings_that_its_function_names_unless_it_states_another_value():
