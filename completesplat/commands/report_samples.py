@@ -113,5 +113,7 @@ def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], OnProg
     stage = stage.to("cuda" if torch.cuda.is_available() else "cpu").eval()
     scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
     renderer = SampleRenderer(diffusion_of(stage), stage.rasterizer, stage.background, run["samples"], run["seed"])
-    with Console(stderr=True).status("drawing") as status:
-        yield renderer, scenes, lambda text: status.update(f"drawing: {text}")
+    console = Console(stderr=True)
+    with console.status("drawing") as status:  # a log file has a line for each part in its place
+        say = status.update if console.is_terminal else console.print
+        yield renderer, scenes, lambda text: say(f"drawing: {text}")

@@ -151,7 +151,8 @@ def likeliest_weights(images: Sequence[Path], remove_background: bool) -> tuple[
             read.append(printable(image.name))
     if not read:
         name, *names = shipped_configs()
-        return name, f"; there is no image to choose by (weights=NAME takes others: {', '.join(names)})"
+        why = "no image can be read" if images else "there is no image to choose by"
+        return name, f"; {why} (weights=NAME takes others: {', '.join(names)})"
     shares = [f"{name} {total / len(read):.0%}" for name, total in sums.most_common()]
     shares += [f"{name} needs a plain background" for name in shipped() if name not in sums]
     whose = read[0] if len(images) == 1 else f"{len(read)} of {len(images)} images"

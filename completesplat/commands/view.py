@@ -28,7 +28,7 @@ def run(config: DictConfig, out: Path) -> None:
     """Open the page, fill it and stay until Ctrl-C; with `export`, write it to a file instead.
 
     The page first says that it is loading, because importing torch takes a second and loading the model longer. The
-    address of a page with the user's own weights is printed when they are open, because they may be refused.
+    address of a page with the user's own files is printed when they are read, because they may be refused.
     """
     try:
         import viser  # noqa: F401
@@ -38,17 +38,16 @@ def run(config: DictConfig, out: Path) -> None:
     from completesplat.viewer.access import start_server, stop_server
 
     config.update(setting_of_path(Path(config.path)) if config.path is not None else {})
-    drawn = config.scene is None and config.watch is None
-    checked_first = drawn and config.weights not in (AUTO, *shipped())
+    own = (config.image, config.scene) != (None, None) or config.weights not in (AUTO, *shipped())
     server = start_server(0 if config.export is not None else config.port)
     address, page, step = f"{server.address} (Ctrl-C ends it)", None, None
     try:
-        if config.export is None and not checked_first:
+        if config.export is None and not own:
             print(address, flush=True)
         page = make_page(server, config, out)
         if config.export is not None:
             return export(page, Path(config.export))
-        if checked_first:
+        if own:
             print(address, flush=True)
         while True:
             time.sleep(PAUSE)

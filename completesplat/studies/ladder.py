@@ -34,7 +34,7 @@ def ladder_rows(renderer: SampleRenderer, scenes: Scenes, fits: int, tick: OnPro
     measured = defaultdict[str, list[dict[str, float | None]]](list)
     for scene in scenes:
         for rung, gaussians in _rungs(renderer, scene, fits):
-            tick(f"{scene.names[0]}: {rung}")
+            tick(f"{scene.names[0]}: {rung}, done")
             measured[rung].append(_scores(renderer, scene, gaussians))
     return [{"rung": rung, **mean_over_scenes(values)} for rung, values in measured.items()]
 
@@ -55,8 +55,7 @@ def _rungs(renderer: SampleRenderer, scene: SceneBatch, fits: int) -> Iterator[t
 
     yield "raw values fitted", fitted([free_raw], RAW_RATE, lambda: replace(start, raw=free_raw))
     yield "decoder fitted", fitted(decoder.parameters(), DECODER_RATE, lambda: decoder(latent, features))
-    make_latent = lambda: stage1.reconstructor(free_latent, features)  # noqa: E731
-    yield "latent fitted", fitted([free_latent], LATENT_RATE, make_latent)
+    yield "latent fitted", fitted([free_latent], LATENT_RATE, lambda: stage1.reconstructor(free_latent, features))
     if stage1.sees_views:
         yield "posterior, all views", start.gaussians(*inputs)
     yield "samples", renderer.model.generate(images, *inputs, samples=renderer.samples, seed=renderer.seed)

@@ -63,6 +63,7 @@ def test_the_ladder_of_reconstructions_has_every_rung_and_fitting_helps(runs, co
     assert rows[posterior]["psnr"] != rows[alone]["psnr"]
     assert all(row["sharpness_behind"] > 0 and 0 < row["behind"] < 60 for row in rows.values())
     assert "Where quality is lost" in finished.out
+    assert finished.err.count(", done") == len(rows)  # a line each where there is no terminal
 
 
 def test_several_samples_have_proper_scores_of_the_hidden_part(runs, command, tmp_path):

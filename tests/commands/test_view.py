@@ -123,6 +123,16 @@ def test_a_run_without_scenes_is_waited_for(tmp_path, capsys, monkeypatch):
     assert "no scenes yet; waiting" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", ["photo.jpg", "scene.ply"])
+def test_a_file_that_cannot_be_read_is_refused_before_the_address_is_printed(name, command, monkeypatch, tmp_path):
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    monkeypatch.setattr("completesplat.commands.view.time", None)  # a page that opens would stay until it is ended
+    (tmp_path / name).write_text("neither")
+    finished = command("view", tmp_path / name, f"out={tmp_path / 'out'}")
+    assert (finished.status, name in finished.err) == (2, True)
+    assert "http" not in finished.out
+
+
 def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "viser", None)
     refused = command.refuses("view", f"out={tmp_path}")
