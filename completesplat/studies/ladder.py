@@ -1,6 +1,5 @@
 """Ladder of reconstructions, from the representation's best to one sample: where quality is lost."""
 
-import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from copy import deepcopy
@@ -94,9 +93,8 @@ def _scores(renderer: SampleRenderer, scene: SceneBatch, gaussians: Gaussians) -
     counted = torch.ones_like(views.images[behind][:, :1], dtype=torch.bool)
     sharp = [sharpness(sample[behind], views.images[behind], counted) for sample in images] if behind.any() else [None]
     quality = torch.stack([psnr(sample, views.images) for sample in images])
-    from_behind = quality[:, behind].mean().item()
     return {
         "psnr": quality.mean().item(),
-        "behind": None if math.isnan(from_behind) else from_behind,
+        "behind": quality[:, behind].mean().item() if behind.any() else None,
         "sharpness_behind": None if None in sharp else sum(sharp) / len(sharp),  # type: ignore[arg-type]
     }
