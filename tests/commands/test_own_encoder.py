@@ -29,6 +29,7 @@ class Enc(Encoder):
 """
 OWN = ["autoreconstructor.encoder._target_=myenc.Enc", "+autoreconstructor.encoder.gain=0.5"]
 QUICK = [*SMALL, "callbacks.images=null", "test=false"]
+DRAW = ["video=[]", "samples=1", "color_fits=1"]
 REFUSAL = r"names myenc\.Enc, which is no part .* trust=true$"
 
 
@@ -79,14 +80,14 @@ def test_weights_with_a_part_of_the_users_own_draw_scenes_in_the_working_folder(
     assert (encoder["_target_"], encoder["gain"]) == ("myenc.Enc", 0.5)
     for weights in (run, f"{run}/weights", f"{run}/checkpoints/last.ckpt"):
         out = f"OUT/{weights.replace('/', '-')}"
-        command.succeeds("predict", pipeline.photograph(), f"weights={weights}", "video=[]", "samples=1", f"out={out}")
+        command.succeeds("predict", pipeline.photograph(), f"weights={weights}", *DRAW, f"out={out}")
         assert list((runs / out).glob("*/sample_00.ply"))
 
 
 def test_from_elsewhere_a_part_of_the_users_own_needs_trust(command, runs, imported, pipeline, tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    predict = ["predict", pipeline.photograph(), "video=[]", "samples=1", "out=OUT"]
+    predict = ["predict", pipeline.photograph(), *DRAW, "out=OUT"]
     for weights in (runs / "STAGE2", runs / "STAGE2/weights", runs / "STAGE1/checkpoints/last.ckpt"):
         refused = command.refuses(*predict, f"weights={weights}")
         assert "names myenc.Enc, which is no part" in refused

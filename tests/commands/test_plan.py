@@ -78,8 +78,11 @@ def test_a_batch_that_does_not_fit_is_told_what_makes_it_fit():
     assert any("No setting here makes it fit" in line for line in none["remarks"])
 
 
-def test_this_machine_is_timed():
-    plan = plan_of(compose_config("plan", *SMALL, "gpu=this", "data.batch_size=2"))
+def test_this_machine_is_timed_and_what_an_unfinished_folder_lacks_is_assumed(tmp_path):
+    (tmp_path / "unfinished").mkdir()
+    unfinished = f"data.root={tmp_path / 'unfinished'}"
+    plan = plan_of(compose_config("plan", *SMALL, "gpu=this", "data.batch_size=2", unfinished))
+    assert (plan["assumptions"]["sequences"], plan["parts"]["waiting for data"]) == (400, None)
     assert plan["seconds_a_step"] > 0
     assert plan["memory_measured_GB"] is None or 0.3 < plan["memory_GB"] / plan["memory_measured_GB"] < 3
 
@@ -124,15 +127,13 @@ def test_data_that_are_here_are_loaded_and_waited_for_if_that_takes_longer(toy_r
     assert parts_beside_steps(config, counts, 2, seconds, seconds)["checkpoints"] == 0
 
 
-def test_an_absent_or_unfinished_folder_of_data_is_planned_with_assumptions(toy_root, tmp_path, caplog):
+def test_an_absent_or_unfinished_folder_of_data_has_no_sequences(toy_root, tmp_path, caplog):
     (tmp_path / "unfinished").mkdir()
     for name in ("absent", "unfinished"):
         config = compose_config("plan", "experiment=toy_var", f"data.root={tmp_path / name}")
         assert sequences_there(config.data) is None
     assert len(caplog.messages) == 1
     assert "unfinished/toy_objects: no such CO3D category; the plan is made as if" in caplog.text
-    plan = plan_of(compose_config("plan", *SMALL, f"data.root={tmp_path / 'unfinished'}"))
-    assert (plan["assumptions"]["sequences"], plan["parts"]["waiting for data"]) == (400, None)
     assert sequences_there(compose_config("plan", "experiment=toy_var", f"data.root={toy_root}").data) > 0
 
 

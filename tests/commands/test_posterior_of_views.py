@@ -91,7 +91,8 @@ def test_the_cache_holds_latents_of_views_and_trains(runs, command, tmp_path):
 
 def test_several_images_with_their_cameras_give_one_scene(runs, command, tmp_path):
     write_capture(tmp_path, 6)
-    weights = [f"weights={runs / 'diffusion/weights'}", f"cameras={tmp_path / 'transforms.json'}", "video=false"]
+    weights = [f"weights={runs / 'diffusion/weights'}", f"cameras={tmp_path / 'transforms.json'}"]
+    weights += ["video=false", "color_fits=1"]
 
     def predict(*numbers: int) -> np.ndarray:
         images = ",".join(str(tmp_path / f"frame{number}.png") for number in numbers)

@@ -88,7 +88,9 @@ def test_a_photograph_of_an_object_becomes_a_scene_without_its_background(rembg,
     photo = Image.new("RGB", (120, 80), "red")
     photo.paste((0, 128, 255), (5, 8, 25, 18))
     photo.save(tmp_path / "a.png")
-    command.succeeds("predict", "a.png", f"weights={weights}", "out=out", "video=[]", "background=remove")
+    command.succeeds(
+        "predict", "a.png", f"weights={weights}", "out=out", "video=[]", "color_fits=1", "background=remove"
+    )
     model = CompleteSplat.from_pretrained(weights)
     seen = model.read(tmp_path / "a.png", remove_background=True)
     blue = seen.image[0] < 0.5
@@ -145,6 +147,6 @@ def test_what_is_trained_on_is_predicted_with_from_its_run(command, toy_root, tm
     before, after = (CompleteSplat.from_pretrained(path).network.state_dict() for path in (weights, tmp_path / "RUN"))
     same = {name for name, value in before.items() if torch.equal(value, after[name])}
     assert same < set(before)
-    quick = ["samples=1", "video=[]", "rasterizer=reference", "out=OUT"]
+    quick = ["samples=1", "video=[]", "color_fits=1", "rasterizer=reference", "out=OUT"]
     command.succeeds("predict", str(cut_out(tmp_path / "a.png")), "weights=RUN", *quick)
     assert (tmp_path / "OUT/a/sample_00.ply").is_file()
