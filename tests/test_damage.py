@@ -329,7 +329,7 @@ CHUNKS += [
     (chunk(lambda whole: [whole | {"key": "other"}]), BadAnnotation, f"{C}, bad", ""),
     (put(INDEX, "b", "../0.torch"), OutsidePath, f"{INDEX}, b", "leads outside"),
     (put(INDEX, "c", "/0.torch"), OutsidePath, f"{INDEX}, c", "another machine"),
-    (linked_chunk, OutsidePath, f"{INDEX}, d", "links must stay below"),
+    (linked_chunk, OutsidePath, f"{INDEX}, d", "links may not leave it"),
     (put(INDEX, "e", ""), OutsidePath, f"{INDEX}, e", "leads outside of train, or nowhere"),
 ]  # fmt: skip
 J = "transforms.json"

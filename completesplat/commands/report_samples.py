@@ -115,5 +115,5 @@ def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], OnProg
     renderer = SampleRenderer(diffusion_of(stage), stage.rasterizer, stage.background, run["samples"], run["seed"])
     console = Console(stderr=True)
     with console.status("drawing") as status:  # a log file has a line for each part in its place
-        say = status.update if console.is_terminal else console.print
+        say = status.update if console.is_terminal else console.out
         yield renderer, scenes, lambda text: say(f"drawing: {text}")

@@ -38,16 +38,16 @@ def run(config: DictConfig, out: Path) -> None:
     from completesplat.viewer.access import start_server, stop_server
 
     config.update(setting_of_path(Path(config.path)) if config.path is not None else {})
-    own = (config.image, config.scene) != (None, None) or config.weights not in (AUTO, *shipped())
+    own_files = (config.image, config.scene) != (None, None) or config.weights not in (AUTO, *shipped())
     server = start_server(0 if config.export is not None else config.port)
     address, page, step = f"{server.address} (Ctrl-C ends it)", None, None
     try:
-        if config.export is None and not own:
+        if config.export is None and not own_files:
             print(address, flush=True)
         page = make_page(server, config, out)
         if config.export is not None:
             return export(page, Path(config.export))
-        if own:
+        if own_files:
             print(address, flush=True)
         while True:
             time.sleep(PAUSE)

@@ -107,7 +107,7 @@ def path_below(root: Path, relative: str) -> Path:
     if windows.drive or os.path.commonpath([real_root, real_path]) != real_root:
         if absolute and not os.path.lexists(path):
             raise OutsidePath(f"a path of another machine; make it relative to {root}: {shown}")
-        advice = "" if absolute else "; links must stay below the data's folder: name the one where they lie"
+        advice = "" if absolute else "; links may not leave it, so name the real folder"
         raise OutsidePath(f"leads outside of {root}: {shown} is {real_path}{advice}")
     return root / (os.path.relpath(real_path, real_root) if absolute else path)
 
