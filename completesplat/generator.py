@@ -16,8 +16,8 @@ from torch import Tensor
 from completesplat.autoreconstructor.encoder import Images
 from completesplat.autoreconstructor.model import DepthRange, VariationalAutoReconstructor
 from completesplat.baselines.splatter_image.model import PublishedModel, is_published
+from completesplat.diffusion import sampling
 from completesplat.diffusion.guidance import Latents, allowed_skip_weight
-from completesplat.diffusion.sampling import PART, Sampler, draw_noise, in_parts, one_thread_each, with_forward_process
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -68,7 +68,7 @@ class CompleteSplat(SceneModel):
         self.autoreconstructor = frozen.requires_grad_(False)
         self.conditioning = build(conditioning)
         self.denoiser = build(denoiser)
-        self.sampler: Sampler = build(sampler)
+        self.sampler: sampling.Sampler = build(sampler)
         # The training stage measures these on the training set.
         channels = self.denoiser.latent_channels
         self.register_buffer("latent_mean", torch.zeros(channels, 1, 1))
@@ -116,6 +116,7 @@ class CompleteSplat(SceneModel):
         visible: Visible | None = None,
         color_fits: Natural = 0,
         batch: Positive | None = None,
+        bfloat16: bool = False,
         on_step: Callable[[int, int, Gaussians], None] | None = None,
     ) -> Gaussians:
         """Draw Gaussians [batch * samples]: the scenes of one image next to each other, in the frame of its camera.
@@ -129,6 +130,8 @@ class CompleteSplat(SceneModel):
             color_fits: rounds of fitting to the image (`fit_front`); 0 in the paper.
             batch: the largest number of latents at a time, which changes only the rounding of float32; all by default,
                 or fewer if a GPU's memory does not suffice.
+            bfloat16: compute the denoiser in bfloat16; a call with a photo does, where the processor has it. Renders
+                then change about as little as by rounding to 8 bits.
             on_step: called after each denoiser call of each batch with its number, the timestep, the estimated scenes.
 
         Raises:
@@ -136,26 +139,32 @@ class CompleteSplat(SceneModel):
         """
         weight = allowed_skip_weight(skip_weight, visible)
         images = images if visible is None else images * visible
-        with one_thread_each(self.denoiser, images.device) as threads:
+        with sampling.one_thread_each(self.denoiser, images.device) as threads:
             conditioning = self.conditioning(images)
             stage1 = self.autoreconstructor
             features = stage1.encoder.features(images * 2 - 1, stage1.reconstructor.feature_levels) if weight else []
             shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
-            noise = draw_noise(len(images), samples, shape, seed).to(images.device)
+            noise = sampling.draw_noise(len(images), samples, shape, seed).to(images.device)
             image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
+            denoise = partial(self._denoise_in_bfloat16, images.device.type) if bfloat16 else self.denoiser
             decode = partial(self._decode, image_of, features, weight, cameras, depth_range)
 
             def draw(part: slice) -> Tensor:
                 watch = None if on_step is None else lambda step, t, latent: on_step(step, t, decode(latent, part))
                 inputs = noise[part], conditioning[image_of[part]]
-                return self.sampler(self.denoiser, *inputs, guidance_weight, steps, watch)
+                return self.sampler(denoise, *inputs, guidance_weight, steps, watch)
 
             # Sample first, then decode: if a GPU's memory does not suffice to decode a part, its latents are not lost.
-            most = batch or (PART if threads else None)
-            parts = partial(in_parts, count=len(noise), most=most, threads=1 if on_step else threads)
-            latents = torch.cat(parts(draw))
-            scenes = concatenate(parts(lambda part: decode(latents[part], part)))
+            drawn, decoded = (sampling.part_of(len(noise)), sampling.PART) if threads else (None, None)
+            parts = partial(sampling.in_parts, count=len(noise), threads=1 if on_step else threads)
+            latents = torch.cat(parts(draw, most=batch or drawn))
+            scenes = concatenate(parts(lambda part: decode(latents[part], part), most=batch or decoded))
         return self.fitted(scenes, images, cameras, visible, color_fits)
+
+    def _denoise_in_bfloat16(self, device: str, *inputs: Tensor) -> Latents:
+        with torch.autocast(device, torch.bfloat16):
+            result: Tensor = self.denoiser(*inputs)
+        return result
 
     def _decode(
         self,
@@ -176,7 +185,7 @@ class CompleteSplat(SceneModel):
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Use another sampler from now on, with the noise schedule and prediction type of training."""
-        config = stored_config(with_forward_process(sampler, self.architecture["sampler"]))
+        config = stored_config(sampling.with_forward_process(sampler, self.architecture["sampler"]))
         check_architecture({**self.architecture, "sampler": config})
         self.sampler = build(config)
         self.architecture["sampler"] = config

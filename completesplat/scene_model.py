@@ -23,6 +23,7 @@ from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, tr
 from completesplat.rasterizers.front_fitting import fit_front
 from completesplat.rasterizers.selection import auto
 from completesplat.scene import Views
+from completesplat.settings.composition import has_bfloat16
 from completesplat.settings.schema import Natural, check_settings
 from completesplat.splatter_image import Parameterization
 from completesplat.tensors import concatenate, in_float32
@@ -155,7 +156,7 @@ class SceneModel(nn.Module):
             self.camera(photograph)[None],
             self.depth_range_of(photograph)[None],
             visible=None if visible is None else visible[None].to(device),
-            **settings,
+            **{"bfloat16": has_bfloat16(device.type), **settings},
         )
         return [scenes[i] for i in range(len(scenes.means))]
 

@@ -16,6 +16,7 @@ from published_weights import write_published
 from safetensors.torch import load_file, save
 from support import compose_config, tiny_generator
 
+from completesplat import scene_model
 from completesplat.commands.predict import photo_warnings
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.generator import CompleteSplat
@@ -66,6 +67,20 @@ def test_samples_are_fitted_to_the_visible_part_of_the_image_one_by_one(model, p
         assert (one.colors - other.colors).abs().max() > 0.01
         torch.testing.assert_close(other.colors, part.colors, atol=1e-3, rtol=1e-3)
     assert not same(fitted[0], draw(visible=visible, color_fits=2)[0])
+
+
+def test_a_photo_is_denoised_in_bfloat16_where_the_processor_has_it_and_decoded_in_float32(model, photo, monkeypatch):
+    networks, seen = (model.denoiser.network, model.autoreconstructor.reconstructor.network), []
+    hooks = [part.conv_in.register_forward_hook(lambda *_: seen.append(_[-1].dtype)) for part in networks]
+    exact, half = model(photo, samples=1, bfloat16=False)[0], model(photo, samples=1, bfloat16=True)[0]
+    steps = model.sampler.steps
+    assert seen == [torch.float32] * (steps + 1) + [torch.bfloat16] * steps + [torch.float32]
+    assert 0 < (half.colors - exact.colors).square().mean().sqrt() < 0.02
+    for has in (True, False):
+        monkeypatch.setattr(scene_model, "has_bfloat16", {"cpu": has}.get)
+        assert same(model(photo, samples=1)[0], half if has else exact)
+    for hook in hooks:
+        hook.remove()
 
 
 @pytest.mark.processes

@@ -9,14 +9,17 @@ from omegaconf import DictConfig
 
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import printable
+from completesplat.weights import AUTO, check_name
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 
 
 def check_inputs(verb: str, config: DictConfig) -> None:
-    """Raise CompleteSplatError if `predict` has no image, or `test` no model or a checkpoint that is not there."""
+    """Raise CompleteSplatError if an image, weights or a checkpoint are not there, or `test` is given no model."""
     if verb == "predict":
         find_images(config.image)
+    if verb in ("predict", "view") and config.weights != AUTO and ":" not in config.weights:  # published weights' names
+        check_name(config.weights)
     if verb == "test":
         check_one_model(config.ckpt, config.weights, config.scenes)
         if config.ckpt is not None and not os.path.exists(config.ckpt):

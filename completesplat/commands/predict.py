@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numba.np.arraymath  # else the first kernel imports it, and scipy with it  # noqa: F401
 import torch
@@ -35,6 +36,7 @@ from completesplat.generator import CompleteSplat
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene_model import SceneModel, distance_to_training, match_shipped
 from completesplat.settings.checks import REMOVE
+from completesplat.settings.composition import has_bfloat16
 from completesplat.version import __version__
 from completesplat.weights import sha256_of
 
@@ -118,7 +120,7 @@ def made_from(config: DictConfig, model: SceneModel, image: Path) -> str:
 
 
 def output_files(config: DictConfig) -> OutputFiles:
-    """Return the outputs for each image; raise CompleteSplatError for none, an unknown one, or a missing program."""
+    """Return the outputs for each image; raise CompleteSplatError for none, or a missing program."""
     formats, videos = _names(config.formats), _names(config.video)
     if not formats and not videos:
         raise CompleteSplatError(f"formats=[] video=[]: choose a format ({', '.join(FORMATS)}) or a video")
@@ -134,9 +136,9 @@ def output_files(config: DictConfig) -> OutputFiles:
     return wanted
 
 
-def _names(value: object) -> tuple[str, ...]:
+def _names(value: object) -> tuple[Any, ...]:
     names = value if isinstance(value, Sequence) and not isinstance(value, str) else [value] if value else []
-    return tuple(dict.fromkeys(map(str, names)))
+    return tuple(dict.fromkeys(names))
 
 
 def predict_images(
@@ -262,6 +264,7 @@ def _predict(
         settings["guidance_weight"] = config.guidance_weight
         settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
         settings["steps"] = model.sampler.steps if config.steps is None else config.steps
+        settings["bfloat16"] = has_bfloat16(model.up.device.type)
         sampler = {"sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2]}
     begin(f"drawing {config.samples} sample{'s' if config.samples > 1 else ''}", advance=0)
     scenes = model(photograph, visible, batch=config.batch, **settings)

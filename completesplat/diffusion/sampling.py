@@ -23,8 +23,8 @@ logger = logging.getLogger(__name__)
 
 SMALL = 20_000_000
 """Parameters of a denoiser below which samples are drawn side by side (notebooks/experiments.md)."""
-PART = 4
-"""Samples that one thread draws at a time with a small denoiser."""
+PART, LARGEST_PART = 4, 10
+"""Samples of a small denoiser that one thread decodes at a time, and the most that it draws at a time."""
 
 OnStep = Callable[[int, int, Tensor], None]
 """Callback: (number of the denoiser call, timestep, estimate of the clean latent) -> None."""
@@ -150,7 +150,7 @@ def one_thread_each(denoiser: nn.Module, device: torch.device) -> Iterator[int]:
 
     A sample has hundreds of operations of a tenth of a millisecond. Threads that share each of them wait for each other
     as often, and beside another busy process they wait for a core, too. Threads that draw parts of all samples do not,
-    and parts of `PART` samples are the same however many threads draw them.
+    and the parts (`part_of`) are the same however many threads draw them.
     """
     before = torch.get_num_threads()
     if device.type != "cpu" or sum(parameter.numel() for parameter in denoiser.parameters()) > SMALL:
@@ -161,6 +161,11 @@ def one_thread_each(denoiser: nn.Module, device: torch.device) -> Iterator[int]:
         yield before
     finally:
         torch.set_num_threads(before)
+
+
+def part_of(count: int) -> int:
+    """Return how many of `count` samples a thread draws at a time: half of them, as large parts take less time each."""
+    return min(max(count // 2, PART), LARGEST_PART)
 
 
 def in_parts(draw: Callable[[slice], T], count: int, most: int | None = None, threads: int = 0) -> list[T]:

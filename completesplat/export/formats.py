@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -30,9 +30,10 @@ from completesplat.geometry.cameras import transform_points
 from completesplat.geometry.harmonics import SH_C0
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.rasterizers import Rasterizer
+from completesplat.settings.schema import Format
 from completesplat.version import __version__
 
-FORMATS = ("ply", "splat", "glb", "mesh", "spz", "sog", "html")
+FORMATS: tuple[str, ...] = get_args(Format)
 CONVERTED = ("spz", "sog", "html")
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quaternions", "u1", 4)])
 EXTENSION = "KHR_gaussian_splatting"

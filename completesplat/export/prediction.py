@@ -14,7 +14,6 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
 from completesplat.export.formats import FORMATS, write_format
 from completesplat.export.formats import suffix as format_suffix
@@ -38,6 +37,7 @@ from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.geometry.trajectories import PATHS
 from completesplat.rasterizers import Rasterizer
+from completesplat.settings.schema import CameraPath, Format
 
 logger = logging.getLogger(__name__)
 
@@ -63,19 +63,19 @@ class OutputFiles:
     """Selection of the files that are written for each prediction.
 
     Raises:
-        CompleteSplatError: a format or video is unknown, or a format needs a package that is missing.
+        CompleteSplatError: a format needs a package that is missing.
 
     Args:
-        formats: scene formats, from `completesplat.export.formats.FORMATS`; some need `find_splat_transform`.
-        videos: camera paths, from `completesplat.geometry.trajectories.PATHS`; each video has `frames` frames.
+        formats: scene formats; some need `find_splat_transform`.
+        videos: camera paths; each video has `frames` frames.
         background: grey value behind the scene.
         pivot_depth: depth on the optical axis around which orbits turn; None: `seen_center` finds it.
         maps: whether to write depth, normals and opacity of the reference view (`write_maps`).
         screen_space_dilation: whether to store Gaussians `with_screen_space_dilation`.
     """
 
-    formats: Sequence[str] = ("ply",)
-    videos: Sequence[str] = ("orbit",)
+    formats: Sequence[Format] = ("ply",)
+    videos: Sequence[CameraPath] = ("orbit",)
     frames: int = 48
     background: float = 0.5
     pivot_depth: float | None = None
@@ -83,10 +83,6 @@ class OutputFiles:
     screen_space_dilation: bool = True
 
     def __post_init__(self) -> None:
-        for name, chosen, known in (("formats", self.formats, FORMATS), ("video", self.videos, PATHS)):
-            for kind in chosen:
-                if kind not in known:
-                    raise CompleteSplatError(f"{name}={kind}: choose from {', '.join(known)}")
         if "mesh" in self.formats:
             check_available()
 
@@ -256,12 +252,12 @@ def write_scene(
     for kind in wanted.formats:
         on_file(name + format_suffix(kind))
         files |= write_format(folder, name, kind, stored, view, comments, rasterizer)
-    for kind in wanted.videos:
-        files[f"{kind}{suffix}"] = f"{kind}{suffix}.mp4"
-        on_file(f"{kind}{suffix}.mp4")
-        cameras = PATHS[kind](reference, pivot, shot.up, wanted.frames)
+    for path in wanted.videos:
+        files[f"{path}{suffix}"] = f"{path}{suffix}.mp4"
+        on_file(f"{path}{suffix}.mp4")
+        cameras = PATHS[path](reference, pivot, shot.up, wanted.frames)
         frames, _ = render_views(rasterizer, scene, cameras, wanted.background)
-        write_video(folder / f"{kind}{suffix}.mp4", frames)
+        write_video(folder / f"{path}{suffix}.mp4", frames)
     views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, shot.up)
     return views, depths[0], files
 

@@ -13,6 +13,8 @@ from omegaconf.errors import OmegaConfBaseException
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.options import did_you_mean
 from completesplat.settings.schema import (
+    CameraPath,
+    Format,
     Positive,
     Range,
     Seed,
@@ -104,6 +106,8 @@ class PredictSettings(SceneSettings):
     cameras: str | None
     screen_space_dilation: bool
     maps: bool
+    formats: Format | Sequence[Format] | None
+    video: CameraPath | Sequence[CameraPath] | None
 
 
 class ViewSettings(SceneSettings):

@@ -180,13 +180,19 @@ def shard_folder(_root_: Mapping[str, Any]) -> str:
     return f"/shard-{_root_['shard']}" if _root_.get("shards", 1) != 1 else ""
 
 
+def has_bfloat16(device: str) -> bool:
+    """Return whether a device of this type ("cuda", "cpu", ...) computes in bfloat16 itself."""
+    import torch
+
+    supported = {"cuda": torch.cuda.is_bf16_supported, "cpu": torch.cpu._is_avx512_bf16_supported}
+    return device in supported and bool(supported[device]())
+
+
 def best_precision() -> str:
     """Return Lightning's precision for networks: bfloat16 where the GPU, or else the CPU, supports it, or float32."""
     import torch
 
-    on_gpu = torch.cuda.is_available()
-    supported = torch.cuda.is_bf16_supported() if on_gpu else torch.cpu._is_avx512_bf16_supported()
-    return "bf16-mixed" if supported else "32-true"
+    return "bf16-mixed" if has_bfloat16("cuda" if torch.cuda.is_available() else "cpu") else "32-true"
 
 
 # Resolvers used in `conf/`. Jobs that a cluster starts import this module, too.

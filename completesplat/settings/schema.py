@@ -70,6 +70,8 @@ Natural = Annotated[int, Range(0)]
 Seed = Annotated[int, Range(0, 2**63 - 1)]
 Share = Annotated[float, Range(0, 1)]
 Side = Annotated[int, Range(8, 4096)]  # of an image, in pixels
+Format = Literal["ply", "splat", "glb", "mesh", "spz", "sog", "html"]  # of a scene's files
+CameraPath = Literal["orbit", "swipe", "wobble"]  # of a video
 
 # Sizes of networks. Their bounds lie beyond what anyone trains, and protect from configs that strangers wrote.
 Width = Annotated[int, Range(1, 8192)]

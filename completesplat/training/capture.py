@@ -33,7 +33,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import Batch, SceneBatch, Views
-from completesplat.settings.schema import Positive, Range, Share
+from completesplat.settings.schema import CameraPath, Format, Positive, Range, Share
 from completesplat.tensors import stack
 from completesplat.training.optimization import Schedule, constant
 from completesplat.training.scoring import Renders
@@ -89,8 +89,8 @@ class CaptureFit(Stage):
         loss: WeightedSum,
         fitting: CaptureSettings,
         scene_folder: str | None = None,
-        formats: Sequence[str] = (),
-        videos: Sequence[str] = ("orbit",),
+        formats: Sequence[Format] = (),
+        videos: Sequence[CameraPath] = ("orbit",),
         frames: Positive = 96,
         **rendering: Any,
     ) -> None:

@@ -42,12 +42,10 @@ def locate(weights: Path | str) -> Path:
         WeightsError: there is no such folder, a file is missing, or its checksum differs.
     """
     name, path = str(weights), Path(weights).expanduser()
+    check_name(name)
     if name in shipped():
         path = shipped()[name]
-    elif not os.path.exists(path):  # `Path.exists` raises if a name is too long
-        if HUB_ID.fullmatch(name) is None:
-            included = ", ".join(shipped()) or "no weights"
-            raise WeightsError(f"{printable(name)}: no such folder; with the package come {included}")
+    elif not os.path.exists(path):
         path = from_hub(name)
     elif path.is_file() and path.name != WEIGHTS_FILE:
         return path
@@ -60,6 +58,14 @@ def locate(weights: Path | str) -> Path:
             return path / RUN_CHECKPOINT
     check_folder(path)
     return path / WEIGHTS_FILE
+
+
+def check_name(name: str) -> None:
+    """Raise WeightsError unless there is such a folder or file, with the package or here, or it may be a hub id."""
+    exists = os.path.exists(Path(name).expanduser())  # `Path.exists` raises if a name is too long
+    if name not in shipped() and not exists and HUB_ID.fullmatch(name) is None:
+        included = ", ".join(shipped()) or "no weights"
+        raise WeightsError(f"{printable(name)}: no such folder; with the package come {included}")
 
 
 def check_folder(folder: Path) -> None:

@@ -10,6 +10,10 @@ from completesplat.cli import VERBS
 from completesplat.settings.composition import PARTS_OF_STAGES
 from completesplat.settings.help import help_page
 
+NOT_THERE = [["predict", "a.jpg"], ["predict"], ["test"], ["test", "ckpt=a.ckpt"]]
+NOT_THERE += [["predict", __file__, setting] for setting in ("weights=none", "formats=obj", "video=zoom")]
+NOT_THERE += [["view", "weights=none"]]
+
 
 def python(program: str, **settings) -> str:
     """Run a program in a new process and return what it prints."""
@@ -26,7 +30,7 @@ def test_help_needs_no_heavy_import():
 
 
 @pytest.mark.processes
-@pytest.mark.parametrize("given", [["predict", "a.jpg"], ["predict"], ["test"], ["test", "ckpt=a.ckpt"]], ids=" ".join)
+@pytest.mark.parametrize("given", NOT_THERE, ids=" ".join)
 def test_what_is_not_there_is_refused_before_torch_is_imported(given, tmp_path):
     program = f"import sys; sys.argv = ['', *{given}]; from completesplat.cli import main\n"
     program += "try: main()\nexcept SystemExit as stop: print(stop.code, 'torch' in sys.modules)"

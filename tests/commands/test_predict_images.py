@@ -321,11 +321,9 @@ def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_pat
     monkeypatch.setitem(sys.modules, "skimage", None)
     monkeypatch.setenv("PATH", str(tmp_path))
     for setting, message in (
-        ("formats=[ply,obj]", "formats=obj: choose from ply, splat, glb, mesh, spz, sog, html"),
         ("formats=html", "formats spz, sog and html need Node.js"),
         ("formats=mesh", 'formats=[mesh] needs scikit-image: pip install "completesplat[mesh]"'),
         ("formats=[]", "formats=[] video=[]: choose a format (ply, splat, glb, mesh, spz, sog, html) or a video"),
-        ("video=zoom", "video=zoom: choose from orbit, swipe, wobble"),
         ("mask=x.png", "mask=FILE belongs to one image"),
         ("image=nofile.jpg", "nofile.jpg: no such file"),
     ):

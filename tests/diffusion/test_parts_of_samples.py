@@ -5,7 +5,7 @@ from itertools import chain
 import pytest
 import torch
 
-from completesplat.diffusion.sampling import in_parts
+from completesplat.diffusion.sampling import LARGEST_PART, PART, in_parts, part_of
 
 
 @pytest.mark.parametrize("threads", [0, 2])
@@ -15,6 +15,11 @@ def test_all_are_drawn_in_order(most, sizes, threads):
     parts = in_parts(lambda part: items[part], 7, most, threads)
     assert [len(part) for part in parts] == sizes
     assert list(chain(*parts)) == items
+
+
+def test_two_threads_have_work_before_parts_become_larger_and_many_samples_give_work_to_more():
+    sizes = {1: PART, PART: PART, 2 * PART: PART, 12: 6, 20: LARGEST_PART, 100: LARGEST_PART}
+    assert {count: part_of(count) for count in sizes} == sizes
 
 
 def test_parts_that_do_not_fit_are_halved_until_they_do(caplog):
