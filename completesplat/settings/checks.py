@@ -106,8 +106,8 @@ class PredictSettings(SceneSettings):
     cameras: str | None
     screen_space_dilation: bool
     maps: bool
-    formats: Format | Sequence[Format] | None
-    video: CameraPath | Sequence[CameraPath] | None
+    formats: Format | Sequence[Format] | Literal[False] | None
+    video: CameraPath | Sequence[CameraPath] | Literal[False] | None
 
 
 class ViewSettings(SceneSettings):
