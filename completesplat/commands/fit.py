@@ -2,8 +2,6 @@
 
 import copy
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -117,9 +115,13 @@ def _parts(config: DictConfig, group: str) -> list[Any]:
 def _train(
     trainer: Trainer, module: Stage, data: SceneDataModule, checkpoint: str | None, out: Path
 ) -> dict[str, float]:
-    """Train, save the weights, and return all logged figures."""
-    with _refusing_other_models(checkpoint):
+    """Train, save the weights, and return all logged figures; refuse a checkpoint of another model."""
+    try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    except RuntimeError as error:
+        if checkpoint is None or "loading state_dict" not in str(error):
+            raise
+        raise WeightsError(f"{checkpoint}: of another model; give the settings of its run") from error
     metrics = _logged(trainer)
     if trainer.is_global_zero:
         module.save_weights(out / RUN_WEIGHTS)
@@ -139,16 +141,6 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
     check_whole(Path(path))  # now, because data may be made first
     remove_start_weights(config.model)
     return str(path)
-
-
-@contextmanager
-def _refusing_other_models(checkpoint: str | None) -> Iterator[None]:
-    try:
-        yield
-    except RuntimeError as error:
-        if checkpoint is None or "loading state_dict" not in str(error):
-            raise
-        raise WeightsError(f"{checkpoint}: of another model; give the settings of its run") from error
 
 
 def refuse_without_effect(config: DictConfig, out: Path) -> None:
