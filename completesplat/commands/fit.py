@@ -2,8 +2,6 @@
 
 import copy
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +23,7 @@ from completesplat.files import counted, write_json
 from completesplat.results.measured import evaluation_table
 from completesplat.results.runs import PLAN, read_record
 from completesplat.results.tables import show
-from completesplat.settings.checks import (
-    check_image_size,
-    check_optimizer,
-    check_parts,
-    check_values,
-    each_part,
-    remove_start_weights,
-)
+from completesplat.settings import checks
 from completesplat.settings.schema import start_weights
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs
@@ -56,10 +47,10 @@ def instantiate(config: DictConfig) -> tuple[SceneDataModule, Scorer]:
         WeightsError: weights to start from cannot be used.
     """
     refuse_missing(config)
-    check_values("fit", config)
-    check_parts(config)
-    check_image_size(config)
-    check_optimizer(config.optimizer)
+    checks.check_values("fit", config)
+    checks.check_parts(config)
+    checks.check_image_size(config)
+    checks.check_optimizer(config.optimizer)
     data, module = build(config.data, _convert_="all"), build(config.model, _convert_="all")
     if config.test:
         set_scoring(module, config.evaluation)
@@ -117,9 +108,13 @@ def _parts(config: DictConfig, group: str) -> list[Any]:
 def _train(
     trainer: Trainer, module: Stage, data: SceneDataModule, checkpoint: str | None, out: Path
 ) -> dict[str, float]:
-    """Train, save the weights, and return all logged figures."""
-    with _refusing_other_models(checkpoint):
+    """Train, save the weights, and return all logged figures; refuse a checkpoint of another model."""
+    try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    except RuntimeError as error:
+        if checkpoint is None or "loading state_dict" not in str(error):
+            raise
+        raise WeightsError(f"{checkpoint}: of another model; give the settings of its run") from error
     metrics = _logged(trainer)
     if trainer.is_global_zero:
         module.save_weights(out / RUN_WEIGHTS)
@@ -137,18 +132,8 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
     if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
     check_whole(Path(path))  # now, because data may be made first
-    remove_start_weights(config.model)
+    checks.remove_start_weights(config.model)
     return str(path)
-
-
-@contextmanager
-def _refusing_other_models(checkpoint: str | None) -> Iterator[None]:
-    try:
-        yield
-    except RuntimeError as error:
-        if checkpoint is None or "loading state_dict" not in str(error):
-            raise
-        raise WeightsError(f"{checkpoint}: of another model; give the settings of its run") from error
 
 
 def refuse_without_effect(config: DictConfig, out: Path) -> None:
@@ -167,7 +152,7 @@ def refuse_without_effect(config: DictConfig, out: Path) -> None:
 def refuse_missing(config: DictConfig) -> None:
     """Raise CompleteSplatError, with an example, for a setting of data or model that is missing or an empty text."""
     examples = {"root": "DIR"}
-    for _, kind in each_part(config.model):
+    for _, kind in checks.each_part(config.model):
         examples |= start_weights(kind)
     missing = [key for part in (config.data, config.model) for key in sorted(OmegaConf.missing_keys(part))]
     missing += [f"model.{key}" for key in sorted(examples) if config.model.get(key) == ""]

@@ -85,16 +85,12 @@ def provenance(data: "SceneDataModule", out: Path) -> dict[str, object]:
 
 def sampler_settings(module: Any) -> dict[str, object]:
     """Return the settings of the sampler; nulls for deterministic models and for scenes from files."""
+    controls = ("skip_weight", "guidance_weight", "color_fits")
     if not hasattr(module, "completesplat"):
-        return dict.fromkeys(("sampler", "steps", "skip_weight", "guidance_weight", "color_fits"))
+        return dict.fromkeys(("sampler", "steps", *controls))
     sampler = module.completesplat.sampler
-    return {
-        "sampler": type(sampler.scheduler).__name__,
-        "steps": sampler.steps,
-        "skip_weight": module.skip_weight,
-        "guidance_weight": module.guidance_weight,
-        "color_fits": module.color_fits,
-    }
+    described = {"sampler": type(sampler.scheduler).__name__, "steps": sampler.steps}
+    return described | {name: getattr(module, name) for name in controls}
 
 
 def checkpoint_facts(path: Path) -> dict[str, Any]:

@@ -9,23 +9,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
-from completesplat.results import tables
-from completesplat.results.measured import (
-    ALIKE,
-    BEST_BY_METRIC,
-    BEST_OF_K,
-    LEADING,
-    OF_RUNS,
-    OURS,
-    Entry,
-    entries_of,
-    group_by_protocol,
-    leading_headings,
-    mode_tables,
-    protocol_line,
-    score_rows,
-    score_tables,
-)
+from completesplat.results import measured, tables
 from completesplat.results.runs import HOW, MODES, SCORES, Job, RunTree, collect
 from completesplat.results.sweeps import sweep_rows
 
@@ -71,7 +55,7 @@ def parse_cell(cell: str) -> tables.Cell:
     return tables.Cell(" ".join([text, *signs]), mark)
 
 
-def comparison_table(table: PublishedTable, entries: Sequence[Entry]) -> tables.Table:
+def comparison_table(table: PublishedTable, entries: Sequence[measured.Entry]) -> tables.Table:
     """Return the published rows, followed by entries of ours.
 
     Times are of one sequence, warm, for the complete pipeline.
@@ -79,12 +63,13 @@ def comparison_table(table: PublishedTable, entries: Sequence[Entry]) -> tables.
     notes, keys = tables.Notes(), ["method"]
     is_ablation = bool(table.get("options"))
     if not is_ablation:
-        keys = [key for key in LEADING if key in OF_RUNS or any(column.key == key for column in table.columns)]
+        shown = {*measured.OF_RUNS, *(column.key for column in table.columns)}
+        keys = [key for key in measured.LEADING if key in shown]
     scored = score_columns(table)
     names = [f"{table.region}_{table.view}_{column.key}" for _, column, _ in scored]
     data_sets = [None if is_ablation else data_set for *_, data_set in scored]
-    ours = score_rows(entries, keys, list(zip(names, data_sets, strict=True)), notes, marked=False)
-    headings = [*leading_headings(keys), *(tables.Heading(column.heading) for _, column, _ in scored)]
+    ours = measured.score_rows(entries, keys, list(zip(names, data_sets, strict=True)), notes, marked=False)
+    headings = [*measured.leading_headings(keys), *(tables.Heading(column.heading) for _, column, _ in scored)]
     source = f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
     signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.get("legend", {}).items()]
     of_ours = [APART] if entries else []
@@ -104,7 +89,7 @@ def _published_rows(table: PublishedTable, keys: Sequence[str]) -> list[tables.T
     return rows
 
 
-def is_comparable(table: PublishedTable, entry: Entry) -> bool:
+def is_comparable(table: PublishedTable, entry: measured.Entry) -> bool:
     """Return whether an entry was measured like the table's figures.
 
     The run followed one of the table's evaluations: the same views, resolution and number of scenes (all scenes of the
@@ -122,22 +107,23 @@ def is_comparable(table: PublishedTable, entry: Entry) -> bool:
         return False
     if "subset" in table and protocol.get("subset") != table.subset:
         return False
-    if entry.predictor in (BEST_OF_K, BEST_BY_METRIC) and protocol.get("samples") != table.get("oracle_samples"):
+    is_oracle = entry.predictor in (measured.BEST_OF_K, measured.BEST_BY_METRIC)
+    if is_oracle and protocol.get("samples") != table.get("oracle_samples"):
         return False
     if protocol["scenes"] not in wanted.get("scenes", [protocol.get("scenes_listed")]):
         return False
     return (protocol["resolution"], protocol.get("protocol_views")) == (wanted["resolution"], wanted["protocol_views"])
 
 
-def sweep_entries(table: PublishedTable, name: str, jobs: Sequence[Job]) -> list[Entry]:
+def sweep_entries(table: PublishedTable, name: str, jobs: Sequence[Job]) -> list[measured.Entry]:
     """Return a sweep's means over seeds by protocol, with the paper's names of their settings."""
     entries = []
-    for group in group_by_protocol((job, job.protocol) for job in jobs):
+    for group in measured.group_by_protocol((job, job.protocol) for job in jobs):
         protocol = group[0].protocol
-        note = f"{name}: mean ± sample deviation over seeds; {protocol_line(protocol, ALIKE)}."
+        note = f"{name}: mean ± sample deviation over seeds; {measured.protocol_line(protocol, measured.ALIKE)}."
         for row in sweep_rows(group):
             theirs = "".join(f" ({table.options[part]})" for part in row.label.split(", ") if part in table.options)
-            label = f"{OURS}{row.label}{theirs}{f', {row.seeds} seeds' if row.seeds else ''}"
+            label = f"{measured.OURS}{row.label}{theirs}{f', {row.seeds} seeds' if row.seeds else ''}"
             entries.append(replace(row, label=label, note=note, protocol=protocol, lacking=LACKING))
     return entries
 
@@ -156,7 +142,7 @@ def published_tables(tree: RunTree | None) -> list[tables.Table]:
     if not (tree.scores or tree.modes or tree.warnings):
         raise CompleteSplatError(f"runs={tree.folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
     sweeps = _ablation_sweeps(tree)
-    single = entries_of(run for run in tree.scores if run.folder.parent not in sweeps)
+    single = measured.entries_of(run for run in tree.scores if run.folder.parent not in sweeps)
     made, placed = [], []
     for table in read_tables():
         entries = []
@@ -167,7 +153,8 @@ def published_tables(tree: RunTree | None) -> list[tables.Table]:
             entries = [entry for entry in single if is_comparable(table, entry)]
             placed += entries
         made.append(comparison_table(table, entries))
-    return [*made, *score_tables([entry for entry in single if entry not in placed]), *mode_tables(tree.modes)]
+    others = measured.score_tables([entry for entry in single if entry not in placed])
+    return [*made, *others, *measured.mode_tables(tree.modes)]
 
 
 def _ablation_sweeps(tree: RunTree) -> dict[Path, list[Job]]:

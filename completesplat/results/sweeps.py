@@ -11,21 +11,10 @@ from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 
+from completesplat.results import tables
 from completesplat.results.machine import machine
 from completesplat.results.measured import Entry, score_rows, styles_of
 from completesplat.results.runs import MODEL, SEED, UPPER_BOUND, Job, Record, collect, shell_command
-from completesplat.results.tables import (
-    SSIM_NOTE,
-    Heading,
-    Notes,
-    Table,
-    metric_of,
-    score_heading,
-    show,
-    shown_scores,
-    write_csv,
-    write_documents,
-)
 
 # Hydra imports this file for every run, even to print the help, so torch and rich are imported only when a job has
 # ended.
@@ -33,7 +22,7 @@ log = logging.getLogger(__name__)
 
 CAPTION = (
     "Mean ± sample standard deviation over seeds; PSNR in dB. "
-    f"The best of our rows is in bold, the second best underlined. {SSIM_NOTE}"
+    f"The best of our rows is in bold, the second best underlined. {tables.SSIM_NOTE}"
 )
 PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
 IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
@@ -61,7 +50,7 @@ def _summarize(config: Any, last: bool) -> None:
         folder = Path(config.hydra.sweep.dir)
         table = write_summary(folder)
         if last:
-            show(table, width=160)
+            tables.show(table, width=160)
             print(folder / "summary.md")
     except Exception as error:  # no error of a summary may stop the remaining jobs
         log.warning("no summary of the sweep: %s: %s", type(error).__name__, error)
@@ -87,10 +76,10 @@ def sweep_rows(finished: Sequence[Job]) -> list[Entry]:
 
 
 def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> Entry:
-    tables = [job.test.get(predictor, {}) for job in jobs]
-    scenes = _common(int(table["scenes"]) for table in tables if table)
-    bound = any(table.get(UPPER_BOUND) for table in tables)
-    scores = _complete_scores(tables)
+    by_job = [job.test.get(predictor, {}) for job in jobs]
+    scenes = _common(int(table["scenes"]) for table in by_job if table)
+    bound = any(table.get(UPPER_BOUND) for table in by_job)
+    scores = _complete_scores(by_job)
     means = {name: fmean(values) for name, values in scores.items()}
     if predictor != MODEL:
         return Entry(label, means, scenes, predictor, bound, protocol=jobs[0].protocol)
@@ -99,13 +88,13 @@ def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> Entry:
     return Entry(label, means, scenes, predictor, bound, len(jobs), steps, deviations, jobs[0].protocol)
 
 
-def _complete_scores(tables: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
-    """Return the values of the views' scores that all tables have."""
+def _complete_scores(by_job: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
+    """Return the values of the views' scores that all jobs have."""
     scores = {}
-    for name in tables[0]:
+    for name in by_job[0]:
         of_views = "_novel_" in name or "_reference_" in name
-        if of_views and all(name in table for table in tables):
-            scores[name] = [table[name] for table in tables]
+        if of_views and all(name in table for table in by_job):
+            scores[name] = [table[name] for table in by_job]
     return scores
 
 
@@ -120,7 +109,7 @@ def _common(values: Iterable[int]) -> int | str | None:
     return different[0] if len(different) == 1 else "/".join(map(str, different)) or None
 
 
-def summarize(*folders: Path) -> tuple[list[Entry], Table]:
+def summarize(*folders: Path) -> tuple[list[Entry], tables.Table]:
     """Return rows and table of all jobs in a sweep's folder, or in its parts on several machines, finished or not.
 
     One seed has no standard deviation.
@@ -128,14 +117,14 @@ def summarize(*folders: Path) -> tuple[list[Entry], Table]:
     jobs = collect(*folders)
     rows = sweep_rows([job for job in jobs if job.finished])
     styles = styles_of(rows)
-    names = [name for name in shown_scores(styles) if any(name in row.scores for row in rows)]
+    names = [name for name in tables.shown_scores(styles) if any(name in row.scores for row in rows)]
     columns = [(name, None) for name in names]
-    body = score_rows(rows, ("method", "seeds", "scenes"), columns, Notes(), marked=True)
-    headings = [Heading("ablation", figures=False), Heading("seeds"), Heading("scenes")]
-    headings += [score_heading(name, styles[metric_of(name)]) for name in names]
+    body = score_rows(rows, ("method", "seeds", "scenes"), columns, tables.Notes(), marked=True)
+    headings = [tables.Heading("ablation", figures=False), tables.Heading("seeds"), tables.Heading("scenes")]
+    headings += [tables.score_heading(name, styles[tables.metric_of(name)]) for name in names]
     remarks = [CAPTION if rows else "No job of this sweep has finished.", *_progress_remarks(jobs)]
     remarks += [*_row_remarks(rows), *_program_remarks([job.record for job in jobs if job.record])]
-    return rows, Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
+    return rows, tables.Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
 
 
 def _progress_remarks(jobs: Sequence[Job]) -> list[str]:
@@ -173,7 +162,7 @@ def _program_remarks(records: Sequence[Record]) -> list[str]:
     ]
 
 
-def write_summary(folder: Path, *parts: Path) -> Table:
+def write_summary(folder: Path, *parts: Path) -> tables.Table:
     """Write `summary.csv` (all metrics), `summary.md` and `summary.tex`; return the table.
 
     `parts` are the folders of one sweep on several machines; the files then cover all of them.
@@ -185,6 +174,6 @@ def write_summary(folder: Path, *parts: Path) -> Table:
     for row in rows:
         scores = [score for name in names for score in (row.scores.get(name), row.deviations.get(name))]
         lines.append([row.label, row.seeds, row.scenes, row.steps, row.upper_bound, *scores])
-    write_csv(folder / "summary.csv", header, lines)
-    write_documents([table], folder / "summary")
+    tables.write_csv(folder / "summary.csv", header, lines)
+    tables.write_documents([table], folder / "summary")
     return table

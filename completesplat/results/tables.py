@@ -115,17 +115,12 @@ class Heading:
         return separator.join(part for part in (self.group, self.text) if part)
 
 
-class Notes:
+class Notes(dict[str, int]):
     """Sentences below a table, each with the number by which cells refer to it."""
-
-    def __init__(self) -> None:
-        self.texts: list[str] = []
 
     def number(self, text: str) -> int:
         """Return the number of a text, the same for equal texts."""
-        if text not in self.texts:
-            self.texts.append(text)
-        return self.texts.index(text) + 1
+        return self.setdefault(text, len(self) + 1)
 
 
 @dataclass(frozen=True)
@@ -145,7 +140,7 @@ class Table:
         return list(zip(self.rows, [*apart, False], strict=False))
 
     def below(self) -> list[str]:
-        return [*self.remarks, *(f"[{n}] {text}" for n, text in enumerate(self.notes.texts, 1))]
+        return [*self.remarks, *(f"[{n}] {text}" for text, n in self.notes.items())]
 
     def __rich_console__(self, console: "Console", options: "ConsoleOptions") -> Iterator["PrintedTable"]:
         """Yield the table, in parts that repeat the first column if the words of all columns do not fit side by side.

@@ -50,7 +50,18 @@ def _rungs(renderer: SampleRenderer, scene: SceneBatch, fits: int) -> Iterator[t
     free_raw, free_latent = (tensor.clone().requires_grad_() for tensor in (start.raw, latent))
 
     def fitted(parameters: Iterable[Tensor], rate: float, make: Callable[[], SplatterImage]) -> Gaussians:
-        return _fitted(renderer, scene, parameters, rate, fits, lambda: make().gaussians(*inputs))
+        """Return the Gaussians after steps of Adam on the mean square error of some views each, with a falling rate."""
+        optimizer = torch.optim.Adam(parameters, lr=rate)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, fits)
+        generator = torch.Generator().manual_seed(renderer.seed)
+        for _ in range(fits):
+            chosen = torch.randperm(views.images.shape[1], generator=generator)[:VIEWS_OF_A_STEP]
+            drawn = renderer.rasterizer(make().gaussians(*inputs), views.cameras[:, chosen]).over(renderer.background)
+            optimizer.zero_grad()
+            (drawn - views.images[:, chosen]).square().mean().backward()  # type: ignore[no-untyped-call]
+            optimizer.step()
+            schedule.step()
+        return make().gaussians(*inputs)
 
     yield "raw values fitted", fitted([free_raw], RAW_RATE, lambda: replace(start, raw=free_raw))
     yield "decoder fitted", fitted(decoder.parameters(), DECODER_RATE, lambda: decoder(latent, features))
@@ -59,28 +70,6 @@ def _rungs(renderer: SampleRenderer, scene: SceneBatch, fits: int) -> Iterator[t
         yield "posterior, all views", start.gaussians(*inputs)
     yield "samples", renderer.model.generate(images, *inputs, samples=renderer.samples, seed=renderer.seed)
     yield "reference alone", stage1.reconstructor(alone.mode(), features).map(Tensor.detach).gaussians(*inputs)
-
-
-def _fitted(
-    renderer: SampleRenderer,
-    scene: SceneBatch,
-    parameters: Iterable[Tensor],
-    rate: float,
-    steps: int,
-    make: Callable[[], Gaussians],
-) -> Gaussians:
-    """Return the Gaussians after steps of Adam on the mean square error of some views each, with a falling rate."""
-    optimizer = torch.optim.Adam(parameters, lr=rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
-    generator, views = torch.Generator().manual_seed(renderer.seed), scene.all_views()
-    for _ in range(steps):
-        chosen = torch.randperm(views.images.shape[1], generator=generator)[:VIEWS_OF_A_STEP]
-        drawn = renderer.rasterizer(make(), views.cameras[:, chosen]).over(renderer.background)
-        optimizer.zero_grad()
-        (drawn - views.images[:, chosen]).square().mean().backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        schedule.step()
-    return make()
 
 
 @torch.no_grad()

@@ -125,7 +125,7 @@ def test_photos_become_upright_keep_their_focal_length_and_the_unusable_are_name
     assert "left out: 1 file of other formats: notes.txt" in caplog.text
     assert f"left out: {tmp_path / 'cut.jpg'}: cannot be decoded" in caplog.text
     full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
-    monkeypatch.setattr(importing, "save_image", full)
+    monkeypatch.setattr(importing.files, "save_image", full)
     with pytest.raises(OSError, match="No space left"):
         importing._copy_photos(tmp_path, images)
 
@@ -138,7 +138,7 @@ def test_a_video_is_split_into_evenly_spread_frames_unless_they_are_too_large(tm
     importing._split_video(tmp_path / "a.mp4", images, asked)
     means = [np.asarray(Image.open(path)).mean() for path in sorted(images.iterdir())]
     np.testing.assert_allclose(means, 6 * np.array(expected), atol=2)
-    monkeypatch.setattr(importing, "MOST_PIXELS", 64 * 64 - 1)
+    monkeypatch.setattr(importing.files, "MOST_PIXELS", 64 * 64 - 1)
     with pytest.raises(DataError, match=r"a\.mp4: ffmpeg finds no video of at most 4,095 pixels there"):
         importing._split_video(tmp_path / "a.mp4", images, asked)
 

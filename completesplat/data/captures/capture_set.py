@@ -81,14 +81,12 @@ class CaptureSetDataModule(ObjectDataModule):
         self.seeded = SeededSplit(val_fraction, test_fraction, split_seed)
 
     def describe(self) -> dict[str, str | None]:
-        targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
         val, test, seed = self.seeded
         seeded = f"by seed {seed}: {val:g} of the objects for validation, {test:g} for the test"
         return {
             "data_set": "captures",
             "split": f"of a list, or {seeded}",
-            "crop": "largest square around the principal point",
-            "protocol_views": f"reference: a capture's first frame; targets: {targets}",
+            **self.described_views("a capture's first frame"),
         }
 
     def packed_settings(self) -> dict[str, Scalar]:

@@ -17,16 +17,7 @@ from rich.progress import Progress, track
 from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.turntable import TurntableSettings, import_turntables
-from completesplat.data.images.files import (
-    MOST_PIXELS,
-    check_sums,
-    image_files,
-    open_image,
-    photo_formats,
-    refused_as_bad,
-    save_image,
-    stored_size,
-)
+from completesplat.data.images import files
 from completesplat.data.sequences import first_names
 from completesplat.data.validation import refused_to
 from completesplat.errors import DataError
@@ -100,33 +91,33 @@ def _copy_photos(folder: Path, images: Path) -> None:
 
     Photos of folders below are written into folders, each the photos of one camera.
     """
-    formats = photo_formats()
+    formats = files.photo_formats()
     photos = _photos_in(folder, formats)
     # COLMAP lists pairs with a space between.
     folders = sorted({photo.parent for photo in photos})
     names = dict(zip(folders, folder_names("_".join(path.name.split()) for path in folders), strict=True))
     stems = folder_names("_".join(path.stem.split()) for path in photos)
     for photo, stem in track(list(zip(photos, stems, strict=True)), "photos"):
-        with refused_to(leave_out), refused_as_bad(str(photo)):
-            with open_image(photo, formats) as image:
-                check_sums(image, photo)
+        with refused_to(leave_out), files.refused_as_bad(str(photo)):
+            with files.open_image(photo, formats) as image:
+                files.check_sums(image, photo)
                 upright = ImageOps.exif_transpose(image)
             options = {"quality": 95, "subsampling": 0, "exif": upright.info.get("exif", b"")}
             place = images if photo.parent == folder else images / names[photo.parent]
             place.mkdir(exist_ok=True)
             suffix = ".jpg" if image.format == "HEIF" else photo.suffix.lower()
-            save_image(upright, place / f"{stem}{suffix}", **options)
+            files.save_image(upright, place / f"{stem}{suffix}", **options)
 
 
 def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
     """Return the photos in a folder or, if there are none, in the folders below it; name files of other formats."""
     folders, below = [folder], sorted(folder.glob("[!.]*/"))
-    photos = image_files(folder, formats)
+    photos = files.image_files(folder, formats)
     if not photos:
-        photos = [photo for path in below for photo in image_files(path, formats)]
+        photos = [photo for path in below for photo in files.image_files(path, formats)]
         folders = below if photos else [folder, *below]
-    files = {path for searched in folders for path in searched.glob("[!.]*") if path.is_file()}
-    if others := sorted({path.name for path in files.difference(photos)}):
+    there = {path for searched in folders for path in searched.glob("[!.]*") if path.is_file()}
+    if others := sorted({path.name for path in there.difference(photos)}):
         advice = "" if "HEIF" in formats else '; HEIC needs: pip install "completesplat[heic]"'
         logger.warning("left out: %s of other formats: %s%s", counted(len(others), "file"), first_names(others), advice)
     return photos
@@ -136,12 +127,12 @@ def _split_video(video: Path, images: Path, frames: int) -> None:
     """Write the first frame of each of equal parts of a video, or all frames if there are fewer."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
-    limit = "-max_pixels", str(MOST_PIXELS)  # else a small file could take gigabytes
+    limit = "-max_pixels", str(files.MOST_PIXELS)  # else a small file could take gigabytes
     start = [get_ffmpeg_exe(), "-nostdin", *limit, "-i", str(video.absolute())]
     output = subprocess.run([*start, "-map", "0:v:0", "-f", "null", "-"], capture_output=True).stderr
     count = int((re.findall(rb"frame= *(\d+)", output) or [b"0"])[-1])
     if not count:
-        raise DataError(f"ffmpeg finds no video of at most {MOST_PIXELS:,} pixels there", str(video))
+        raise DataError(f"ffmpeg finds no video of at most {files.MOST_PIXELS:,} pixels there", str(video))
     part = f"{min(frames, count)}/{count}"
     options = ["-vf", f"select=gt(floor(n*{part})\\,floor((n-1)*{part}))", "-fps_mode", "passthrough", "-q:v", "2"]
     if subprocess.run([*start, "-v", "error", *options, "%05d.jpg"], cwd=images).returncode:
@@ -159,7 +150,7 @@ def _find_cameras(folder: Path, names: list[str], sequential: bool, max_image_si
     pycolmap = import_pycolmap()
     images, database, pairs, at_a_time = folder / "images", folder / "db", folder / "pairs", os.cpu_count() or 1
     pycolmap.Database.open(database).close()
-    sizes = {(Path(name).parent, stored_size(images / name, name)) for name in names}
+    sizes = {(Path(name).parent, files.stored_size(images / name, name)) for name in names}
     uniform = len(sizes) == len({Path(name).parent for name in names})
     mode = pycolmap.CameraMode.PER_FOLDER if uniform else pycolmap.CameraMode.PER_IMAGE
     pycolmap.import_images(database, images, mode, names)

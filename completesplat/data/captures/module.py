@@ -198,12 +198,10 @@ class CaptureDataModule(ObjectDataModule):
         self.hold_out = hold_out
 
     def describe(self) -> dict[str, str | None]:
-        targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
         return {
             "data_set": "capture",
             "split": f"one of {self.hold_out} photos is held out, from the first on, and at least {FEWEST_HELD_OUT}",
-            "crop": "largest square around the principal point",
-            "protocol_views": f"reference: a capture's first held-out frame; targets: {targets}",
+            **self.described_views("a capture's first held-out frame"),
         }
 
     def packed_settings(self) -> dict[str, Scalar]:

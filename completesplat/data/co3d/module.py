@@ -61,13 +61,11 @@ class CO3DDataModule(ObjectDataModule):
         self.filters = Filters(min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences)
 
     def describe(self) -> dict[str, str | None]:
-        targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
         return {
             "data_set": f"co3d/{self.category}",
             "subset": self.subset,
             "split": self._split(),
-            "crop": "largest square around the principal point",
-            "protocol_views": f"reference: a sequence's first frame; targets: {targets}",
+            **self.described_views("a sequence's first frame"),
         }
 
     def _split(self) -> str:

@@ -9,15 +9,7 @@ from typing import NamedTuple
 
 from completesplat.data.co3d.annotations import CO3DFrame, CO3DVideo, Frames, read_frames, read_videos
 from completesplat.data.sequences import SPLITS, overlaps, shared_names, split_by_hash
-from completesplat.data.validation import (
-    BadAnnotation,
-    Refuse,
-    SharedSequences,
-    field,
-    path_below,
-    read_json,
-    refused_to,
-)
+from completesplat.data.validation import BadAnnotation, SharedSequences, field, path_below, read_json, refused_to
 from completesplat.errors import DataError, errors_at
 
 Listed = dict[str, set[tuple[str, int]]]
@@ -51,8 +43,8 @@ def set_list_path(category: Path, subset: str | None) -> Path | None:
     return folder / f"set_lists_{subset}.json"
 
 
-def read_set_list(path: Path, refuse: Refuse) -> Listed:
-    """Read the frames of each split; errors of single entries are passed to `refuse`.
+def read_set_list(path: Path, refused: list[DataError]) -> Listed:
+    """Read the frames of each split; errors of single entries are added to `refused`.
 
     Raises:
         DataError: the file is missing, unreadable, or has no list for a split.
@@ -64,7 +56,7 @@ def read_set_list(path: Path, refuse: Refuse) -> Listed:
             members = field(content, split, list)
         splits[split] = set()
         for member in members:
-            with refused_to(refuse), errors_at(path):
+            with refused_to(refused.append), errors_at(path):
                 if type(member) is not list or [type(part) for part in member[:2]] != [str, int]:
                     raise BadAnnotation(f"{split} has {str(member)[:80]}, [sequence name, number, path] is expected")
                 splits[split].add((member[0], member[1]))
@@ -174,7 +166,7 @@ def read_category(
     set_list, refused = set_list_path(folder, subset), list[DataError]()
     listed, lost = None, list[str]()
     if set_list is not None:
-        listed = read_set_list(set_list, refused.append)
+        listed = read_set_list(set_list, refused)
         if not allow_shared:
             listed, lost = remove_test_sequences(set_list, listed, seeded)
     wanted = None if listed is None else set().union(*listed.values())

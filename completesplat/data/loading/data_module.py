@@ -363,6 +363,12 @@ class ObjectDataModule(SceneDataModule):
     def training_facts(self) -> dict[str, float | list[float]]:
         return super().training_facts() | {"depth_before": self.framing.depth_before}
 
+    def described_views(self, reference: str) -> dict[str, str | None]:
+        """Return those facts of `describe` that all data of objects share, given what the reference of a test is."""
+        targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
+        views = f"reference: {reference}; targets: {targets}"
+        return {"crop": "largest square around the principal point", "protocol_views": views}
+
     def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
         """Draw a random reference and targets at random, or spread around it."""
         return (draw_spread_views if self.spread_targets else training_views)(frames, self.targets, rng)

@@ -6,6 +6,7 @@ marked minis the nose is light or dark, which determines the probability of each
 learns only the overall frequency of the colours.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -181,44 +182,41 @@ class ToyScene:
 def draw_object_scene(rng: np.random.Generator, frames: int) -> ToyScene:
     """Draw a random scene and `frames` cameras on one full turn; the patch faces away from the first camera."""
     blueprint = FAMILIES[rng.integers(len(FAMILIES))](rng)
-    yaw = rng.uniform(0, 2 * np.pi)
-    cameras = draw_orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
-    away = -np.array([np.sin(yaw), 0, np.cos(yaw)])
-    name = str(rng.choice(list(PATCH_COLORS)))
-    patch = Patch(away / np.linalg.norm(away), np.array(PATCH_COLORS[name]), np.array(blueprint.patch_heights), 0.4)
-    return _placed(rng, blueprint, yaw, cameras, _surroundings(rng), patch, name, EVEN)
+    return _placed(rng, frames, blueprint, _surroundings, tilt=0.0, edge=0.4)
 
 
 def draw_mini(rng: np.random.Generator, frames: int, marked: bool = False) -> ToyScene:
     """Draw a random mini and `frames` cameras on a full turn that starts in front of the nose."""
     mark = str(rng.choice(list(CHANCES))) if marked else "light"
-    chances = CHANCES[mark] if marked else EVEN
     half_sizes = rng.uniform(0.36, 0.55, size=3)
     body = plain_look(color(rng.uniform(), rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)))
     nose = ball((0, 0, half_sizes[2]), 0.13, plain_look(np.full(3, NOSES[mark])))
     blueprint = Blueprint("mini", (ball((0, 0, 0), tuple(half_sizes), body), nose), patch_heights=(-1, 1))
-    yaw = rng.uniform(0, 2 * np.pi)
-    cameras = draw_orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
-    name = str(rng.choice(list(PATCH_COLORS), p=chances))
     # The patch covers normals within 60 degrees of the direction opposite to the nose, tilted down by 0.2 radians.
-    level, down = np.cos(0.2), np.sin(0.2)
-    facing = -np.array([level * np.sin(yaw), down, level * np.cos(yaw)])
-    patch = Patch(facing, np.array(PATCH_COLORS[name]), np.array(blueprint.patch_heights), 0.5)
-    return _placed(rng, blueprint, yaw, cameras, _grey(rng), patch, name, chances)
+    return _placed(rng, frames, blueprint, _grey, tilt=0.2, edge=0.5, chances=CHANCES[mark] if marked else EVEN)
 
 
 def _placed(
     rng: np.random.Generator,
+    frames: int,
     blueprint: Blueprint,
-    yaw: float,
-    cameras: Array,
-    surroundings: tuple[Dome, Light],
-    patch: Patch,
-    patch_color: str,
-    chances: Array,
+    draw_surroundings: Callable[[np.random.Generator], tuple[Dome, Light]],
+    tilt: float,
+    edge: float,
+    chances: Array | None = None,
 ) -> ToyScene:
-    """Return the scene of an object that is turned by `yaw`, centred, and scaled to `OBJECT_HALF_SIZE`."""
-    dome, light = surroundings
+    """Return the scene of an object that is turned at random, centred, and scaled to `OBJECT_HALF_SIZE`.
+
+    The first of the cameras is in front of it. The patch faces backwards and down by `tilt` radians, and covers normals
+    whose cosine with that direction is above `edge`. `chances` are those of its colour; None: all are equal.
+    """
+    yaw = rng.uniform(0, 2 * np.pi)
+    cameras = draw_orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
+    name = str(rng.choice(list(PATCH_COLORS), p=chances))
+    level, down = np.cos(tilt), np.sin(tilt)
+    facing = -np.array([level * np.sin(yaw), down, level * np.cos(yaw)])
+    patch = Patch(facing, np.array(PATCH_COLORS[name]), np.array(blueprint.patch_heights), edge)
+    dome, light = draw_surroundings(rng)
     parts = tuple(part.moved(rotation_about("y", yaw), np.zeros(3)) for part in blueprint.parts)
     points, point_colors = _surface(rng, parts, dome, light, patch)
     center = points.mean(axis=0)
@@ -226,8 +224,8 @@ def _placed(
     points = scale * (points - center)
     return ToyScene(
         family=blueprint.family,
-        patch_color=patch_color,
-        chances=chances,
+        patch_color=name,
+        chances=EVEN if chances is None else chances,
         shapes=as_arrays([part.moved(np.eye(3), -center, scale) for part in parts]),
         dome=dome if dome.plain else dome._replace(ground=float(points[:, 1].min())),
         light=light,
