@@ -46,26 +46,29 @@ def quick_compositions() -> Iterator[None]:
 
     Hydra composes it a second time to learn `hydra.mode`, which no file of `conf/` sets. Both take half of the time.
     """
-    from hydra._internal.core_plugins.file_config_source import FileConfigSource
     from hydra._internal.hydra import Hydra
+    from hydra.core.plugins import Plugins
+    from hydra.plugins.config_source import ConfigSource
 
-    read, results, get_mode = FileConfigSource.load_config, {}, Hydra.get_mode
+    results, get_mode = {}, Hydra.get_mode
 
     def mode(self: Hydra, config_name: str | None, overrides: list[str]) -> object:
         return get_mode(self, config_name, overrides) if any("hydra" in text for text in overrides) else None
 
-    def load_config(source: FileConfigSource, config_path: str) -> object:
-        path = Path(source.path, source._normalize_file_name(config_path))
-        if not path.is_file():
-            return read(source, config_path)
-        state = path.stat()
-        key = source.provider, source.path, config_path, state.st_ino, state.st_size, state.st_mtime_ns
-        if key not in results:
-            results[key] = pickle.dumps(read(source, config_path))
-        return pickle.loads(results[key])
+    def read_once(read: Callable[[ConfigSource, str], object]) -> Callable[[ConfigSource, str], object]:
+        def load_config(source: ConfigSource, config_path: str) -> object:
+            path = Path(source.path, source._normalize_file_name(config_path))
+            state = path.stat() if path.is_file() else None  # None: Hydra's own files, which do not change
+            key = source.provider, source.path, config_path, state and (state.st_ino, state.st_size, state.st_mtime_ns)
+            if key not in results:
+                results[key] = pickle.dumps(read(source, config_path))
+            return pickle.loads(results[key])
+
+        return load_config
 
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(FileConfigSource, "load_config", load_config)
+        for kind in Plugins.instance().discover(ConfigSource):  # importing its module would make the class anew
+            monkeypatch.setattr(kind, "load_config", read_once(kind.load_config))
         monkeypatch.setattr(Hydra, "get_mode", mode)
         yield
 
