@@ -12,7 +12,7 @@ class CompleteSplatError(Exception):
 
 
 class DataError(CompleteSplatError):
-    """A missing or broken part of a data set, or one with another layout; its subclasses are in `data/validation.py`.
+    """A missing or broken part of a data set, or one with another layout; its subclasses are in `data/validation`.
 
     Args:
         reason: description of the problem, without the place.

@@ -95,6 +95,7 @@ class CompleteSplat(SceneModel):
         return self.standardised(self.autoreconstructor.posterior(images, views, depth_range)[0].sample())
 
     def set_latent_moments(self, mean: Sequence[float], std: Sequence[float]) -> None:
+        """Set the mean and standard deviation of each channel over the training set (`standardised`)."""
         self.latent_mean.copy_(torch.tensor(mean)[:, None, None])
         self.latent_std.copy_(torch.tensor(std)[:, None, None])
 
@@ -128,11 +129,12 @@ class CompleteSplat(SceneModel):
             seed: seed of all noise, or one for each image, whose samples then do not depend on the other images.
             visible: 0 where an image is hidden; hidden pixels have no influence.
             color_fits: rounds of fitting to the image (`fit_front`); 0 in the paper.
-            batch: the largest number of latents at a time, which changes only the rounding of float32; all by default,
-                or fewer if a GPU's memory does not suffice.
-            bfloat16: compute the denoiser in bfloat16; a call with a photo does, where the processor has it. Renders
-                then change about as little as by rounding to 8 bits.
-            on_step: called after each denoiser call of each batch with its number, the timestep, the estimated scenes.
+            batch: the largest number of latents at a time; it changes only rounding. By default all, or fewer if a
+                GPU's memory does not suffice; a small denoiser on a CPU draws `part_of` them unless `on_step` is given.
+            bfloat16: compute the denoiser in bfloat16; a call with a photo does, where the device computes in it.
+                Renders then change about as little as by rounding to 8 bits.
+            on_step: called after each denoiser call of each part with the call's number, the timestep, and the part's
+                estimated scenes.
 
         Raises:
             CompleteSplatError: a weight lies outside of [0, 1], skips meet hidden pixels, or the steps are impossible.
@@ -157,7 +159,7 @@ class CompleteSplat(SceneModel):
             # Sample first, then decode: if a GPU's memory does not suffice to decode a part, its latents are not lost.
             drawn, decoded = (sampling.part_of(len(noise)), sampling.PART) if threads else (None, None)
             parts = partial(sampling.in_parts, count=len(noise), threads=1 if on_step else threads)
-            latents = torch.cat(parts(draw, most=batch or drawn))
+            latents = torch.cat(parts(draw, most=batch or (None if on_step else drawn)))
             scenes = concatenate(parts(lambda part: decode(latents[part], part), most=batch or decoded))
         return self.fitted(scenes, images, cameras, visible, color_fits)
 
@@ -184,7 +186,12 @@ class CompleteSplat(SceneModel):
         return splatter_image.gaussians(cameras[indices], depth_range[indices])
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
-        """Use another sampler from now on, with the noise schedule and prediction type of training."""
+        """Use another sampler from now on, with the noise schedule and prediction type of training.
+
+        Raises:
+            CompleteSplatError: one of the two is for diffusion, the other for flow matching.
+            WeightsError: weights may not name one of its parts.
+        """
         config = stored_config(sampling.with_forward_process(sampler, self.architecture["sampler"]))
         check_architecture({**self.architecture, "sampler": config})
         self.sampler = build(config)

@@ -115,7 +115,7 @@ def toy_root(built_once: Folders) -> Path:
 
 
 class Pipeline(NamedTuple):
-    """Both stages, trained for two steps: run directories of the real thing, with no skill."""
+    """Run folders of both stages, trained for two steps, and their data."""
 
     toy: Path
     var: Path
@@ -167,7 +167,7 @@ def tiny_weights(built_once: Folders) -> Path:
 
 
 class Installed(NamedTuple):
-    """The wheel, and an environment with it in which what it requires is that of this one."""
+    """The wheel, and an environment that has it and borrows this environment's packages."""
 
     wheel: Path
     environment: Path
@@ -183,7 +183,7 @@ class Installed(NamedTuple):
 
 @pytest.fixture(scope="session")
 def installed(built_once: Folders) -> Installed:
-    """Nothing is downloaded but what builds the wheel (hatchling)."""
+    """Build the wheel and install it in a new environment; only hatchling is downloaded."""
 
     def install(folder: Path) -> None:
         building = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT]

@@ -13,8 +13,10 @@ from omegaconf import OmegaConf
 from support import SMALL, call, compose_config
 
 from completesplat.cli import VERBS
+from completesplat.errors import CompleteSplatError
 from completesplat.rasterizers import RenderingConstants
 from completesplat.settings.checks import check_image_size, check_parts_of_verb, check_values
+from completesplat.settings.composition import compose, has_bfloat16
 from completesplat.settings.options import conf_folder, options
 
 CONF = conf_folder()
@@ -280,6 +282,17 @@ def test_an_ablation_changes_its_own_settings_and_nothing_else(ablation):
         full["loss.terms.lpips"] = "there"
     changed = {key for key in full.keys() | ablated.keys() if full.get(key) != ablated.get(key)}
     assert changed == CHANGES[ablation]
+
+
+def test_a_device_has_bfloat16_if_it_computes_in_it_itself(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: including_emulation)
+    assert [has_bfloat16(device) for device in ("cuda", "mps")] == [False, False]
+
+
+@pytest.mark.parametrize(("verb", "override"), [("nosuch", "out=x"), ("fit", "~zz")])
+def test_what_cannot_be_composed_is_an_error_of_ours(verb, override):
+    with pytest.raises(CompleteSplatError, match=r"no verb 'nosuch'|zz"):
+        compose(verb, override)
 
 
 def test_what_is_taken_away_is_not_built():

@@ -292,6 +292,12 @@ def test_the_scenes_of_all_steps_are_shown(model, photo):
     assert not torch.allclose(shown[0][2].means, shown[3][2].means, atol=1e-3)
 
 
+def test_who_watches_the_steps_sees_all_samples_at_once(model, photo):
+    seen = []
+    model(photo, samples=5, steps=2, on_step=lambda step, _, part: seen.append((step, len(part.means))))
+    assert seen == [(0, 5), (1, 5)]
+
+
 def test_another_sampler_is_saved_with_the_weights(model, photo, tmp_path):
     changed = copy.deepcopy(model)
     changed.replace_sampler(OmegaConf.to_container(compose_config("fit", "sampler=unipc10", "sampler.steps=5").sampler))

@@ -80,4 +80,6 @@ def test_a_download_that_fails_or_has_another_hash_is_refused_and_not_kept(hub, 
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         assert "cannot be downloaded" in refusal(f"http://127.0.0.1:{unused.getsockname()[1]}/net.pth")
+    for malformed in ("http://127.0.0.1:1/a b.pth", "https://[x/a.pth"):
+        assert "cannot be downloaded" in refusal(malformed)
     assert list(hub.iterdir()) == []

@@ -8,16 +8,17 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import recompute
+from completesplat.errors import CompleteSplatError
 from completesplat.settings.schema import Few, Levels, Width, Widths
 from completesplat.splatter_image import Parameterization, SplatterImage, from_channels, initialize_head, zeroed
 
 
 class Reconstructor(nn.Module):
-    """Decoder from a latent to a Splatter Image; its last convolution has M * 15 channels instead of 3.
+    """Decoder from a latent to a Splatter Image, whose channels (M * 15 in the paper) its last convolution has.
 
     A skip passes the encoder's features of one level, before its downsampling, through a zero-initialised 1x1
     convolution and adds them to the input of the up block of the same resolution. The paper does not state the merge
-    operator; zero initialisation leaves pretrained weights intact at step 0. `gradient_checkpointing`: see `recompute`.
+    operator; zero initialisation leaves pretrained weights intact at step 0.
 
     Args:
         parameterization: layers and activations of the Splatter Image.
@@ -26,6 +27,12 @@ class Reconstructor(nn.Module):
         latent_channels: channels of the latent.
         norm_groups: groups of the group normalisation.
         skip_levels: encoder levels with a skip. The paper's model has level 0; its ablations none, or 0 and 1.
+
+    Attributes:
+        gradient_checkpointing: see `recompute`.
+
+    Raises:
+        CompleteSplatError: a level of `skip_levels` does not exist.
     """
 
     def __init__(
@@ -38,6 +45,9 @@ class Reconstructor(nn.Module):
         skip_levels: Levels = (0,),
     ) -> None:
         super().__init__()
+        if max(skip_levels, default=0) >= len(channels):
+            levels = f"there are levels 0 to {len(channels) - 1}"
+            raise CompleteSplatError(f"skip_levels={list(skip_levels)}: {levels}")
         self.parameterization = parameterization
         self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
         self.network = vae.Decoder(

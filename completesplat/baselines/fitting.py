@@ -19,7 +19,7 @@ from completesplat.geometry.harmonics import SH_C0
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
-from completesplat.settings.schema import Positive, Range, Share
+from completesplat.settings.schema import Positive, Range
 from completesplat.tensors import as_float64
 
 POSITION_RATE, POSITION_DECAY = 1.6e-4, 0.01
@@ -30,6 +30,7 @@ positions is relative to the scene's extent and decays exponentially to a hundre
 DEAD_OPACITY, MOST_COPIES = 0.005, 51  # as in the authors' code and gsplat
 NOISE, NOISE_STEEPNESS = 5e5, 100.0
 NEIGHBOURS = 3
+Translucent = Annotated[float, Range(0.01, 0.99)]  # 0 and 1 have no finite logits
 Count = Annotated[int, Range(NEIGHBOURS + 1, 10**7)]  # of Gaussians; 3DGS's largest scenes have six million
 
 
@@ -48,7 +49,7 @@ class FittingSettings:
     count: Count = 4000
     steps: Positive = 300
     views: Positive = 2
-    opacity: Share = 0.1
+    opacity: Translucent = 0.1
     position_rate: float = 30.0
     other_rates: float = 4.0
 

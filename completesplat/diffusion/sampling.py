@@ -2,6 +2,7 @@
 
 import copy
 import logging
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -24,13 +25,19 @@ logger = logging.getLogger(__name__)
 SMALL = 20_000_000
 """Parameters of a denoiser below which samples are drawn side by side (notebooks/experiments.md)."""
 PART, LARGEST_PART = 4, 10
-"""Samples of a small denoiser that one thread decodes at a time, and the most that it draws at a time."""
+"""Fewest and most samples of a small denoiser that a thread draws at a time; it decodes `PART` at a time."""
+
+_callers: list[int] = []  # for each call of `one_thread_each` that has not ended, torch's threads before the first
+_callers_lock = threading.Lock()
 
 OnStep = Callable[[int, int, Tensor], None]
 """Callback: (number of the denoiser call, timestep, estimate of the clean latent) -> None."""
 
 # Scheduler options that training fixes for all later samplers.
-FORWARD_PROCESS = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
+FORWARD_PROCESS = (
+    *("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type"),
+    "rescale_betas_zero_snr",
+)
 
 
 class Sampler:
@@ -146,21 +153,26 @@ def draw_noise(
 
 @contextmanager
 def one_thread_each(denoiser: nn.Module, device: torch.device) -> Iterator[int]:
-    """On a processor, let each operation of a small denoiser use one thread; yield how many threads torch had, else 0.
+    """On a CPU, limit each operation of a small denoiser to one thread; yield how many threads torch had, else 0.
 
-    A sample has hundreds of operations of a tenth of a millisecond. Threads that share each of them wait for each other
-    as often, and beside another busy process they wait for a core, too. Threads that draw parts of all samples do not,
-    and the parts (`part_of`) are the same however many threads draw them.
+    A sample has hundreds of operations of a tenth of a millisecond. Threads that share one wait for each other after
+    each, and longer beside another busy process. Threads that draw different samples do not. The parts (`part_of`) do
+    not depend on the number of threads, so neither do the samples. Calls may overlap: new threads have torch's number
+    of all, which is 1 meanwhile.
     """
-    before = torch.get_num_threads()
     if device.type != "cpu" or sum(parameter.numel() for parameter in denoiser.parameters()) > SMALL:
         yield 0
         return
+    with _callers_lock:
+        before = _callers[0] if _callers else torch.get_num_threads()
+        _callers.append(before)
     torch.set_num_threads(1)
     try:
         yield before
     finally:
         torch.set_num_threads(before)
+        with _callers_lock:
+            _callers.pop()
 
 
 def part_of(count: int) -> int:
@@ -183,7 +195,7 @@ def in_parts(draw: Callable[[slice], T], count: int, most: int | None = None, th
     start, size = 0, min(count if most is None else most, count)
     if threads > 1 and size < count:
         with ThreadPoolExecutor(threads) as pool:
-            slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
+            slices = [slice(first, min(first + size, count)) for first in range(0, count, size)]
             return list(pool.map(_with_modes_of_this_thread(draw), slices))
     while start < count:
         try:

@@ -76,7 +76,8 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
     """Return flags and settings as Hydra reads them, the flags first.
 
     `data import DIR` is short for `data_task=import folder=DIR`, `predict A B` for `image=[A,B]`, `view PATH` for
-    `path=PATH`, and `new KIND NAME` for `kind=KIND name=NAME`. An existing file's name is taken literally: `a,b.jpg`.
+    `path=PATH`, and `new KIND NAME` for `kind=KIND name=NAME`. An existing file's name is taken literally: `a,b.jpg`;
+    `~/` is the user's home.
 
     Raises:
         CompleteSplatError: a flag lacks its value, there are too many words, a setting is given as a word and by `=`, a
@@ -111,6 +112,8 @@ def _with_words(verb: str, arguments: Sequence[str]) -> list[str]:
 
 def _with_file(argument: str) -> str:
     key, equals, value = argument.partition("=")
+    if equals and value.startswith("~/"):  # shells leave it as it is behind `=`
+        return f"{key}={quoted(os.path.expanduser(value))}"
     if not equals or not os.path.exists(value):
         return argument
     try:

@@ -53,11 +53,16 @@ def compose(verb: str, *overrides: str) -> DictConfig:
     """Return the config of a verb, as `completesplat VERB OVERRIDES...` composes it: `compose("fit", "trainer=ddp")`.
 
     Raises:
-        CompleteSplatError: an override cannot be read, or names no option.
+        CompleteSplatError: there is no such verb, or an override cannot be read or names no option.
     """
+    if not (conf_folder() / f"{verb}.yaml").is_file():
+        raise CompleteSplatError(f"no verb {verb!r}; `completesplat --help` shows those that there are")
     arguments = for_hydra(verb, overrides)
-    with nearest_names(verb, arguments):
-        config = _composed(verb, arguments)
+    try:
+        with nearest_names(verb, arguments):
+            config = _composed(verb, arguments)
+    except HydraException as error:
+        raise CompleteSplatError(" ".join(str(error).split())) from error
     OmegaConf.set_struct(config, False)
     return config
 
@@ -124,7 +129,8 @@ def _misspelt(error: Exception, verb: str, arguments: Sequence[str]) -> str | No
 
 def _nearest(verb: str, key: str, names: Sequence[str]) -> str:
     """Return an ending for a message about an unknown key: settings near its last name, or found by words."""
-    top, last, lasts = key.partition(".")[0], key.rpartition(".")[2], {name: name.rpartition(".")[2] for name in names}
+    top, last = key.partition(".")[0], key.rpartition(".")[2]
+    lasts = {name: name.rpartition(".")[2] for name in names}
     known = set(lasts.values())
     close = [last] if last in known else get_close_matches(last, known, cutoff=LEAST_LIKE)
     likely = [name for near in close for name in names if lasts[name] == near]
@@ -169,7 +175,7 @@ def job_name(*keys: str, _root_: DictConfig) -> str:
     values = dict(override.lstrip("+~").split("=", 1) for override in _root_.hydra.overrides.task if "=" in override)
     shared = shard_folder(_root_)
     full = "+".join(f"{key}-{values[key]}" for key in keys if key in values and not (shared and key == "shard"))
-    name = re.sub(r"[^\w.+-]+", "_", full) or "."
+    name = re.sub(r"[^\w.+-]+", "_", full, flags=re.ASCII) or "."  # file systems limit bytes, not characters
     if name in (full, ".") and len(name) <= LONGEST_NAME:
         return name
     return f"{name[:LONGEST_NAME]}-{hashlib.sha256(full.encode()).hexdigest()[:8]}"
@@ -184,8 +190,9 @@ def has_bfloat16(device: str) -> bool:
     """Return whether a device of this type ("cuda", "cpu", ...) computes in bfloat16 itself."""
     import torch
 
-    supported = {"cuda": torch.cuda.is_bf16_supported, "cpu": torch.cpu._is_avx512_bf16_supported}
-    return device in supported and bool(supported[device]())
+    if device == "cuda":
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+    return device == "cpu" and bool(torch.cpu._is_avx512_bf16_supported())
 
 
 def best_precision() -> str:

@@ -43,7 +43,7 @@ def help_page(verb: str, arguments: Sequence[str]) -> str:
     Raises:
         CompleteSplatError: no setting has the words in its name or comment.
     """
-    words = [argument for argument in arguments if argument not in FLAGS and not argument.startswith("-")]
+    words = [argument for argument in arguments if not argument.startswith("-")]
     task = None
     if verb in TASKS:
         default = next(choice.option for choice in read_conf_file(verb).choices if choice.group == f"{verb}_task")
@@ -115,7 +115,9 @@ def _wrapped(text: str) -> str:
 
 
 def _first_sentence(text: str) -> str:
-    return re.split(r"(?<=[.:])\s", text.replace("\n", " ").partition(": ")[2] or text)[0].rstrip(":")
+    """Return the first sentence of a text, without the command's name before it."""
+    sentence = text.replace("\n", " ").partition(": ")[2] or text
+    return re.split(r"(?<=[.:])\s", sentence)[0].rstrip(":")
 
 
 def _hints(verb: str, task: str | None) -> Mapping[str, object]:

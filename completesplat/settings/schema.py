@@ -105,7 +105,7 @@ def check_settings(function: object, settings: Mapping[str, object]) -> None:
 def check_value(key: str, annotation: object, value: object) -> None:
     """Raise CompleteSplatError, with the values that are allowed, if a setting does not fit an annotation."""
     for place, part, reason in violations(annotation, value):
-        example = f", such as {key}{place}=[{part}]" if reason == "must be a list" else ""
+        example = f", such as {key}{place}=[{part}]" if reason == "must be a list" and part is not None else ""
         raise CompleteSplatError(f"{key}{place}={'null' if part is None else part}: {reason}{example}")
 
 
@@ -186,9 +186,11 @@ def _in_choice(choices: Sequence[object], value: object) -> list[Violation]:
 def _in_union(members: Sequence[object], value: object) -> list[Violation]:
     if all(get_origin(member) is Literal or member is NoneType for member in members):
         return _in_choice([choice for member in members for choice in get_args(member) or (None,)], value)
-    # A setting is never a `Tensor`, so `float | Tensor` means float. Without numbers, other classes accept all.
+    # Of `float | Tensor` only float counts, because no setting is a tensor. Classes without numbers accept everything.
     if {int, float} & set(members) and isinstance(value, str | int | float | Sequence):
         members = [member for member in members if not isinstance(member, type) or member in KINDS]
+    if isinstance(value, Sequence) and not isinstance(value, str):  # for the reason that its entries do not fit
+        members = [*(member for member in members if get_origin(member) is Sequence), *members]
     attempts = [violations(member, value) for member in members]
     return [] if [] in attempts else attempts[0]
 

@@ -19,6 +19,7 @@ from completesplat.baselines.fitting import (
     POSITION_DECAY,
     Count,
     RawGaussians,
+    Translucent,
     adam,
     gaussians_at_points,
     initial_gaussians,
@@ -54,14 +55,14 @@ class CaptureSettings:
         refine_every: steps between relocations of dead Gaussians, which add the share `growth` of new ones.
         opacity_weight, scale_weight: weights of mean opacity and mean scale in the loss.
         position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
-        opacity_rate: factor on that of the opacities; with 4, captures of flat floors and walls collapse.
+        opacity_rate: factor on the opacities' learning rate; with 4, captures of flat floors and walls collapse.
     """
 
     initial: Count = 20_000
     most: Count = 50_000
-    opacity: Share = 0.1
+    opacity: Translucent = 0.1
     refine_every: Positive = 50
-    growth: Annotated[float, Range(0, 1)] = 0.05
+    growth: Share = 0.05
     opacity_weight: Annotated[float, Range(0)] = 0.01
     scale_weight: Annotated[float, Range(0)] = 0.01
     position_rate: Annotated[float, Range(1e-3)] = 10.0
@@ -78,7 +79,8 @@ class CaptureFit(Stage):
     Args:
         scene_folder: folder of the result in the capture's own world and units, by `write_fitted_scene` and
             `write_scene`; None: nothing is written.
-        formats, videos, frames: as in `OutputFiles`, without `ply`. A format that cannot be written is left out.
+        formats, videos, frames: as in `OutputFiles`, without `ply`. A format that cannot be written is left out; `mesh`
+            without its package is refused.
     """
 
     first_novel = 0  # all held-out photos count as one

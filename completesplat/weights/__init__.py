@@ -9,6 +9,7 @@ import logging
 import os
 import re
 from collections.abc import Sequence
+from http.client import HTTPException
 from pathlib import Path
 from urllib.parse import urlparse
 
@@ -140,13 +141,14 @@ def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: st
     expected = None if sha256 is None else sha256.lower()
     path = Path(weights).expanduser()
     if weights.startswith(("http://", "https://")):
-        path = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(weights).path).name
+        folder = Path(torch.hub.get_dir()) / "checkpoints"
         try:
+            path = folder / Path(urlparse(weights).path).name
             if not path.is_file():
-                path.parent.mkdir(parents=True, exist_ok=True)
+                folder.mkdir(parents=True, exist_ok=True)
                 torch.hub.download_url_to_file(weights, str(path), hash_prefix=expected)
-        except (OSError, RuntimeError) as error:
-            reason = f"cannot be downloaded to {path.parent} ({error})"
+        except (OSError, RuntimeError, ValueError, HTTPException) as error:
+            reason = f"cannot be downloaded to {folder} ({error})"
             raise WeightsError(f"{weights} {reason}; elsewhere, {advice}") from error
     if not path.is_file():
         raise WeightsError(f"{path}: no such file; {advice}")

@@ -5,6 +5,7 @@ from pretrained_vaes import stable_diffusion_vae
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.reconstructor import Reconstructor
+from completesplat.errors import CompleteSplatError
 from completesplat.splatter_image import Parameterization
 
 TINY = {"channels": (8, 16, 24, 32), "layers_per_block": 1, "norm_groups": 4}
@@ -56,6 +57,11 @@ def test_skips_start_at_zero_and_their_weight_acts_per_sample(images, levels):
         torch.testing.assert_close(mixed, torch.stack([none[0], full[1]]))
         assert torch.equal(full, none) == (not any(p.any() for p in model.reconstructor.skips.parameters()))
     assert (mixed[1] - none[1]).abs().max() > 1e-3
+
+
+def test_a_skip_of_a_level_that_is_not_there_is_refused():
+    with pytest.raises(CompleteSplatError, match=r"skip_levels=\[2\]: there are levels 0 to 1"):
+        Reconstructor(Parameterization(), channels=(8, 8), norm_groups=4, skip_levels=(2,))
 
 
 @torch.no_grad()

@@ -39,6 +39,7 @@ def weights(job: Path) -> dict[str, torch.Tensor]:
 def test_a_job_is_named_by_what_is_swept_plainly_and_like_no_other():
     root = root_with("experiment=toy_var", "ablation=no_skips", "seed=1", "data.root=/a/b")
     assert job_name("ablation", "seed", _root_=root) == "ablation-no_skips+seed-1"
+    assert len(job_name("name", _root_=root_with(f"name={'写' * 105}")).encode()) <= LONGEST_NAME
     assert job_name("optimizer.lr", _root_=root_with("+optimizer.lr=1e-3")) == "optimizer.lr-1e-3"
     shards = OmegaConf.merge(root_with("shard=1", "shards=2", "seed=3"), {"shard": 1, "shards": 2})
     assert job_name("shard", "seed", _root_=shards) + shard_folder(shards) == "seed-3/shard-1"

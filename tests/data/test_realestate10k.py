@@ -1,5 +1,6 @@
 import json
 import logging
+import shutil
 import weakref
 from pathlib import Path
 
@@ -175,6 +176,14 @@ def test_missing_clips_are_counted_and_left_out(form, tmp_path, caplog):
         f"{split}: {count}; 2 left out: frames are missing"
         for split, count in (("train", "6 sequences"), ("val", "1 sequence"))
     ]
+
+
+def test_a_folder_of_frames_that_is_gone_is_an_error_of_its_clip(tmp_path):
+    write_tree(tmp_path, "text", TRAIN[:1], TEST)
+    source = clips.TextClips(tmp_path / "train")
+    shutil.rmtree(tmp_path / "train/train0")
+    with pytest.raises(UnreadableFile, match=r"train0.*cannot be listed"):
+        source.clip("train0")
 
 
 def test_what_is_not_there_or_makes_no_sense_is_refused(tmp_path):

@@ -1,11 +1,12 @@
 """Parts of a batch, and what happens when a GPU's memory is too small for them."""
 
+from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 
 import pytest
 import torch
 
-from completesplat.diffusion.sampling import LARGEST_PART, PART, in_parts, part_of
+from completesplat.diffusion.sampling import LARGEST_PART, PART, in_parts, one_thread_each, part_of
 
 
 @pytest.mark.parametrize("threads", [0, 2])
@@ -20,6 +21,21 @@ def test_all_are_drawn_in_order(most, sizes, threads):
 def test_two_threads_have_work_before_parts_become_larger_and_many_samples_give_work_to_more():
     sizes = {1: PART, PART: PART, 2 * PART: PART, 12: 6, 20: LARGEST_PART, 100: LARGEST_PART}
     assert {count: part_of(count) for count in sizes} == sizes
+
+
+def test_calls_that_overlap_leave_torchs_number_of_threads_as_it_was():
+    before, denoiser = torch.get_num_threads(), torch.nn.Linear(1, 1)
+    torch.set_num_threads(3)
+    try:
+        with one_thread_each(denoiser, torch.device("cpu")), ThreadPoolExecutor(1) as pool:
+            inner = one_thread_each(denoiser, torch.device("cpu"))
+            assert pool.submit(inner.__enter__).result() == 3
+        pool_of_new_threads = ThreadPoolExecutor(1)
+        pool_of_new_threads.submit(inner.__exit__, None, None, None).result()
+        with ThreadPoolExecutor(1) as later:
+            assert later.submit(torch.get_num_threads).result() == 3
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_parts_that_do_not_fit_are_halved_until_they_do(caplog):

@@ -94,6 +94,12 @@ def test_unreadable_arguments_are_refused_with_an_example(verb, typed, message):
     assert str(caught.value).startswith(message)
 
 
+def test_the_users_home_is_found_behind_an_equals_sign(monkeypatch):
+    monkeypatch.setenv("HOME", "/homes/ann, bob")
+    given = values("fit", "data.root=~/toys", "out=~/a,b")
+    assert (given["data.root"], given["out"]) == ("/homes/ann, bob/toys", "/homes/ann, bob/a,b")
+
+
 def test_no_argument_behind_two_dashes_is_a_flag():
     given = ["-m", "a.png", "--", "-b.png", "c.png", "--", "-m"]
     assert behind_dashes(given) == ["-m", "a.png", "./-b.png", "c.png", "./--", "./-m"]

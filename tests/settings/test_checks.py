@@ -52,6 +52,8 @@ ODD = [
     ("test", "evaluation.precision=bf16-true", "evaluation.precision=bf16-true: choose one of 32-true, bf16-mixed"),
     ("fit", "model=capture model.fitting.most=99999999999999", "model.fitting.most=99999999999999: must lie between 4"),
     ("fit", "model=per_scene model.fitting.count=99999999999", "model.fitting.count=99999999999: must lie between"),
+    ("fit", "model=capture model.fitting.opacity=1", "model.fitting.opacity=1: must lie between 0.01 and 0.99"),
+    ("fit", "model=per_scene model.fitting.opacity=0", "model.fitting.opacity=0: must lie between 0.01 and 0.99"),
     ("fit", "model=capture model.fitting=null", "model.fitting=null: must not be null; leave it out"),
     ("fit", "model=per_scene model.fitting=null", "model.fitting=null: must not be null; leave it out"),
     ("fit", "model.optimizer=null", "model.optimizer=null: must not be null; leave it out"),

@@ -23,6 +23,7 @@ def task(
     by_name: Mapping[str, Sequence[Positive]],
     part: Part | Literal[False],
     anything: Any,
+    seed: Natural | Sequence[Natural] = 0,
 ) -> None: ...
 
 
@@ -47,13 +48,20 @@ GOOD: dict[str, Any] = {
         ("words", [], "must not be empty"),
         ("words", ["x", "z"], "choose one of x, y"),
         ("workers", -1, "must be at least 0"),
+        ("words", None, "must be a list"),
         ("by_name", [1], "must be a mapping"),
+        ("seed", "x", "must be a whole number"),
     ],
 )
 def test_what_does_not_fit_is_named_with_what_it_may_be(setting, value, message):
     with pytest.raises(CompleteSplatError) as caught:
         check_settings(task, GOOD | {setting: value})
     assert str(caught.value) == f"{setting}={'null' if value is None else value}: {message}"
+
+
+def test_a_list_with_a_wrong_entry_is_told_of_the_entry():
+    with pytest.raises(CompleteSplatError, match=r"seed=\[1, -1\]: must be at least 0"):
+        check_settings(task, GOOD | {"seed": [1, -1]})
 
 
 def test_what_fits_is_accepted_and_what_lies_deeper_is_named_with_its_place():

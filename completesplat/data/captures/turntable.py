@@ -34,7 +34,7 @@ from completesplat.data.validation import (
     refused_to,
 )
 from completesplat.errors import DataError, ImageError, errors_at
-from completesplat.files import writing
+from completesplat.files import counted, writing
 from completesplat.geometry.cameras import Cameras, invert_rigid, look_at, mirror
 from completesplat.settings.schema import Range
 
@@ -103,6 +103,8 @@ def _write_turns(folders: Mapping[str, Path], out: Path, settings: TurntableSett
     for name, photos in track(folders.items(), "turns"):
         with refused_to(refused.append), errors_at(sequence=name):
             known = None if count is None else field(counts, name, int)
+            if known is not None and known < FEWEST_PHOTOS:
+                raise BadAnnotation(f"photos_of_a_turn: {known}; a turn needs at least {FEWEST_PHOTOS}")
             turns[name] = _write_turn(photos, known, out / name, settings)
     if not turns:
         raise refused[0]
@@ -145,8 +147,8 @@ def _write_turn(folder: Path, count: int | None, out: Path, settings: TurntableS
         DataError: the turn does not close.
     """
     paths = files.image_files(folder, files.photo_formats())
-    if (fewest := min(len(paths), count or len(paths))) < FEWEST_PHOTOS:
-        raise TooFewFrames(f"{fewest} photo{'s'[: fewest != 1]}; a turn needs at least {FEWEST_PHOTOS}")
+    if len(paths) < FEWEST_PHOTOS:
+        raise TooFewFrames(f"{counted(len(paths), 'photo')}; a turn needs at least {FEWEST_PHOTOS}")
     places = dict(enumerate(paths)) if count is None else _numbered(paths, count)
     positions = sorted(places)
     photos = [_read_photo(places[position], settings["background"]) for position in positions]
@@ -207,7 +209,8 @@ def _read_photo(path: Path, background: str | None) -> Photo:
         mask = image.getchannel("A")
         share = np.mean(np.asarray(mask) > 127)
         if not 0 < share <= FULL:
-            raise ImageError(f"background={background}: its mask {'fills the photo' if share else 'is empty'}")
+            fault = "fills the photo; background=white or remove finds the object" if share else "is empty"
+            raise ImageError(f"background={'null' if background is None else background}: its mask {fault}")
         return files.over_grey(image, 1.0), mask
 
 

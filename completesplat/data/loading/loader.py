@@ -147,7 +147,7 @@ class SceneLoader:
         return self._order.epoch if self._order is not None else 0
 
     def state_dict(self) -> dict[str, int]:
-        """Return the current epoch and the number of its batches that were yielded."""
+        """Return the current epoch and the number of its batches that were read."""
         return {"epoch": self._epoch, "batches": self._batches}
 
     def load_state_dict(self, state: dict[str, int]) -> None:

@@ -170,8 +170,10 @@ def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
 
 def _images_of(folder: Path) -> dict[int, Path]:
     """Return image files by timestamp; JPEG is preferred to PNG."""
-    with os.scandir(folder) as entries:
-        paths = [Path(entry.path) for entry in entries]
+    try:
+        paths = list(folder.iterdir())
+    except OSError as error:
+        raise UnreadableFile(f"cannot be listed ({error.strerror})", str(folder)) from None
     suffixes = {path: path.suffix.lower() for path in paths}
     ordered = sorted((path for path in paths if suffixes[path] in SUFFIXES), key=lambda path: suffixes[path] != ".png")
     return {int(path.stem): path for path in ordered if path.stem.isdecimal()}
