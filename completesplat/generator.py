@@ -133,8 +133,7 @@ class CompleteSplat(SceneModel):
                 GPU's memory does not suffice; a small denoiser on a CPU draws `part_of` them unless `on_step` is given.
             bfloat16: compute the denoiser in bfloat16; a call with a photo does, where the device computes in it.
                 Renders then change about as little as by rounding to 8 bits.
-            on_step: called after each denoiser call of each part with the call's number, the timestep, and the part's
-                estimated scenes.
+            on_step: called after each denoiser call of each part with its number, the timestep, the estimated scenes.
 
         Raises:
             CompleteSplatError: a weight lies outside of [0, 1], skips meet hidden pixels, or the steps are impossible.

@@ -88,7 +88,7 @@ class Parameterization:
         smallest_scale, largest_scale: the exponential of the raw scale is clamped to this range, in scene units
             (the paper states none). The clamp has no gradient outside and the full gradient inside.
         harmonics: largest degree of the spherical harmonics of colours. 0 is the paper's: one colour for all
-            directions. Light that stands still while an object turns needs 1 or 2.
+            directions. Light that stands still while an object turns needs 1 to 3.
         within_range: give opacity 0 to Gaussians that their offset moves nearer than the depth range, because they
             can hide the object like a fog from other sides. The paper keeps them.
     """

@@ -46,8 +46,7 @@ class Reconstructor(nn.Module):
     ) -> None:
         super().__init__()
         if max(skip_levels, default=0) >= len(channels):
-            levels = f"there are levels 0 to {len(channels) - 1}"
-            raise CompleteSplatError(f"skip_levels={list(skip_levels)}: {levels}")
+            raise CompleteSplatError(f"skip_levels={list(skip_levels)}: there are levels 0 to {len(channels) - 1}")
         self.parameterization = parameterization
         self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
         self.network = vae.Decoder(

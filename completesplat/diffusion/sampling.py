@@ -156,9 +156,8 @@ def one_thread_each(denoiser: nn.Module, device: torch.device) -> Iterator[int]:
     """On a CPU, limit each operation of a small denoiser to one thread; yield how many threads torch had, else 0.
 
     A sample has hundreds of operations of a tenth of a millisecond. Threads that share one wait for each other after
-    each, and longer beside another busy process. Threads that draw different samples do not. The parts (`part_of`) do
-    not depend on the number of threads, so neither do the samples. Calls may overlap: new threads have torch's number
-    of all, which is 1 meanwhile.
+    each, and longer beside another busy process. Threads that draw different samples do not. Neither parts (`part_of`)
+    nor samples depend on the number of threads. Calls may overlap.
     """
     if device.type != "cpu" or sum(parameter.numel() for parameter in denoiser.parameters()) > SMALL:
         yield 0

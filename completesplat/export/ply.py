@@ -70,7 +70,7 @@ def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian property"]:
 def read_ply(path: str | Path) -> Gaussians:
     """Read a 3DGS `.ply`, binary or ASCII, of this project or another.
 
-    Colours' harmonics above degree 2 are left out, with a warning, and other properties are ignored. Colours below 0
+    Colours' harmonics above degree 3 are left out, with a warning, and other properties are ignored. Colours below 0
     become 0, as in other 3DGS renderers.
 
     Raises:

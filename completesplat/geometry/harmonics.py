@@ -1,4 +1,4 @@
-"""Real spherical harmonics of degree 1 and 2, in the order and with the signs of 3D Gaussian Splatting.
+"""Real spherical harmonics of degree 1 to 3, in the order and with the signs of 3D Gaussian Splatting.
 
 Along the unit vector d, from the camera to the Gaussian, the colour 0.5 + C0 c_0 + sum_k Y_k(d) c_k is seen
 (Kerbl et al. 2023, `utils/sh_utils.py`).
@@ -15,7 +15,8 @@ SH_C0 = 0.28209479177387814
 """The zeroth spherical harmonic, 1 / (2 sqrt(pi)): colours are predicted as its coefficient."""
 SH_C1 = 0.4886025119029199
 SH_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-LARGEST_DEGREE = 2
+SH_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+LARGEST_DEGREE = 3
 Directions = Float[Tensor, "*batch 3"]
 
 
@@ -37,6 +38,12 @@ def harmonics(directions: Directions, degree: int) -> Float[Tensor, "*batch coef
         mixed, even, difference = SH_C2
         terms += [mixed * x * y, -mixed * y * z, even * (2 * z * z - x * x - y * y)]
         terms += [-mixed * x * z, difference * (x * x - y * y)]
+    if degree > 2:
+        outer, mixed, inner, zonal, difference = SH_C3
+        xx, yy, zz = x * x, y * y, z * z
+        terms += [-outer * y * (3 * xx - yy), mixed * x * y * z, -inner * y * (4 * zz - xx - yy)]
+        terms += [zonal * z * (2 * zz - 3 * xx - 3 * yy), -inner * x * (4 * zz - xx - yy)]
+        terms += [difference * z * (xx - yy), -outer * x * (xx - 3 * yy)]
     return torch.stack(terms[: coefficients(degree)], dim=-1)
 
 

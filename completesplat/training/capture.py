@@ -79,8 +79,7 @@ class CaptureFit(Stage):
     Args:
         scene_folder: folder of the result in the capture's own world and units, by `write_fitted_scene` and
             `write_scene`; None: nothing is written.
-        formats, videos, frames: as in `OutputFiles`, without `ply`. A format that cannot be written is left out; `mesh`
-            without its package is refused.
+        formats, videos, frames: as in `OutputFiles`, without `ply`. A format whose writing fails is left out.
     """
 
     first_novel = 0  # all held-out photos count as one

@@ -159,7 +159,7 @@ def test_a_color_seen_along_a_direction_is_that_of_the_formula_of_3d_gaussian_sp
         np.testing.assert_allclose(seen, np.maximum(color, 0), atol=1e-5)
 
 
-@pytest.mark.parametrize(("properties", "kept", "warning"), [(45, 8, "above degree 2"), (10, 0, "no degree")])
+@pytest.mark.parametrize(("properties", "kept", "warning"), [(72, 15, "above degree 3"), (10, 0, "no degree")])
 def test_harmonics_that_are_not_known_are_left_out_with_a_warning(properties, kept, warning, tmp_path, caplog):
     path = tmp_path / "a.ply"
     write_ply(path, random_gaussians(4))
@@ -171,5 +171,5 @@ def test_harmonics_that_are_not_known_are_left_out_with_a_warning(properties, ke
     assert warning in caplog.text
     assert isinstance(gaussians, DirectionalGaussians) == (kept > 0)
     if kept:
-        expected = torch.from_numpy(rest.reshape(4, 3, 15)[:, :, :kept].copy()).mT
+        expected = torch.from_numpy(rest.reshape(4, 3, 24)[:, :, :kept].copy()).mT
         assert torch.equal(gaussians.harmonics, expected)

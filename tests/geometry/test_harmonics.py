@@ -16,16 +16,16 @@ def directions(count: int, seed: int = 0) -> torch.Tensor:
 
 
 def test_harmonics_are_orthonormal_on_the_sphere() -> None:
-    """Gauss-Legendre points in z and even steps in azimuth integrate polynomials of degree 4 exactly."""
+    """Gauss-Legendre points in z and even steps in azimuth integrate polynomials of degree 6 exactly."""
     heights, weights = (torch.from_numpy(values) for values in leggauss(6))
     azimuth = torch.arange(12, dtype=torch.float64) * 2 * math.pi / 12
     z, angle = torch.meshgrid(heights, azimuth, indexing="ij")
     ring = (1 - z * z).sqrt()
     points = torch.stack([ring * angle.cos(), ring * angle.sin(), z], -1)
-    values = torch.cat([torch.full_like(z, SH_C0)[..., None], harmonics(points, 2)], -1)
+    values = torch.cat([torch.full_like(z, SH_C0)[..., None], harmonics(points, 3)], -1)
     area = weights[:, None] * (2 * math.pi / 12) * torch.ones_like(z)
     products = torch.einsum("ij,ija,ijb->ab", area, values, values)
-    torch.testing.assert_close(products, torch.eye(9, dtype=torch.float64))
+    torch.testing.assert_close(products, torch.eye(16, dtype=torch.float64))
 
 
 def test_signs_and_order_are_those_of_3d_gaussian_splatting() -> None:
@@ -38,9 +38,12 @@ def test_signs_and_order_are_those_of_3d_gaussian_splatting() -> None:
     second = {3: (x + y, mixed), 4: (y + z, -mixed), 5: (z, along), 6: (x + z, -mixed), 7: (x, mixed)}
     for index, (toward, expected) in second.items():
         assert harmonics(toward / toward.norm(), 2)[index].item() == pytest.approx(expected)
+    signs = {8: y + x, 9: x + y + z, 10: 2 * z + y, 11: z, 12: 2 * z + x, 13: x + z, 14: x}
+    negative = [harmonics(toward / toward.norm(), 3)[index].item() < 0 for index, toward in signs.items()]
+    assert negative == [True, False, True, False, True, False, True]
 
 
-@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("degree", [1, 2, 3])
 def test_rotated_coefficients_give_the_same_colours_along_rotated_directions(degree: int) -> None:
     generator = torch.Generator().manual_seed(1)
     values = torch.randn(2, 5, coefficients(degree), 3, generator=generator, dtype=torch.float64)
