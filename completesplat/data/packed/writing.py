@@ -188,14 +188,23 @@ def prepare(
     bad = [error for source in writer.sources.values() for error in source.refused]
     if bad and on_bad == "raise":
         raise bad[0]
-    with Progress(disable=not progress or not missing) as bar:
-        task = bar.add_task("preparing sequences", total=sum(len(plan.names) for plan in missing))
-        for plan, record in zip(missing, map_in_processes(writer.write, missing, workers), strict=True):
-            bar.advance(task, len(record.names))
-            records[plan] = record
+    if missing:
+        records |= _write_shards(writer, missing, workers, progress)
     splits = {split: _split(split, source, records.values()) for split, source in writer.sources.items()}
     _finish(PackedManifest(codec, dict(settings), splits), out, max_bad_fraction)
     return out
+
+
+def _write_shards(
+    writer: ShardWriter, plans: list[ShardPlan], workers: int | None, progress: bool
+) -> dict[ShardPlan, ShardRecord]:
+    records = {}
+    with Progress(disable=not progress) as bar:
+        task = bar.add_task("preparing sequences", total=sum(len(plan.names) for plan in plans))
+        for plan, record in zip(plans, map_in_processes(writer.write, plans, workers), strict=True):
+            bar.advance(task, len(record.names))
+            records[plan] = record
+    return records
 
 
 def _plan(writer: ShardWriter, settings: Mapping[str, Scalar], plans: list[ShardPlan]) -> dict[str, dict[str, Scalar]]:
