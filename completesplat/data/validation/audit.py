@@ -83,7 +83,14 @@ def check(
         for batch in map_in_processes(partial(_read_batch, sources), batches, workers):
             sequences += batch
             bar.advance(task, len(batch))
-    refused += [error for sequence in sequences for error in sequence.refused]
+    return _report(sources, sequences, refused, splits_share_sequences)
+
+
+def _report(
+    sources: Sources, sequences: Sequence["_Sequence"], refused: list[DataError], splits_share_sequences: bool
+) -> AuditReport:
+    """Return what was found in sequences, which were read, and in sources, which refused some before."""
+    refused = refused + [error for sequence in sequences for error in sequence.refused]
     refused += _too_short(sequences, {error.sequence for error in refused})
     unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in refused}
     usable = {split: [sequence.usable_in(split) for sequence in sequences] for split in sources}
