@@ -5,8 +5,10 @@
 PYTHON ?= python3
 BIN := .venv/bin
 # The rasterizer's kernels are compiled in the background, while the target that needed .venv begins.
-# LOCKED=1 installs the versions of requirements.lock, whose files must have the hashes in it.
+# LOCKED=1 installs the versions of requirements.lock, whose files must have the hashes in it. torch is the version of
+# most figures in the documents, of which some machines have the CPU build at hand.
 READY := .venv/installed$(if $(LOCKED),-locked)
+TORCH := torch<2.14
 DEMO := outputs/demo
 DEMO_SCENES := 80
 DEMO_LAST := 00079
@@ -20,7 +22,7 @@ $(READY): pyproject.toml $(if $(LOCKED),requirements.lock)
 	@echo "Installing into .venv: a few minutes, once"
 	@$(PYTHON) -m venv .venv
 	$(if $(LOCKED),@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements.lock)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]" "$(TORCH)"
 	@$(BIN)/python -c "from completesplat.rasterizers.selection import auto; auto()" > /dev/null 2>&1 &
 	@touch $(READY)
 

@@ -110,10 +110,10 @@ class SceneModel(nn.Module):
             return scenes
         background, parts = 0.5 if self.background is None else self.background, []
         for i in range(len(scenes.means)):  # one after the other, for the memory
-            own = slice(j := i * len(images) // len(scenes.means), j + 1)
-            shown = None if visible is None else visible[own]
-            image = cameras[own], images[own]
-            parts.append(fit_front(scenes[i : i + 1], *image, _rasterizer(), color_fits, background, shown))
+            photo = slice(j := i * len(images) // len(scenes.means), j + 1)
+            mask = None if visible is None else visible[photo]
+            image = cameras[photo], images[photo]
+            parts.append(fit_front(scenes[i : i + 1], *image, _rasterizer(), color_fits, background, mask))
         return concatenate(parts)
 
     @property
@@ -168,9 +168,9 @@ class SceneModel(nn.Module):
         before = (self.architecture.get("training") or {}).get("depth_before")
         if before is None:
             return self.depth_range
-        trained, own = (math.tan(math.radians(x) / 2) for x in (self.fov_degrees.item(), photograph.fov_degrees))
+        trained, assumed = (math.tan(math.radians(x) / 2) for x in (self.fov_degrees.item(), photograph.fov_degrees))
         center: Tensor = self.depth_range[0] + before
-        return (self.depth_range + center * (trained / own - 1)).clamp(min=SMALLEST_NEAR)
+        return (self.depth_range + center * (trained / assumed - 1)).clamp(min=SMALLEST_NEAR)
 
     @torch.no_grad()
     def reconstruct(self, views: Views) -> Gaussians:

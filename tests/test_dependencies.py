@@ -108,8 +108,9 @@ OF_ANOTHER_BUILD = ("nvidia-", "cuda-")
 def licences(name: str) -> set[str]:
     """Return the licences of an installed distribution, by their SPDX names where these are known."""
     metadata = distribution(name).metadata
-    given = metadata.get("License-Expression") or metadata.get("License") or "UNKNOWN"
-    if given == "UNKNOWN" or "\n" in given.strip() or len(given) > 100:  # the text of the licence
+    expression = metadata.get("License-Expression")
+    given = expression or metadata.get("License") or "UNKNOWN"
+    if given == "UNKNOWN" or not expression and ("\n" in given.strip() or len(given) > 100):  # the licence's text
         classifiers = metadata.get_all("Classifier") or []
         given = " AND ".join(line.split(" :: ")[-1] for line in classifiers if line.startswith("License ::"))
     given = given or READ_IN_THEIR_FILES.get(name, "UNKNOWN")

@@ -169,8 +169,8 @@ def run_hidden_modes(
         tested.files.find([scene.scene.names[0] for scene in scenes], samples)
     progress = partial(track, description="Hidden modes", console=Console(stderr=True))
     methods, on_device = predictors(module, samples, evaluation["batch"]), [scene.to(device) for scene in scenes]
-    shown = evaluation["shown_scenes"], evaluation["shown_samples"]
-    measured = measure(methods, on_device, samples, evaluation["seed"], *shown, progress)
+    sheet_sizes = evaluation["shown_scenes"], evaluation["shown_samples"]
+    measured = measure(methods, on_device, samples, evaluation["seed"], *sheet_sizes, progress)
     results = measured.results(samples)
     write_json(out / "hidden_modes.json", results)
     write_json(out / "shares.json", measured.shares())

@@ -223,15 +223,15 @@ def _refuse_another_run(out: Path, config: Mapping[str, object], earlier: object
         return
     other_model = "model._target_" in others
     # `model` repeats settings from outside it.
-    own = [key for key in others if not key.startswith("model.") or key.removeprefix("model.") not in others]
-    named = ["model"] if other_model else sorted(own, key=lambda key: (key.count("."), key))
-    shown = ", ".join(named[:3]) + (f" and {len(named) - 3} more" if len(named) > 3 else "")
+    keys = [key for key in others if not key.startswith("model.") or key.removeprefix("model.") not in others]
+    names = ["model"] if other_model else sorted(keys, key=lambda key: (key.count("."), key))
+    listed = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
     advice = "choose another out=DIR"
     if (out / LAST).is_file() and not other_model:
         same = [argument for argument in overrides if not argument.startswith(("out=", "ckpt_path="))]
         again = shlex.join(["completesplat", "fit", *same, f"ckpt_path={out / LAST}", "out=MORE"])
         advice = f"give all settings of {out / RECORD} again, or continue in another folder: {again}"
-    raise CompleteSplatError(f"{out} holds a run with another {shown}: {advice}")
+    raise CompleteSplatError(f"{out} holds a run with another {listed}: {advice}")
 
 
 def _refuse_earlier_end(out: Path, ends: Mapping[str, Any], earlier: Mapping[str, Any]) -> None:

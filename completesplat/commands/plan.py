@@ -312,8 +312,8 @@ def advice(config: DictConfig, counts: StepCounts, batch: int, limit: float) -> 
     if OmegaConf.select(config, key) is False:
         ways.append((f"{key}=true", count_work(config, batch, **{key: True})))
     lines = []
-    for settings, found in ways:
-        fixed, grows = parts_of(found)
+    for settings, step_counts in ways:
+        fixed, grows = parts_of(step_counts)
         least = next((k for k in range(1, batch + 1) if batch % k == 0 and fixed + grows / k <= limit), None)
         if least is not None:
             times = least * config.trainer.accumulate_grad_batches

@@ -85,8 +85,8 @@ def scenes_in(path: Path) -> dict[str, Path]:
     if path.is_file() or any(any(path.glob(name)) for name in SCENE_FILES):
         return {path.name: path}
     inner = [entry for folder in (path, path / SCENES) if folder.is_dir() for entry in sorted(folder.iterdir())]
-    found = [x for x in inner if x.suffix.lower() in SPLATS or any(any(x.glob(name)) for name in SCENE_FILES)]
-    return {printable(x.relative_to(path).as_posix()): x for x in found}
+    scenes = [x for x in inner if x.suffix.lower() in SPLATS or any(any(x.glob(name)) for name in SCENE_FILES)]
+    return {printable(x.relative_to(path).as_posix()): x for x in scenes}
 
 
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
@@ -151,15 +151,15 @@ def newest_scenes(run: Path) -> tuple[str, Sequence[Any], Sequence[float]]:
     return AT_STEP.format(step), samples, up
 
 
-def show_newest(page: Any, run: Path, shown: int | None) -> int | None:
-    """Show what the run has written after step `shown` (None: after the page was made); return its newest step."""
+def show_newest(page: Any, run: Path, newest: int | None) -> int | None:
+    """Show what the run has written after step `newest` (None: after the page was made); return its newest step."""
     from completesplat.viewer.sample import read_newest
 
     try:
         step, samples, _ = read_newest(run / NEWEST)
     except CompleteSplatError:
-        return shown  # the scenes are just being written, or were removed: the page stays as it is
-    if samples and step not in {shown, *(sample.settings.get("step") for sample in page.view.samples)}:
+        return newest  # the scenes are just being written, or were removed: the page stays as it is
+    if samples and step not in {newest, *(sample.settings.get("step") for sample in page.view.samples)}:
         page.show(samples, AT_STEP.format(step))
     return step
 

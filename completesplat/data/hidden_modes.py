@@ -96,23 +96,23 @@ class HiddenModeScenes:
         regions = (differences > DIFFERENCE).any(1)
         best_first = differences.sum((1, 2, 3)).argsort(descending=True, stable=True).tolist()
         large = [view for view in best_first if view and regions[view].float().mean() >= SMALLEST_REGION]
-        shown = large[: self.views]
-        if not shown:
+        selected = large[: self.views]
+        if not selected:
             raise DataError("no view shows enough of what the reference image hides", sequence=name)
-        targets = sorted({*shown, *evaluation_views(len(sequence.frames), self.spread)[1]})
+        targets = sorted({*selected, *evaluation_views(len(sequence.frames), self.spread)[1]})
         scene = with_true_depths(self.store.scene(sequence, 0, targets), sequence, 0, targets)
         front, others = scene.reference, scene.targets
         assert front.depths is not None
         assert others.depths is not None
         unseen, _ = hidden_from(front.cameras, front.depths, others.cameras, others.depths)
-        views, region = list(map(targets.index, shown)), regions[shown]
+        views, region = list(map(targets.index, selected)), regions[selected]
         # Depth maps leave out edges; but the reference view does not show what differs between the modes.
         unseen[views] |= region
         true_mode, probabilities = self._modes_of(name)
         return HiddenModes(
             scene=stack([scene]),
             views=tuple(views),
-            truths=truths[:, shown],
+            truths=truths[:, selected],
             region=region,
             probabilities=probabilities,
             unseen=unseen,

@@ -85,10 +85,10 @@ class SequenceSource(ABC):
 def shared_names(splits: Mapping[str, Collection[str]]) -> dict[str, list[str]]:
     """Return the names that two splits share, by pair ("train and val"), without pairs that share nothing."""
     shared = {}
-    for one, other in combinations(splits, 2):
-        names = set(splits[one]) & set(splits[other])
+    for first, second in combinations(splits, 2):
+        names = set(splits[first]) & set(splits[second])
         if names:
-            shared[f"{one} and {other}"] = sorted(names)
+            shared[f"{first} and {second}"] = sorted(names)
     return shared
 
 
@@ -99,8 +99,8 @@ def overlaps(shared: Mapping[str, Sequence[str]]) -> list[str]:
 
 def first_names(names: Sequence[str], most: int = 5) -> str:
     """Return the first few names for a message."""
-    shown = [*names[:most], "..."] if len(names) > most else names
-    return ", ".join(shown)
+    listed = [*names[:most], "..."] if len(names) > most else names
+    return ", ".join(listed)
 
 
 def spread_places(count: int, most: int | None) -> list[int]:

@@ -128,7 +128,8 @@ def load_heads() -> list[Head]:
     resource = files("torchmetrics.functional.image") / "lpips_models" / "vgg.pth"
     with as_file(resource) as path:
         weights = torch.load(path, map_location="cpu", weights_only=True)
-    return [weights[f"lin{layer}.model.1.weight"] for layer in range(5)]
+    # `plan` loads them as fake tensors, which are on "meta" whatever `map_location` says.
+    return [weights[f"lin{layer}.model.1.weight"].cpu() for layer in range(5)]
 
 
 class PerceptualTerm:

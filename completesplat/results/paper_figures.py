@@ -63,8 +63,8 @@ def comparison_table(table: PublishedTable, entries: Sequence[measured.Entry]) -
     notes, keys = tables.Notes(), ["method"]
     is_ablation = bool(table.get("options"))
     if not is_ablation:
-        shown = {*measured.OF_RUNS, *(column.key for column in table.columns)}
-        keys = [key for key in measured.LEADING if key in shown]
+        columns = {*measured.OF_RUNS, *(column.key for column in table.columns)}
+        keys = [key for key in measured.LEADING if key in columns]
     scored = score_columns(table)
     names = [f"{table.region}_{table.view}_{column.key}" for _, column, _ in scored]
     data_sets = [None if is_ablation else data_set for *_, data_set in scored]

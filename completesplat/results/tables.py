@@ -170,7 +170,7 @@ class Table:
 
 
 def _longest(pattern: re.Pattern[str], texts: Sequence[str]) -> int:
-    return max((len(found) for text in texts for found in pattern.findall(text)), default=0)
+    return max((len(word) for text in texts for word in pattern.findall(text)), default=0)
 
 
 def _side_by_side(widths: Sequence[int], room: int) -> list[list[int]]:

@@ -79,9 +79,9 @@ def _body(verb: str, task: str | None) -> Iterator[str]:
 
 def search_page(verb: str, task: str | None, words: Sequence[str]) -> str:
     """Return the help text of the settings that `search_settings` finds; raise CompleteSplatError if there are none."""
-    own, rows = _hints(verb, task), []
+    hints, rows = _hints(verb, task), []
     for setting, part, option in search_settings(verb, task, words):
-        key, text = _part_line(setting, part) if part else _line(setting, own.get(setting.key), {}, verb)
+        key, text = _part_line(setting, part) if part else _line(setting, hints.get(setting.key), {}, verb)
         rows.append((key, text + option))
     if not rows:
         known = {setting.key.rpartition(".")[2] for setting, _, _ in search_settings(verb, task, [])}

@@ -159,8 +159,8 @@ def search_settings(verb: str, task: str | None, words: Sequence[str]) -> list[t
                 entries += [(setting, part, "" if option == default else f" ({place}={option})") for setting in part]
     once = {entry[0].key: entry for entry in entries[::-1] if not REFERRING.search(f"{entry[0].key}={entry[0].value}")}
     patterns = [re.compile(rf"(?<![^\W_]){re.escape(word).replace('_', '[_ ]')}", re.IGNORECASE) for word in words]
-    found = [e for e in reversed(once.values()) if all(x.search(f"{e[0].key}: {e[0].comment}") for x in patterns)]
-    return sorted(found, key=lambda entry: not all(x.search(entry[0].key) for x in patterns))
+    results = [e for e in reversed(once.values()) if all(x.search(f"{e[0].key}: {e[0].comment}") for x in patterns)]
+    return sorted(results, key=lambda entry: not all(x.search(entry[0].key) for x in patterns))
 
 
 def with_bases(group: str, option: str) -> ConfFile:

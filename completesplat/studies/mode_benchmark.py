@@ -136,8 +136,8 @@ class ModeMeasurements:
         labels = [f"{name} (true)" if mode == scene.true_mode else name for mode, name in enumerate(scene.modes)]
         classes = classify(pixels, modes, scene.probabilities).tolist()
         labels += ["rejected" if mode == REJECTED else scene.modes[mode] for mode in classes]
-        shown = [scene.scene.reference.images[0], *scene.truths[:, 0], *images[:count, 0]]
-        self.rows.append([SheetCell(*cell) for cell in zip(shown, [scene.scene.names[0], *labels], strict=True)])
+        row = [scene.scene.reference.images[0], *scene.truths[:, 0], *images[:count, 0]]
+        self.rows.append([SheetCell(*cell) for cell in zip(row, [scene.scene.names[0], *labels], strict=True)])
 
     def results(self, samples: int) -> dict[str, dict[str, float]]:
         """Return means over the scenes by method; an energy score without pixels is 0."""

@@ -185,7 +185,7 @@ class Progress(RichProgressBar):
     Without a terminal, it logs a line after every validation.
     """
 
-    shown = 0.0
+    updated_at = 0.0
 
     @property
     def total_train_batches(self) -> int | float:
@@ -205,8 +205,8 @@ class Progress(RichProgressBar):
 
     def _update_metrics(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Show figures at most once a second, because reading them waits for the GPU."""
-        if (now := time.perf_counter()) - self.shown >= 1:
-            self.shown = now
+        if (now := time.perf_counter()) - self.updated_at >= 1:
+            self.updated_at = now
             super()._update_metrics(trainer, pl_module)
 
     def get_metrics(

@@ -113,9 +113,9 @@ class CaptureFit(Stage):
         """Return the frames of a split of the capture; raise CompleteSplatError unless there is exactly one capture."""
         names = self.data.store(split).names
         if len(names) != 1 or not self.data.splits_share_sequences or is_packed(self.data.root):
-            found = "is prepared" if is_packed(self.data.root) else f"has {len(names)} sequences ({first_names(names)})"
+            state = "is prepared" if is_packed(self.data.root) else f"has {len(names)} sequences ({first_names(names)})"
             advice = "model=capture fits one capture: give data=capture and its folder, as it was taken"
-            raise CompleteSplatError(f"data.root={self.data.root} {found}; {advice}")
+            raise CompleteSplatError(f"data.root={self.data.root} {state}; {advice}")
         return self.data.store(split).source.read(names[0])
 
     def reference_poses(self, scenes: SceneBatch, split: str) -> Float[Tensor, "batch 4 4"]:

@@ -197,7 +197,7 @@ def fit_lens(frame: CapturedFrame) -> CapturedFrame:
 
 def _same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Return whether one size is a multiple of the other, up to the rounding of a side."""
-    down, across = (one / another for one, another in zip(size, other, strict=True))
+    down, across = (side / other_side for side, other_side in zip(size, other, strict=True))
     return abs(down - across) <= max(1, down, across) / min(other)
 
 

@@ -115,10 +115,10 @@ class CaptureSetDataModule(ObjectDataModule):
 
 
 def _capture_folders(root: Path) -> list[Path]:
-    found: list[Path] = []
+    folders: list[Path] = []
     for folder, below, files in os.walk(root):
         below.sort()
         if Path(folder) != root and ("transforms.json" in files or "sparse" in below):
-            found.append(Path(folder))
+            folders.append(Path(folder))
             below.clear()
-    return found
+    return folders

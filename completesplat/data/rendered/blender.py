@@ -43,8 +43,8 @@ def find_blender(program: str | None = None) -> Blender:
     Raises:
         CompleteSplatError: there is none, it cannot be run, or it is older than `LEAST_VERSION`.
     """
-    own = sys.executable if find_spec("bpy") else None
-    program = program or os.environ.get(VARIABLE) or shutil.which("blender") or own
+    this_python = sys.executable if find_spec("bpy") else None
+    program = program or os.environ.get(VARIABLE) or shutil.which("blender") or this_python
     if program is None:
         raise CompleteSplatError(f"no Blender: give blender=PATH, or get one by {ADVICE}")
     output = _output_of(program, "--version")

@@ -96,19 +96,19 @@ def path_below(root: Path, relative: str) -> Path:
         OutsidePath: the path is empty, has `..`, a drive, scheme or NUL, or it or a link leads out.
     """
     path, windows = PurePath(relative.replace("\\", "/")), PureWindowsPath(relative)
-    absolute, shown = path.is_absolute() or windows.drive, printable(repr(relative), SHORT)
+    absolute, preview = path.is_absolute() or windows.drive, printable(repr(relative), SHORT)
     if not path.parts or ".." in path.parts or any(text in relative for text in ("\0", "://")):
-        raise OutsidePath(f"leads outside of {root}, or nowhere: {shown}")
+        raise OutsidePath(f"leads outside of {root}, or nowhere: {preview}")
     try:
         # `realpath` also accepts a path that does not exist, and one whose links form a ring.
         real_root, real_path = os.path.realpath(root), os.path.realpath(root / path)
     except ValueError:
-        raise OutsidePath(f"characters that no file name has: {shown}") from None
+        raise OutsidePath(f"characters that no file name has: {preview}") from None
     if windows.drive or os.path.commonpath([real_root, real_path]) != real_root:
         if absolute and not os.path.lexists(path):
-            raise OutsidePath(f"a path of another machine; make it relative to {root}: {shown}")
+            raise OutsidePath(f"a path of another machine; make it relative to {root}: {preview}")
         advice = "" if absolute else "; links may not leave it, so name the real folder"
-        raise OutsidePath(f"leads outside of {root}: {shown} is {real_path}{advice}")
+        raise OutsidePath(f"leads outside of {root}: {preview} is {real_path}{advice}")
     return root / (os.path.relpath(real_path, real_root) if absolute else path)
 
 
@@ -174,8 +174,8 @@ def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
         return kind(**{key: parsed(hint, _entry(value, key), key) for key, hint in get_type_hints(kind).items()})
     if type(value) in (arguments if origin is UnionType else (kind,)):
         return value
-    shown = printable(repr(value), SHORT)
-    raise BadAnnotation(f"{name} must be of type {getattr(kind, '__name__', kind)}, not {shown}")
+    preview = printable(repr(value), SHORT)
+    raise BadAnnotation(f"{name} must be of type {getattr(kind, '__name__', kind)}, not {preview}")
 
 
 def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
