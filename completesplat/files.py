@@ -161,7 +161,7 @@ def _asked(path: Path | None) -> OSError | None:
 def _disk_error(error: OSError, path: Path) -> DiskError | None:
     """Return the error to show, in the operating system's words; None if it is not the disk's."""
     if not path.parent.is_dir():
-        return DiskError(f"{path}: cannot be written, {path.parent} is not there any more")
+        return DiskError(f"{path}: cannot be written, {path.parent} is not there")
     return DiskError(f"{path}: cannot be written: {error.strerror}") if error.errno in NO_SPACE | UNUSABLE else None
 
 

@@ -110,7 +110,7 @@ def licences(name: str) -> set[str]:
     metadata = distribution(name).metadata
     expression = metadata.get("License-Expression")
     given = expression or metadata.get("License") or "UNKNOWN"
-    if given == "UNKNOWN" or not expression and ("\n" in given.strip() or len(given) > 100):  # the licence's text
+    if given == "UNKNOWN" or (not expression and ("\n" in given.strip() or len(given) > 100)):  # the licence's text
         classifiers = metadata.get_all("Classifier") or []
         given = " AND ".join(line.split(" :: ")[-1] for line in classifiers if line.startswith("License ::"))
     given = given or READ_IN_THEIR_FILES.get(name, "UNKNOWN")

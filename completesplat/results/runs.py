@@ -12,8 +12,11 @@ from typing import Any, TypedDict, cast
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from completesplat.errors import CompleteSplatError
+from completesplat.metrics import Style
 
 SCORES, MODES = "metrics.json", "hidden_modes.json"
 RECORD, CONFIG, PLAN = "run.json", "config.yaml", "multirun.yaml"
@@ -99,9 +102,11 @@ def find_results(folder: Path) -> RunTree:
     """Search a folder and everything below it, except hidden folders."""
     if not folder.is_dir():
         raise CompleteSplatError(f"runs={folder}: no such folder")
-    tree, results = RunTree(folder), []
-    for place, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+    tree, results, visited = RunTree(folder), list[Path](), set[str]()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        visited.add(os.path.realpath(place))
+        inner = sorted(name for name in folders if not name.startswith("."))
+        folders[:] = [name for name in inner if os.path.realpath(Path(place, name)) not in visited]
         path = Path(place)
         if PLAN in names:
             tree.sweeps.append(path)
@@ -129,6 +134,11 @@ def _result(path: Path, root: Path) -> ResultsFile:
         raise ValueError(f"it does not say how it was measured; {HOW}")
     if not entries:
         raise ValueError("it holds no scores by predictor")
+    try:
+        for metric in cast(Protocol, protocol).get("metrics", {}).values():
+            Style(**metric.get("style", {"heading": ""}))
+    except (AttributeError, TypeError):
+        raise ValueError("a metric's style in it is not one of this version") from None
     return ResultsFile(path.parent, path.parent.relative_to(root).as_posix(), cast(Protocol, protocol), entries)
 
 
@@ -214,15 +224,15 @@ def planned_jobs(folder: Path) -> list[list[str]]:
     """
     if not (folder / PLAN).is_file():
         return []
-    arguments = list(OmegaConf.load(folder / PLAN).hydra.overrides.task)
     values = {}
     try:
+        arguments = list(OmegaConf.load(folder / PLAN).hydra.overrides.task)
         for override in OverridesParser.create().parse_overrides(arguments):
             sweep = override.is_sweep_override()
             texts = list(override.sweep_string_iterator()) if sweep else [override.get_value_element_as_str()]
             key = override.get_key_element()
             values[key] = [f"{key}={text}" for text in texts]
-    except HydraException:
+    except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError):
         return []
     return [list(job) for job in itertools.product(*values.values())]
 
@@ -238,9 +248,12 @@ def _pairs(overrides: Sequence[str]) -> dict[str, str]:
 
 def _job(folder: Path, name: str) -> Job:
     record, metrics = read_record(folder), read_mapping(folder / SCORES)
-    if not record:
+    try:
+        config = cast(Mapping[str, object], OmegaConf.to_container(OmegaConf.load(folder / CONFIG)))
+    except (OmegaConfBaseException, YAMLError, OSError, ValueError):  # its writer was killed
+        config = {}
+    if not config or "overrides" not in record:
         return Job(name)
-    config = cast(Mapping[str, object], OmegaConf.to_container(OmegaConf.load(folder / CONFIG)))
     tested = _mapping(metrics.get("test"))
     test = {name: flat_scores(_mapping(entry)) for name, entry in tested.items() if name != PROTOCOL}
     steps, protocol = cast(int, metrics.get("steps", 0)), cast(Protocol, _mapping(tested.get(PROTOCOL)))

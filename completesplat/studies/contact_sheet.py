@@ -25,9 +25,9 @@ red: to the first camera's right, green: up, blue: ahead; yellow: mask."""
 
 # Length of an arm as the first camera sees it, in units of half its image's width.
 ARM = 0.3
-# Root mean squares. The image axes determine the horizon if they turn by at least LEAST_TURN (radians). Cameras look at
-# one point if their optical axes spread by at least LEAST_SPREAD and miss it by at most LARGEST_MISS of its depth.
-LEAST_TURN, LEAST_SPREAD, LARGEST_MISS = 0.1, 0.2, 0.2
+# Root mean squares. Cameras look at one point if their optical axes spread by at least LEAST_SPREAD and miss it by at
+# most LARGEST_MISS of its depth.
+LEAST_SPREAD, LARGEST_MISS = 0.2, 0.2
 # Parts of lines that are nearer to a camera's plane are not drawn (as a share of an arm's length).
 NEAREST = 0.05
 
@@ -59,13 +59,9 @@ def place_cross(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Cross:
 
 
 def level_axes(cameras: Cameras) -> Float[Tensor, "3 3"]:
-    """Return unit vectors in the world as rows: the first camera's right, up and ahead, levelled to the world's up.
-
-    If the cameras [view] hardly turn, no horizon follows from them, and up is the mean of their up directions.
-    """
-    right, down, forward = cameras.world_to_camera[:, :3, :3].unbind(dim=1)
-    turn = torch.linalg.svdvals(right)[1:2] / len(right) ** 0.5
-    up = world_up(cameras) if (turn > LEAST_TURN).any() else torch.nn.functional.normalize(-down.mean(dim=0), dim=0)
+    """Return unit vectors as rows: right, up and ahead of the first camera [view], levelled to `world_up`."""
+    _, down, forward = cameras.world_to_camera[:, :3, :3].unbind(dim=1)
+    up = world_up(cameras)
     # Ahead is at the upper edge of an image taken straight down, and at the lower edge of one taken straight up.
     ahead = forward[0] if (forward[0] @ up).abs() < 0.99 else down[0] * (forward[0] @ up).sign()
     ahead = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)

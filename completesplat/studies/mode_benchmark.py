@@ -31,6 +31,7 @@ Renders = Float[Tensor, "sample view 3 height width"]
 Predictor = Callable[[SceneBatch, SceneBatch, int], Renders]
 """Function from a scene, another scene (batches of one) and a seed to renders of all targets in [0, 1]."""
 
+OTHER_SCENE = "other_scene"
 Method = Callable[[SceneBatch, SceneBatch, int], Gaussians]
 """Function from the same arguments to Gaussians [sample], or [1] if it draws nothing."""
 
@@ -73,7 +74,7 @@ def decoding_methods(
     methods: dict[str, Method] = {
         "posterior_mean": lambda scene, other, seed: decode(encode(scene)[0].mean, scene),
         "posterior_samples": lambda scene, other, seed: decode_samples(scene, scene, seed),
-        "other_scene": lambda scene, other, seed: decode_samples(scene, other, seed),
+        OTHER_SCENE: lambda scene, other, seed: decode_samples(scene, other, seed),
     }
     if model.sees_views:
         methods["reference_only"] = lambda scene, other, seed: decode(encode(scene, False)[0].mean, scene)
@@ -195,6 +196,8 @@ def measure(
         measured.add("true_sampler", draw_modes(scene.truths, scene.probabilities, samples, seed + index), scene)
         measured.add("mean_predictor", mean.expand(samples, *mean.shape), scene)
         for method, predict in predictors.items():
+            if method == OTHER_SCENE and len(scenes) == 1:
+                continue
             renders = predict(scene.scene, scenes[index - 1].scene, seed + index)
             mode_views = renders[:, list(scene.views)]
             measured.add(method, mode_views, scene)

@@ -1,6 +1,7 @@
 """Gaussians fitted to the training frames of one capture, and scored on the frames that are held out."""
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -202,7 +203,7 @@ class CaptureFit(Stage):
         """Return the scores, with the names of the photos; warn if the photos' mean scores as well."""
         results, parts = super().test_results(), {"fitted": "train", "held_out": "test"}
         results["model"]["photos"] = {part: list(self.sequence(split).photos) for part, split in parts.items()}
-        fitted, mean = (results[name]["full"]["novel"]["psnr"] for name in ("model", "mean_image"))
+        fitted, mean = (results[name]["full"]["novel"].get("psnr", math.nan) for name in ("model", "mean_image"))
         if fitted <= mean:
             scores = f"{fitted:.2f} dB, the mean image {mean:.2f} dB"
             logger.warning("%s: are these the cameras of these photos, and are the steps enough?", scores)

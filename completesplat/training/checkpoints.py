@@ -182,7 +182,7 @@ def _replaced(path: Path) -> AbstractContextManager[Path]:
 
 
 def newest_whole(last: Path) -> Path | None:
-    """Return `last.ckpt`, or with a warning an older checkpoint if it is damaged; None if there is no `last.ckpt`.
+    """Return `last.ckpt`, or with a warning an older checkpoint if it is damaged or missing; None if there is none.
 
     Raises:
         WeightsError: all of them are damaged.
@@ -190,13 +190,12 @@ def newest_whole(last: Path) -> Path | None:
     steps = {path: path.stem.partition("=")[2] for path in last.parent.glob("step=*.ckpt")}
     milestones = sorted((path for path, step in steps.items() if step.isdecimal()), key=lambda p: -int(steps[p]))
     refusal: WeightsError | None = None
-    for path in (last, last.with_name(PREVIOUS), *milestones) if last.is_file() else ():
+    for path in filter(Path.is_file, (last, last.with_name(PREVIOUS), *milestones)):
         try:
-            if path.is_file():
-                check_whole(path)
-                if refusal is not None:
-                    logger.warning("%s; going on from %s", refusal, path)
-                return path
+            check_whole(path)
+            if path != last:
+                logger.warning("%s; going on from %s", refusal or f"{last}: is not there", path)
+            return path
         except WeightsError as error:
             refusal = refusal or error
     if refusal is not None:

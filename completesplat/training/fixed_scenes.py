@@ -26,7 +26,7 @@ from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import diversity
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Natural, Positive
+from completesplat.settings.schema import Positive
 from completesplat.tensors import stack
 from completesplat.training.callbacks import ExponentialMovingAverage
 from completesplat.training.stage import Stage
@@ -129,7 +129,7 @@ class FixedScenes(DrawsFixedScenes):
     Weights & Biases also gets the image.
     """
 
-    def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Natural = 4) -> None:
+    def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Positive = 4) -> None:
         super().__init__(folder, every_n_steps, scenes, views=1)
 
     def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> tuple[Image.Image, dict[str, float]]:
@@ -187,7 +187,7 @@ def scene_panels(
         "opacity": whole.alpha.expand(-1, 3, -1, -1),
     }
     pixels = scenes.reference.images.shape[-2] * scenes.reference.images.shape[-1]
-    for layer in range(gaussians.count // pixels):
+    for layer in range(0 if gaussians.count % pixels else gaussians.count // pixels):  # none in a capture's
         part = gaussians[:, layer * pixels : (layer + 1) * pixels]
         panels[f"layer {layer + 1}"] = render(part).over(background)
     return {name: panel.clamp(0, 1).nan_to_num() for name, panel in panels.items()}
@@ -237,7 +237,7 @@ class Samples(DrawsFixedScenes):
         self,
         folder: str,
         every_n_steps: Positive = 2000,
-        scenes: Natural = 2,
+        scenes: Positive = 2,
         samples: Positive = 4,
         views: Positive = 8,
     ) -> None:

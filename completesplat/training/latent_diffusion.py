@@ -119,6 +119,7 @@ class LatentDiffusion(DiffusionScorer, Stage):
         self.skip_weight = skip_weight
         self.guidance_weight = guidance_weight
         self.color_fits = color_fits
+        self.logged_step = -1
         self.scale_batches = scale_batches
         if autoreconstructor_checkpoint is not None and checkpoint is not None:
             raise WeightsError("model.checkpoint holds stage 1 as well: set model.autoreconstructor_checkpoint=null")
@@ -226,7 +227,9 @@ class LatentDiffusion(DiffusionScorer, Stage):
     def log_loss(self, errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"]) -> None:
         """Log the mean of the samples' losses, and that of each quarter of the timesteps that is among them."""
         self.log_step({"train/loss": errors.mean()}, batch_size=len(errors))
-        if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+        interval = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if interval and (self.global_step + 1) % interval == 0 and self.logged_step != self.global_step:
+            self.logged_step = self.global_step  # of accumulated batches, the first is logged
             ranks = zip(*gather_values((errors.cpu(), timestep.cpu())), strict=True)
             errors, timestep = (torch.cat(parts) for parts in ranks)
             values = losses_by_timestep(errors, timestep, self.completesplat.sampler.training_timesteps)

@@ -63,7 +63,12 @@ class Schedule(LambdaLR):
             group["lr"] = rate
 
 
-def exponential(optimizer: Optimizer, steps: float, warmup_steps: Natural = 100, final_ratio: Share = 0.01) -> LambdaLR:
+def exponential(
+    optimizer: Optimizer,
+    steps: float,
+    warmup_steps: Natural = 100,
+    final_ratio: Annotated[float, Range(1e-9, 1)] = 0.01,
+) -> LambdaLR:
     """Build linear warm-up, then exponential decay to `final_ratio` at the end (Marigold, `src/util/lr_scheduler.py`).
 
     The paper follows Marigold without giving numbers; warm-up and ratio are Marigold's.

@@ -208,7 +208,8 @@ class PreoptimizedVAE(Preoptimized, Stage):
         if data.latent_cache is not None:
             raise CompleteSplatError("data.latent_cache is for model=latent_diffusion: set it to null")
         terms = {name: term["weight"] for name, term in self.loss.terms.items()}
-        settings = f"{self.fitting} {terms} {self.background} {data.image_size}"
+        images = data.image_size, data.background, data.mask_threshold, data.packed_settings()
+        settings = f"{self.fitting} {terms} {self.background} {images} {data.source('train').fingerprint()}"
         stores = [data.store("val"), data.store("train")]
         self._stored = FittedScenes(self.folder, stores, super().fitted, settings)
         rank, count = processes()

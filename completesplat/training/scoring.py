@@ -24,7 +24,7 @@ from completesplat.data.loading.loader import SceneLoader
 from completesplat.errors import CompleteSplatError, PlyError
 from completesplat.export.images import surface_depth
 from completesplat.export.reading import read_gaussians
-from completesplat.files import safe_name
+from completesplat.files import by_numbers, safe_name
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.scoring import MODEL, REGIONS, Evaluation
@@ -148,6 +148,8 @@ class Scorer(LightningModule):
             depths = truth.depths
             if depths is not None and depths.shape[-2:] == rendered.alpha.shape[-2:]:
                 evaluation.update_depth(name, rendered[0].expected_depth(), truth[b])
+            elif depths is not None:
+                evaluation.missing["depth"] = "missing: evaluation.resolution is not the size of the renders"
             self.scene_scored(name, samples, cameras[b], images, truth[b])
         if self.mean_image is not None:
             evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
@@ -228,7 +230,7 @@ class SceneFiles(Scorer):
     def find(self, scenes: Sequence[str], samples: int) -> None:
         """Find the first `samples` files of these scenes, by name; raise CompleteSplatError if a scene has fewer."""
         folders = {scene: self.folder / safe_name(scene) for scene in scenes}
-        self.files = {scene: sorted(folder.glob(FILES))[:samples] for scene, folder in folders.items()}
+        self.files = {scene: sorted(folder.glob(FILES), key=by_numbers)[:samples] for scene, folder in folders.items()}
         if incomplete := [scene for scene, paths in self.files.items() if len(paths) < samples]:
             folder, count = folders[incomplete[0]], len(self.files[incomplete[0]])
             present = f"{count} files {FILES}" if folder.is_dir() else "no such folder"
@@ -262,8 +264,10 @@ class SceneFiles(Scorer):
             raise CompleteSplatError(f"{paths[0]}: nearly all Gaussians lie behind the camera; try frame={other}")
         factor = self._scale(sets[0], scene.reference) if self.align == "scale" else 1.0
         if factor is None:
-            reason = "no true depth at the pixels that its first sample covers"
-            raise CompleteSplatError(f"align=scale: {scene.names}: {reason}; use align=none")
+            reason = "at the pixels that its first sample covers"
+            if scene.reference.depths is None:
+                reason = "(prepared data lack it, and images at another evaluation.resolution)"
+            raise CompleteSplatError(f"align=scale: {scene.names}: no true depth {reason}; use align=none")
         return [replace(x, means=factor * x.means, scales=factor * x.scales) for x in sets]
 
     def _scale(self, gaussians: Gaussians, reference: Views) -> float | None:

@@ -119,7 +119,7 @@ class Saver:
         return to_pixels(views[0].nan_to_num())
 
     def _scene(self, kind: str, sample: Sample) -> Path:
-        """Write all layers of a sample, in its reference camera's frame."""
+        """Write all layers of a sample."""
         path = self._next("sample", suffix(kind))
         comments = [f"{name} {value}" for name, value in sample.settings.items()]
         front = PageView(sample.reference, sample.pivot(), torch.tensor(self.view.up), self.background)
@@ -137,8 +137,8 @@ class Saver:
         return path
 
     def _next(self, stem: str, suffix: str) -> Path:
-        taken = {path.name for path in self.folder.glob(f"{stem}_*{suffix}")}
-        return self.folder / next(name for i in range(10**6) if (name := f"{stem}_{i:02}{suffix}") not in taken)
+        taken = {path.name.partition(".")[0] for path in self.folder.glob(f"{stem}_*")}
+        return self.folder / f"{next(name for i in range(10**6) if (name := f'{stem}_{i:02}') not in taken)}{suffix}"
 
 
 class Page:
@@ -192,11 +192,17 @@ class Page:
                 pixels = np.asarray(image.convert("RGB").resize((THUMBNAIL, THUMBNAIL)))
                 self.photo.content = panel.preview_of(pixels, "photo")
 
-    def _choose(self, _: viser.GuiEvent[Any]) -> None:
+    def _choose(self, event: viser.GuiEvent[Any]) -> None:
         name = self.opening.chosen.value
         if name in self.scenes:
             self.opening.chosen.options = (*self.scenes,)
-            self.worker.submit("open", partial(self.open, self.scenes[name], name))
+            self.worker.submit("open", partial(self._open_for, event.client, self.scenes[name], name))
+
+    def _open_for(self, client: viser.ClientHandle | None, path: Path, name: str) -> None:
+        try:
+            self.open(path, name)
+        except Exception as error:
+            self.tell(error, client)
 
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
         """Show an uploaded scene, or complete an uploaded image; its name is never used as a path."""

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from functools import partial
 from html import escape
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import viser
@@ -53,14 +53,14 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
         if not draws:
             gui.add_markdown(ONE_ANSWER)
         free, diverse = "1: most faithful, 0: most free", "more: more diverse"
-        slider: Any = partial(gui.add_slider, visible=draws)
+        slider, fits = cast(Any, partial(gui.add_slider, visible=draws)), start["color_fits"]
         return SimpleNamespace(
             preview=preview,
             remove_background=remove,
             samples=slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
             skip_weight=slider("Skip weight", 0.0, 1.0, 0.05, start["skip_weight"], hint=free),
             guidance_weight=slider("Guidance", 0.0, 1.0, 0.05, start["guidance_weight"], hint=diverse),
-            color_fits=slider("Fits", 0, 50, 1, start["color_fits"], hint="rounds of fitting to the image"),
+            color_fits=slider("Fits", 0, max(50, fits), 1, fits, hint="rounds of fitting to the image"),
             steps=slider("Steps", 1, most_steps, 1, first_steps, hint="denoising steps"),
             seed=slider("Seed", 0, max(MOST_SEED, start["seed"]), 1, start["seed"]),
             live=gui.add_checkbox("Draw when a slider moves", True, visible=draws),
@@ -103,7 +103,7 @@ def add_saving(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
     """Add the folder `Save`; return handles of the file's `kind` (a format or a video) and of the button `save`."""
     with gui.add_folder("Save", order=4):
         kind = gui.add_dropdown("Format", (*formats, VIDEO), hint="spz and sog need Node.js, mesh completesplat[mesh]")
-        return SimpleNamespace(kind=kind, save=gui.add_button("Save what is shown"))
+        return SimpleNamespace(kind=kind, save=gui.add_button("Save", hint="what is shown, with all layers"))
 
 
 def thumbnail_row(images: Sequence[Pixels], chosen: int | None) -> str:

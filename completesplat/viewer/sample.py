@@ -16,6 +16,7 @@ from completesplat.data.validation import BadAnnotation, BadCamera, field, finit
 from completesplat.errors import CompleteSplatError, errors_at
 from completesplat.export.cleaning import LARGEST, with_screen_space_dilation
 from completesplat.export.reading import read_gaussians
+from completesplat.files import by_numbers
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 
@@ -72,7 +73,7 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     Raises:
         CompleteSplatError: there is nothing that can be shown.
     """
-    files = [path] if path.is_file() else sorted([*path.glob("sample_*.ply"), *path.glob("scene.ply")])
+    files = [path] if path.is_file() else sorted([*path.glob("sample_*.ply"), *path.glob("scene.ply")], key=by_numbers)
     if not files:
         raise CompleteSplatError(f"{path}: no sample_*.ply or scene.ply in this folder")
     scenes = [read_gaussians(file) for file in files]

@@ -16,6 +16,7 @@ from torch import Tensor
 from completesplat.export.formats import round_to_uint8
 from completesplat.export.images import color_depth
 from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.rotations import matrix_to_quaternion
 from completesplat.geometry.trajectories import orbit
 from completesplat.viewer.sample import Sample
@@ -94,8 +95,7 @@ def arrangement_of(samples: Sequence[Sample]) -> Arrangement:
 class SplatView:
     """Splats and cameras on the page: one sample or all side by side, all layers or some, in colour or by depth.
 
-    `refresh` draws everything anew from the attributes, under a lock because callbacks come from several threads. The
-    direction up is in the reference camera's frame.
+    `refresh` draws everything anew from the attributes, under a lock because callbacks come from several threads.
 
     Side by side, only the middle part of each sample is shown, because scenes are wider than an image and would hide
     each other.
@@ -154,8 +154,10 @@ class SplatView:
             view, start = self._arrangement, self.server.initial_camera
             start.position, start.look_at, start.fov = view.position, view.look_at, view.fov
             for browser in list(self.server.get_clients().values()) if client is None else [client]:
+                camera = browser.camera
+                if camera.image_width * camera.image_height == 0:  # hidden; `_welcome` fits its view later
+                    continue
                 with browser.atomic():
-                    camera = browser.camera
                     camera.up_direction = self.up
                     camera.position, camera.look_at = view.position, view.look_at
                     camera.fov = view.fov_in(camera.image_width / camera.image_height)
@@ -182,7 +184,7 @@ class SplatView:
         # viser draws one colour for all directions.
         scenes = [sample.for_viewers().seen_from(sample.reference.centers) for sample in samples]
         if self.depth:
-            scenes = depth_colored(scenes)
+            scenes = depth_colored(scenes, [sample.reference for sample in samples])
         wanted = {}
         for i, (sample, scene) in enumerate(zip(samples, scenes, strict=True)):
             size = scene.count // sample.layers  # Gaussians are ordered by layer, row, column
@@ -241,9 +243,10 @@ def to_splats(gaussians: Gaussians) -> tuple[dict[str, Any], float]:
     }, scale
 
 
-def depth_colored(scenes: Sequence[Gaussians]) -> list[Gaussians]:
-    """Colour scenes by depth (z), near bright and far dark, on one scale for all of them."""
-    depths = torch.cat([scene.means[:, 2] for scene in scenes])
+def depth_colored(scenes: Sequence[Gaussians], cameras: Sequence[Cameras]) -> list[Gaussians]:
+    """Colour scenes by depth in their cameras, near bright and far dark, on one scale for all of them."""
+    pairs = zip(scenes, cameras, strict=True)
+    depths = torch.cat([transform_points(camera.world_to_camera, scene.means)[:, 2] for scene, camera in pairs])
     colors, _ = color_depth(depths[None, None, :])
     parts = torch.split(colors[:, 0].T, [scene.count for scene in scenes])
     return [replace(scene, colors=part) for scene, part in zip(scenes, parts, strict=True)]

@@ -8,7 +8,7 @@ from conftest import made
 from plyfile import PlyData
 from support import SMALL, refused, strict_json, write_capture
 
-LADDER = {"model", "posterior_mean", "posterior_samples", "other_scene", "mean_predictor", "true_sampler"}
+LADDER = {"model", "posterior_mean", "posterior_samples", "mean_predictor", "true_sampler"}
 ENCODER = [f"autoreconstructor.encoder.{setting}" for setting in ("channels=[8,16]", "norm_groups=4")]
 SIZES = [*SMALL, "data.targets=2", *ENCODER]
 

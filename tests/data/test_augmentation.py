@@ -234,3 +234,5 @@ def test_a_jittered_camera_sees_what_the_reference_image_shows_and_the_targets_s
     assert torch.equal(after.targets.images, before.targets.images)
     assert not torch.allclose(after.reference.cameras.intrinsics, before.reference.cameras.intrinsics)
     assert torch.equal(after.reference.cameras.world_to_camera, torch.eye(4))
+    square = replace(before.reference, masks=middle)
+    assert set(jitter(replace(before, reference=square), rng(3)).reference.masks.unique().tolist()) == {0, 1}

@@ -222,8 +222,10 @@ def test_too_many_are_an_error_that_names_the_share_and_the_last(tmp_path):
     with pytest.raises(DataError, match=r"data\.max_bad_fraction=0\.1"):
         list(module(root, max_bad_fraction=0.1, val_fraction=0.0).train_dataloader())
     assert len(list(module(root, max_bad_fraction=0.34, evaluation_batch_size=1).test_dataloader())) == 6
-    one_bad = module(make_tree(tmp_path / "one", "c5"), max_bad_fraction=0.0, evaluation_batch_size=1)
-    assert len(list(one_bad.test_dataloader())) == 8  # One is no share.
+    one_bad = make_tree(tmp_path / "one", "c5")
+    assert len(list(module(one_bad, max_bad_fraction=0.01, evaluation_batch_size=1).test_dataloader())) == 8
+    with pytest.raises(DataError, match=r"1 of 9 items .* data\.max_bad_fraction=0 allows"):
+        list(module(one_bad, max_bad_fraction=0.0).test_dataloader())
 
 
 def test_nothing_that_can_be_read_and_an_unknown_policy_are_errors(tmp_path):

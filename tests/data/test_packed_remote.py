@@ -92,6 +92,15 @@ def test_what_cannot_be_fetched_or_is_another_file_is_said(served):
     assert not list(source.root.rglob("*tmp*"))
 
 
+def test_a_store_that_was_fetched_is_read_when_its_address_does_not_answer(served, caplog):
+    address, folder, _ = served
+    make(folder)
+    first = local_root(address)
+    (folder / "manifest.json").unlink()
+    assert local_root(address) == first
+    assert "the manifest of the last time is used" in caplog.text
+
+
 def test_a_store_that_is_made_anew_is_another_one(served):
     address, folder, _ = served
     make(folder)

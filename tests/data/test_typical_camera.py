@@ -28,6 +28,12 @@ def test_world_up_is_found_from_level_cameras(seed, elevation):
     torch.testing.assert_close(world_up(level_orbit(up, elevation)), up)
 
 
+def test_cameras_that_do_not_turn_have_their_own_up():
+    pose = look_at(torch.tensor([[1.0, 2, 3]]), torch.zeros(3), torch.tensor([0.0, -1, 0])).expand(2, 4, 4)
+    pair = Cameras(pose, pinhole(60.0, 32).expand(2, 3, 3), (32, 32))
+    torch.testing.assert_close(world_up(pair), -pose[0, 1, :3])
+
+
 def test_typical_camera_of_known_cameras_counts_sequences_by_their_frames():
     up = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     ranges = torch.tensor([[1.0, 3.0]], dtype=torch.float64).expand(12, 2)

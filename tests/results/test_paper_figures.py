@@ -142,6 +142,10 @@ def test_missing_scores_have_a_reason_below_the_table(runs, run) -> None:
         assert f"[{text.removeprefix('missing: note ')}] {reason}" in table.below()
 
 
+STYLED = '{"protocol": {"data_set": "x", "scenes": 1, "resolution": 2, "metrics": {"a": {"style": {"colour": 1}}}}, '
+STYLED += '"model": {}}'
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
@@ -149,6 +153,7 @@ def test_missing_scores_have_a_reason_below_the_table(runs, run) -> None:
         ('{"steps": 9}', "does not say how it was measured"),
         ('{"protocol": {"data_set": "x", "scenes": 1}, "model": {}}', "does not say how it was measured"),
         ('{"protocol": {"data_set": "x", "scenes": 1, "resolution": 2}}', "no scores"),
+        (STYLED, "a metric's style in it is not one of this version"),
     ],
 )
 def test_a_broken_or_foreign_file_is_left_out_with_a_line(runs, run, content, reason) -> None:
@@ -161,6 +166,14 @@ def test_a_broken_or_foreign_file_is_left_out_with_a_line(runs, run, content, re
     assert reason in warning
     assert "\n" not in warning
     assert len(published_tables(tree)) == len(PAPERS) + 1
+
+
+def test_folders_that_links_lead_to_are_searched_once(runs, run, tmp_path) -> None:
+    run("good", 20.0)
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links/there").symlink_to(runs)
+    (runs / "good/back").symlink_to(runs)
+    assert [score.name for score in find_results(tmp_path / "links").scores] == ["there/good"]
 
 
 def test_a_folder_without_results_is_refused_with_what_makes_them(runs) -> None:

@@ -250,6 +250,20 @@ def test_jobs_that_have_not_started_are_named_and_a_plan_that_depends_on_files_i
     assert remarks(sweep)[0] == "1 of 2 jobs have finished."
 
 
+@pytest.mark.parametrize("file", ["job=1/config.yaml", "job=1/run.json", "multirun.yaml"])
+@pytest.mark.parametrize("content", ["", "{}", "[", None])
+def test_a_sweep_with_a_damaged_file_has_a_summary(sweep, file, content) -> None:
+    sweep.plan(["seed=0,1"])
+    sweep.scored("seed=1", psnr=20.0)
+    sweep.scored("seed=0", psnr=21.0)
+    damaged = sweep.folder / file
+    damaged.unlink()
+    if content is not None:
+        damaged.write_text(content)
+    rows, _ = summarize(sweep.folder)
+    assert rows[0].scores[PSNR] in (20.0, 20.5)
+
+
 def test_planned_jobs_are_those_of_hydras_sweeper(sweep) -> None:
     arguments = ["b=1,2", "a=range(3)", "c=[1,x]", "~d", "+e='f g',h", "b=3,4", "++f=choice({x:1},y)", "out=g"]
     sweep.plan(arguments)

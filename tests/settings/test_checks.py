@@ -37,6 +37,8 @@ ODD = [
     ("fit", "data.color_jitter=1", "data.color_jitter=1: must be a mapping"),
     ("fit", "+data.rot=x", "ToyObjectsDataModule has no setting rot (data.rot); did you mean root?"),
     ("fit", "optimizer.lr=nan", f"optimizer.lr=nan: {NUMBER}"),
+    ("fit", "callbacks.images.scenes=0", "callbacks.images.scenes=0: must be at least 1"),
+    ("fit", "schedule=exponential schedule.final_ratio=0", "schedule.final_ratio=0: must lie between 1e-09 and 1"),
     ("fit", "optimizer.lr=-1", "optimizer: Invalid learning rate: -1"),
     ("fit", "trainer.val_check_interval=0", "trainer.val_check_interval=0: must be at least "),
     ("fit", "trainer.precision=half", "trainer.precision=half: choose one of "),

@@ -70,6 +70,13 @@ def test_constructed_predictors_have_their_scores():
     assert 0 < true["total_variation"] < 0.6
 
 
+def test_of_one_scene_there_is_no_other():
+    predictors = {name: lambda scene, other, seed: renders(scene, [0]) for name in ("model", "other_scene")}
+    for scenes in (SCENES, SCENES[:1]):
+        results = measure(predictors, scenes, SAMPLES, 0, 1, 3).results(SAMPLES)
+        assert ("other_scene" in results) == (len(scenes) > 1)
+
+
 def test_shares_are_of_all_scenes_with_the_same_probabilities():
     often = replace(hidden_scene(1), probabilities=torch.tensor([0.5, 0.25, 0.25, 0.0]))
     modes = [0, 1, 2, 0]  # right for the second scene, and not for the first, whose modes are equally probable

@@ -149,4 +149,7 @@ def test_a_run_goes_on_from_the_newest_whole_checkpoint(tmp_path, caplog):
     assert read_checkpoint(last)["global_step"] == STEPS
     assert not previous.exists()
     last.unlink()
-    assert newest_whole(last) is None
+    caplog.clear()
+    assert newest_whole(last) == tmp_path / "checkpoints/step=15.ckpt"
+    assert [record.getMessage().partition(";")[0] for record in caplog.records] == [f"{last}: is not there"]
+    assert newest_whole(tmp_path / "last.ckpt") is None

@@ -59,6 +59,7 @@ def test_panels_are_input_target_error_and_layers():
         assert ((drawn[layer] == 0).all((0, 2, 3)) == (torch.arange(3) != channel)).all()
     rendering = ReferenceRasterizer()(gaussians, scenes.targets.cameras[:, :1])[:, 0]
     assert torch.equal(drawn["opacity"], rendering.alpha.clamp(0, 1).expand(-1, 3, -1, -1))
+    assert "layer 1" not in panels(gaussians[:, :-1], scenes)  # as of a capture
     rendered = panels(gaussians, scenes)["render"]
     assert rendered.std() > 0
     for difference in (0.0, 0.1):

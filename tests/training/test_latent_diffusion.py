@@ -1,6 +1,7 @@
 """What a training step of stage 2 shows to which network, draws, and logs."""
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -139,6 +140,17 @@ def test_the_buckets_losses_average_to_the_total(monkeypatch):
     assert mean == pytest.approx(total, rel=1e-5)
     values = losses_by_timestep(torch.tensor([1.0, 3.0, 5.0]), torch.tensor([249, 250, 499]), 1000)
     assert values == {"train/loss_t0": 1.0, "train/loss_t1": 4.0}
+
+
+def test_losses_by_timestep_are_logged_once_a_step_and_never_without_an_interval():
+    rows, trainer = [], SimpleNamespace(log_every_n_steps=2)
+    loggers = [SimpleNamespace(log_metrics=lambda values, step: rows.append(step))]
+    parts = SimpleNamespace(sampler=SimpleNamespace(training_timesteps=1000))
+    module = SimpleNamespace(trainer=trainer, loggers=loggers, completesplat=parts, logged_step=-1)
+    module.log_step = lambda values, batch_size: None
+    for module.global_step, trainer.log_every_n_steps in [(0, 2), (1, 2), (1, 2), (2, 2), (3, 2), (4, 0), (5, 0)]:
+        LatentDiffusion.log_loss(module, torch.ones(2), torch.tensor([0, 999]))
+    assert rows == [1, 3]
 
 
 def test_encoded_scenes_train_the_same(monkeypatch):

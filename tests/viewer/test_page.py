@@ -263,6 +263,10 @@ def test_one_of_several_scenes_is_chosen(server, tmp_path):
     assert made.opening.chosen.value == "loaded: c.splat"
     made.opening.chosen.value = "a"
     assert (len(finish(made)), made.opening.chosen.options) == (2, ("a", "b"))
+    browser = Browser()
+    (tmp_path / "a/sample_01.ply").write_text("nothing")
+    press(made, made.opening.chosen, browser)
+    assert "sample_01.ply: not a .ply file" in browser.messages[0]
     made.worker.close()
 
 
@@ -353,7 +357,10 @@ def test_saving_again_overwrites_nothing_and_takes_the_chosen_sample(page):
     page.looking.chosen.value = "sample 2"
     for _ in range(2):
         press(page, page.saving.save)
-    assert sorted(path.name for path in page.saver.folder.iterdir()) == ["sample_00.ply", "sample_01.ply"]
+    page.saving.kind.value = "splat"
+    press(page, page.saving.save)
+    files = ["sample_00.ply", "sample_01.ply", "sample_02.splat"]
+    assert sorted(path.name for path in page.saver.folder.iterdir()) == files
 
 
 @pytest.mark.parametrize("exact", [True, False])

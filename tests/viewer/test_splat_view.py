@@ -8,7 +8,7 @@ import torch
 from viewer_scenes import balls, balls_sample
 
 from completesplat.gaussians import merge_gaussians
-from completesplat.geometry.cameras import look_at
+from completesplat.geometry.cameras import look_at, transform_points
 from completesplat.viewer.splat_view import MARGIN, arrangement_of, depth_colored, to_splats
 
 
@@ -110,7 +110,12 @@ def test_centers_and_bytes_of_finite_gaussians():
 def test_depth_colours_brighten_towards_the_camera_on_one_scale():
     near, far = balls(points=50), balls(points=50)
     far.means[:, 2] += 1
-    scenes = depth_colored([near, far])
+    eye, ahead = torch.tensor([-3.0, 0, 1]), torch.tensor([5.0, 0, 1])
+    sideways = replace(balls_sample().reference, world_to_camera=look_at(eye, ahead, torch.tensor([0.0, 0, 1])))
+    depths = transform_points(sideways.world_to_camera, near.means)[:, 2]
+    by_depth = depth_colored([near], [sideways])[0].colors.sum(-1)[depths.argsort()]
+    assert (by_depth.diff() <= 1e-5).all()
+    scenes = depth_colored([near, far], [balls_sample().reference] * 2)
     depths = torch.cat([near.means[:, 2], far.means[:, 2]])
     lightness = torch.cat([scene.colors.sum(-1) for scene in scenes])[depths.argsort()]
     assert (lightness.diff() <= 1e-5).all()

@@ -104,6 +104,6 @@ class CO3DDataModule(ObjectDataModule):
             return super().hidden_modes(views, spread_views)
         store, folder, first = self.store("test"), self.root / self.category, next(iter(self.chances))
         if not any((folder / name / first).is_dir() for name in store.names):
-            advice = "data toy writes those of test scenes, data render all with hidden=modes"
+            advice = "data toy writes those of test scenes, data render all with hidden=modes; prepared data have none"
             raise MissingFile(f"no test scene has images in each mode, such as {first}: {advice}", str(folder))
         return HiddenModeScenes(store, lambda name: folder / name / self.record, self.chances, views, spread_views)

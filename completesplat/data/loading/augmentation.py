@@ -190,7 +190,8 @@ class CameraJitter:
         layers = torch.cat([scene.reference.images, scene.reference.masks, scene.visible])[None]
         seen = torch.nn.functional.grid_sample(layers, grid[None], padding_mode="border", align_corners=False)[0]
         cameras = replace(scene.reference.cameras, intrinsics=after)
-        reference = Views(seen[:3], cameras, seen[3:4])
+        binary = scene.reference.masks.eq(scene.reference.masks.round()).all()
+        reference = Views(seen[:3], cameras, seen[3:4].round() if binary else seen[3:4])
         turned = scene.targets.cameras.world_to_camera @ turn.mT
         targets = replace(scene.targets, cameras=replace(scene.targets.cameras, world_to_camera=turned))
         return replace(scene, reference=reference, targets=targets, visible=seen[4:])

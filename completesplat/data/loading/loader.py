@@ -159,7 +159,7 @@ class SceneLoader:
         if refused and self.on_bad == "raise":
             raise refused[0]
         self.refused += refused
-        too_many = len(self.refused) > max(1, self.max_bad_fraction * self._items)
+        too_many = len(self.refused) > (self.max_bad_fraction and max(1, self.max_bad_fraction * self._items))
         # Training replaces unreadable items, so an empty batch is an error there; evaluation does not replace them.
         nothing = empty and (self._order is not None or len(self.refused) == self._items)
         if too_many or nothing:

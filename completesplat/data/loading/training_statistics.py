@@ -18,6 +18,7 @@ from completesplat.geometry.cameras import Cameras
 SEQUENCES, IMAGES = 400, 8192
 # Fewer images suffice for the standard deviations of eight features.
 FEATURE_IMAGES, SMALLEST_DEVIATION = 1024, 1e-3
+LEAST_TURN = 0.1  # root mean square, in radians, from which on the image axes determine the horizon
 
 
 class TypicalCamera(NamedTuple):
@@ -42,11 +43,14 @@ def world_up(cameras: Cameras) -> Float[Tensor, "3"]:
     """Estimate the up direction of hand-held cameras [view] in world coordinates.
 
     People hold cameras level, so up is most nearly perpendicular to all horizontal image axes. Its sign follows the
-    cameras' up directions (after `co3d_normalisation.py` of Splatter Image).
+    cameras' up directions (after `co3d_normalisation.py` of Splatter Image). If the cameras hardly turn, no horizon
+    follows from them, and up is the mean of their up directions.
     """
     horizontal, down = cameras.world_to_camera[:, 0, :3], cameras.world_to_camera[:, 1, :3]
-    up = torch.linalg.svd(horizontal).Vh[-1]
-    return torch.where(down.mean(dim=0) @ up > 0, -up, up)
+    _, lengths, axes = torch.linalg.svd(horizontal)
+    if not (lengths[1:2] > LEAST_TURN * len(horizontal) ** 0.5).any():
+        return -torch.nn.functional.normalize(down.mean(dim=0), dim=0)
+    return torch.where(down.mean(dim=0) @ axes[-1] > 0, -axes[-1], axes[-1])
 
 
 def mean_camera(store: SceneStore) -> TypicalCamera:

@@ -4,6 +4,7 @@ A shard is mapped into memory when one of its sequences is read. From an address
 """
 
 import hashlib
+import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +28,7 @@ from completesplat.files import atomic_path, write_bytes
 from completesplat.weights import sha256_of
 
 ADDRESS = "address.txt"
+logger = logging.getLogger(__name__)
 
 
 def local_root(root: str) -> Path:
@@ -43,7 +45,12 @@ def local_root(root: str) -> Path:
     folder = Path(place).expanduser() / "stores" / _digest(root.encode())
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / ".lock"):
-        _get(root, MANIFEST, folder / MANIFEST)
+        try:
+            _get(root, MANIFEST, folder / MANIFEST)
+        except MissingFile as error:
+            if not (folder / MANIFEST).is_file():
+                raise
+            logger.warning("%s; the manifest of the last time is used", error)
         store = folder / _digest((folder / MANIFEST).read_bytes())
         store.mkdir(exist_ok=True)
         for name, content in ((ADDRESS, root.encode()), (MANIFEST, (folder / MANIFEST).read_bytes())):

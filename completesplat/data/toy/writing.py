@@ -1,13 +1,14 @@
 """Writers of toy data: objects as a CO3D category, rooms in RealEstate10K's layout."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypedDict, Unpack
 
 import numpy as np
+from filelock import FileLock
 from rich.console import Console
 from rich.progress import track
 
@@ -167,10 +168,9 @@ def write(
     if kind not in KINDS:
         raise DataError(f"no toy data of kind {kind!r}; there are: {', '.join(KINDS)}")
     folder, rooms = out / f"toy_{kind}", kind == "rooms"
-    scenes, frames, size, seed = numbers["scenes"], numbers["frames"], numbers["size"], numbers["seed"]
-    rules = ("scenes", scenes, Range(1 + rooms)), ("frames", frames, Range(2, MOST_FRAMES)), ("size", size, Range(8))
-    for name, number, rule in rules:
-        reason = rule.refusal(number)
+    rules = {"scenes": Range(1 + rooms), "frames": Range(2, MOST_FRAMES), "size": Range(8)}
+    for name, rule in rules.items():
+        reason = rule.refusal(number := numbers[name])  # type: ignore[literal-required]
         if reason is not None:
             raise DataError(f"{folder.name}: {name}={number}: {reason}")
     parameters = {"format": FORMAT_VERSION, **numbers} | ({} if tuple(light) == WHITE else {"light": list(light)})
@@ -178,15 +178,24 @@ def write(
         if progress:
             Console().print(f"{folder} already holds these scenes")
         return folder
+    out.mkdir(parents=True, exist_ok=True)
+    with FileLock(out / f".{folder.name}.lock"):
+        if not writing.is_written(folder / DESCRIPTION, parameters):  # by another process
+            _write_all(folder, parameters, workers, progress)
+    return folder
+
+
+def _write_all(folder: Path, parameters: Mapping[str, Any], workers: int | None, progress: bool) -> None:
+    rooms, scenes, light = folder.name == "toy_rooms", parameters["scenes"], parameters.get("light", WHITE)
+    sizes = {name: parameters[name] for name in ("frames", "size", "seed")}
     with atomic_folder(folder) as unfinished:
         write_one: Callable[..., Any] = _write_clip if rooms else partial(_write_scene, category=folder.name)
-        write_one = partial(write_one, unfinished, frames=frames, size=size, seed=seed, light=np.array(light, float))
+        write_one = partial(write_one, unfinished, **sizes, light=np.array(light, float))
         written = map_in_processes(write_one, list(enumerate(_splits(scenes, rooms))), workers)
         results = list(track(written, f"Rendering {folder.name}", scenes, disable=not progress))
         if not rooms:
             _write_lists(unfinished, results)
         (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1) + "\n")
-    return folder
 
 
 write_objects, write_rooms = partial(write, "objects"), partial(write, "rooms")

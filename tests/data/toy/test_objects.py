@@ -2,6 +2,7 @@ import gzip
 import json
 import os
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -48,13 +49,21 @@ def test_an_interrupted_set_is_made_anew_a_complete_one_kept_and_other_content_r
     (tmp_path / ".toy_objects.unfinished" / "00000_bear").mkdir(parents=True)
     category = write_objects(tmp_path, **settings, progress=False)
     assert (category / "toy.json").is_file()
-    assert list(tmp_path.iterdir()) == [category]
+    assert list(tmp_path.glob("[!.]*")) == [category]
+    assert not list(tmp_path.glob("*.unfinished"))
     before = {path: path.stat().st_mtime_ns for path in category.rglob("*")}
     assert write_objects(tmp_path, **settings, progress=True) == category
     assert "already" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in category.rglob("*")} == before
     with pytest.raises(DataError, match="toy_objects"):
         write_objects(tmp_path, **{**settings, "seed": 1}, progress=False)
+
+
+def test_two_runs_that_make_the_same_set_at_once_both_get_it(tmp_path):
+    settings = {"scenes": 2, "frames": 2, "size": 8, "seed": 0, "workers": 1, "progress": False}
+    with ThreadPoolExecutor(2) as pool:
+        runs = [pool.submit(write_objects, tmp_path, **settings) for _ in range(2)]
+    assert [run.result() for run in runs] == [tmp_path / "toy_objects"] * 2
 
 
 def test_splits_share_no_sequence_and_list_every_frame(toy_root):
