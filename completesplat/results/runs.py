@@ -16,7 +16,6 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from completesplat.errors import CompleteSplatError
-from completesplat.metrics import Style
 
 SCORES, MODES = "metrics.json", "hidden_modes.json"
 RECORD, CONFIG, PLAN = "run.json", "config.yaml", "multirun.yaml"
@@ -121,6 +120,8 @@ def find_results(folder: Path) -> RunTree:
 
 def _result(path: Path, root: Path) -> ResultsFile:
     """Read a file of results; raise ValueError, with the reason, if it is unusable."""
+    from completesplat.metrics import Style  # which `predict` does not need
+
     content = read_mapping(path)
     if not content:
         raise ValueError("it cannot be read as a mapping in JSON")
