@@ -11,7 +11,10 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import printable
 from completesplat.weights import AUTO, check_name
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
+SUFFIXES = (
+    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm"),
+    *(".heic", ".heif"),
+)
 
 
 def check_inputs(verb: str, config: DictConfig) -> None:
@@ -47,6 +50,13 @@ def find_images(image: object) -> list[Path]:
     if not any(map(os.path.lexists, images)):
         raise CompleteSplatError(f"{printable(str(images[0])[:300])}: no such file")
     return images
+
+
+def left_out(image: object, images: Sequence[Path]) -> list[str]:
+    """Return the names of other files, without hidden ones, in folders that are given as `image`."""
+    entries = image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
+    there = [file for entry in entries for file in Path(str(entry)).glob("[!.]*") if file.is_file()]
+    return sorted(file.name for file in there if file not in images)
 
 
 def _images_of(path: Path) -> list[Path]:

@@ -13,7 +13,7 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
@@ -217,7 +217,8 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
 
 def _refuse_another_run(out: Path, config: Mapping[str, object], earlier: object, overrides: Sequence[str]) -> None:
     """Raise CompleteSplatError if a directory's run had settings that a run cannot continue with."""
-    different = _differences(OmegaConf.to_container(earlier), config)
+    before = cast(dict[str, object], OmegaConf.to_container(earlier))
+    different = _differences(before, config, (str(before.get("out")), str(config.get("out"))))
     others = {key for key in different if not key.startswith((*MAY_CHANGE, *ENDS))}
     if not others:
         return
@@ -247,11 +248,13 @@ def _refuse_earlier_end(out: Path, ends: Mapping[str, Any], earlier: Mapping[str
         raise CompleteSplatError(f"trainer.max_epochs={epochs} may end before the run in {out}: choose another out=DIR")
 
 
-def _differences(first: object, second: object, key: str = "") -> set[str]:
+def _differences(first: object, second: object, moved: tuple[str, str], key: str = "") -> set[str]:
+    """Return the keys of settings that differ by more than the folder's move."""
     if not isinstance(first, dict) or not isinstance(second, dict):
+        first = first.replace(*moved) if isinstance(first, str) else first
         return set() if first == second else {key}
     parts = [(f"{key}.{part}".lstrip("."), part) for part in first.keys() | second.keys()]
-    return {name for place, part in parts for name in _differences(first.get(part), second.get(part), place)}
+    return {name for place, part in parts for name in _differences(first.get(part), second.get(part), moved, place)}
 
 
 @contextmanager

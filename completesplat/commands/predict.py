@@ -22,16 +22,17 @@ from rich.markup import escape
 from rich.progress import Progress, TaskID
 from torch import Tensor
 
-from completesplat.commands.inputs import find_images
+from completesplat.commands.inputs import find_images, left_out
 from completesplat.commands.trained import open_generator, shown_background
 from completesplat.data.images.photograph import Photograph, outside_of_box, outside_of_mask
+from completesplat.data.sequences import first_names
 from completesplat.data.validation.processes import map_in_processes, share_of
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
 from completesplat.export.prediction import SCENE_FILE, OutputFiles, Shot, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
-from completesplat.files import folder_names, printable, safe_name
+from completesplat.files import counted, folder_names, printable, safe_name
 from completesplat.generator import CompleteSplat
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene_model import SceneModel, distance_to_training, match_shipped
@@ -39,6 +40,8 @@ from completesplat.settings.checks import REMOVE
 from completesplat.settings.composition import has_bfloat16
 from completesplat.version import __version__
 from completesplat.weights import sha256_of
+
+logger = logging.getLogger(__name__)
 
 OF_RUNS = ("image", "out", "shard", "shards", "devices")  # settings on which no single prediction depends
 FAR = 1.5  # ratio of tan(fov / 2), photo to training, from which a warning is given
@@ -59,6 +62,8 @@ def run(config: DictConfig, out: Path) -> None:
     """
     wanted = output_files(config)
     images = find_images(config.image)
+    if others := left_out(config.image, images):
+        logger.warning("left out: %s: %s", counted(len(others), "other file"), first_names(others))
     if config.mask is not None and len(images) > 1:
         raise CompleteSplatError("mask=FILE belongs to one image; box=[x0,y0,x1,y1] goes for several")
     share_of(images, config.shard, config.shards)  # refuses a shard that does not exist

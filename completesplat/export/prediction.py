@@ -160,6 +160,8 @@ def write_prediction(
     shots = [replace(x, scene=cleaned(x.scene, f"{settings['image']}: sample {i}")) for i, x in enumerate(shots)]
     scenes, reference = [shot.scene for shot in shots], shots[0].camera
     make_folder(folder)
+    if (folder / SCENE_FILE).is_file():
+        logger.info("%s: an earlier prediction is replaced", folder)
     for file in filter(lambda file: WRITTEN.fullmatch(file.name), [*folder.iterdir()]):
         file.unlink()
     write_png(folder / PHOTO_FILE, Image.fromarray(to_pixels(image)))

@@ -62,15 +62,17 @@ def sweep_rows(finished: Sequence[Job]) -> list[Entry]:
     A score that was not measured in all jobs is left out, because a mean over fewer seeds than the row states would
     mislead.
     """
-    settings: dict[frozenset[tuple[str, str]], list[Job]] = {}
+    settings: dict[frozenset[tuple[str, str]], dict[object, Job]] = {}
     for job in finished:
         shared = frozenset((key, value) for key, value in job.overrides.items() if key != SEED)
-        settings.setdefault(shared, []).append(job)
+        # An extended sweep may have jobs of one seed with and without an override.
+        seed = job.overrides.get(SEED, str(job.config.get(SEED)))
+        settings.setdefault(shared, {})[seed] = job
 
     def order(row: Entry) -> list[tuple[bool, str]]:  # alphabetical by part, the unchanged method last
         return [(part == PROPOSED, part) for part in row.label.split(", ")]
 
-    ours = sorted((_row(jobs[0].label, jobs) for jobs in settings.values()), key=order)
+    ours = sorted((_row(next(iter(jobs.values())).label, [*jobs.values()]) for jobs in settings.values()), key=order)
     naive = dict.fromkeys(predictor for job in finished for predictor in job.test if predictor != MODEL)
     return [*ours, *(_row(name, [job for job in finished if name in job.test], name) for name in naive)]
 

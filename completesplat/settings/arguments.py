@@ -27,6 +27,7 @@ DASHES = (
     "`completesplat predict PHOTO out=DIR`"
 )
 SWEEP = ("-m", "--multirun")
+PLAIN = re.compile(r"[\w ./+@%-]+")  # with letters of any language, which Hydra wants quoted
 WORDS = {"predict": ("image",), "view": ("path",), "new": ("kind", "name"), "data import": ("folder",)}
 """By verb, or verb and task, the settings whose values are given as words without `=`."""
 
@@ -114,7 +115,7 @@ def _with_file(argument: str) -> str:
     key, equals, value = argument.partition("=")
     if equals and value.startswith("~/"):  # shells leave it as it is behind `=`
         return f"{key}={quoted(os.path.expanduser(value))}"
-    if not equals or not os.path.exists(value):
+    if not equals or not (os.path.exists(value) or (key == "out" and PLAIN.fullmatch(value))):
         return argument
     try:
         override = OverridesParser.create().parse_override(argument)

@@ -31,6 +31,7 @@ from completesplat.viewer.splat_view import SplatView
 Task = Callable[[], None]
 
 THUMBNAIL, MOST_THUMBNAILS = 96, 24  # px
+LONGEST_JOB = 30.0  # seconds that the end waits for a job
 
 log = logging.getLogger(__name__)
 
@@ -46,8 +47,9 @@ class Worker:
         self._failed = failed
         self._waiting: dict[str, Task] = {}
         self._changed = threading.Condition()
-        self._busy = self._closed = False
-        threading.Thread(target=self._run, name="completesplat-viewer", daemon=True).start()
+        self._busy = self.closed = False
+        self._thread = threading.Thread(target=self._run, name="completesplat-viewer", daemon=True)
+        self._thread.start()
 
     def submit(self, kind: str, job: Task) -> None:
         """Add a job after the waiting ones, or replace the waiting job of the same kind."""
@@ -61,19 +63,20 @@ class Worker:
             return self._changed.wait_for(lambda: not self._busy and not self._waiting, timeout)
 
     def close(self) -> None:
-        """Drop the waiting jobs, and end the thread after the current job."""
+        """Drop the waiting jobs, and wait for the current one: torch aborts a process that ends while it computes."""
         with self._changed:
             self._waiting.clear()
-            self._closed = True
+            self.closed = True
             self._changed.notify_all()
+        self._thread.join(LONGEST_JOB)
 
     def _run(self) -> None:
         while True:
             with self._changed:
                 self._busy = False
                 self._changed.notify_all()
-                self._changed.wait_for(lambda: bool(self._waiting) or self._closed)
-                if self._closed:
+                self._changed.wait_for(lambda: bool(self._waiting) or self.closed)
+                if self.closed:
                     return
                 job = self._waiting.pop(next(iter(self._waiting)))
                 self._busy = True

@@ -139,10 +139,13 @@ def test_images_that_fail_are_named_and_do_not_stop_the_others(predict, tmp_path
 
     monkeypatch.setattr(CompleteSplat, "forward", faulty)
     save(tmp_path / "x/a.png")
+    for other in ("noext", "notes.txt", ".hidden"):
+        (tmp_path / "x" / other).write_text("no photo")
     (tmp_path / "x/b.jpg").write_bytes(b"\xff\xd8\xff\xe0 truncated")
     lime, blue = save(tmp_path / "lime.png", "lime"), save(tmp_path / "y/a.png", "blue")
     finished = predict(f"[{tmp_path / 'x'},nowhere.png,{lime},{blue}]")
     assert finished.status == 2
+    assert "left out: 2 other files: noext, notes.txt" in finished.out
     broken, missing, fault, summary = finished.err.splitlines()
     assert re.match("error: .*b.jpg", broken)
     assert "nowhere.png: no such file" in missing
@@ -163,7 +166,9 @@ def test_a_prediction_leaves_no_file_of_an_earlier_one_and_what_a_user_put_there
     image, folder = save(tmp_path / "a.png"), tmp_path / "out/a"
     assert predict(image, "formats=[ply,glb]", "video=[orbit]", "maps=true").status == 0
     (folder / "sample_00_mine.ply").write_text("mine")
-    assert predict(image, "formats=[splat]").status == 0
+    again = predict(image, "formats=[splat]")
+    assert again.status == 0
+    assert f"{folder}: an earlier prediction is replaced" in again.out + again.err
     kept = {"photo.png", "sample_00.splat", "sample_00_mine.ply", "sheet.png", "scene.json"}
     assert {path.name for path in folder.iterdir()} == kept
 

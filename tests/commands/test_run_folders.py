@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -127,6 +128,15 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     assert jobs.is_finished(tmp_path, config())
     for longer in ({"max_steps": 40, "test": True}, {"max_steps": -1}, {"max_time": {"hours": 1}, "max_steps": 21}):
         assert not jobs.is_finished(tmp_path, config(**longer))
+    (moved := tmp_path / "moved").mkdir()
+    (moved / "checkpoints").mkdir()
+    (moved / jobs.LAST).touch()
+    placed = {out: config() | {"out": str(out), "folder": f"{out}/checkpoints"} for out in (tmp_path, moved)}
+    OmegaConf.save(placed[tmp_path], moved / "config.yaml")
+    assert not jobs.is_finished(moved, placed[moved])
+    with pytest.raises(CompleteSplatError, match="a run with another folder: "):
+        jobs.is_finished(moved, placed[moved] | {"folder": "elsewhere"})
+    shutil.rmtree(moved)
     advice = f"give all settings of {tmp_path}/run.json again, or continue in another folder"
     again = f"completesplat fit optimizer.lr=2 ckpt_path={tmp_path}/checkpoints/last.ckpt out=MORE"
     for changed, message in (

@@ -72,6 +72,14 @@ def test_one_seed_has_no_deviation_one_without_a_score_no_mean_and_one_that_dive
     assert ",nan,nan" in (sweep.folder / "summary.csv").read_text()
 
 
+def test_a_seed_of_an_extended_sweep_counts_once(sweep) -> None:
+    sweep.scored("ablation=m1", psnr=20.0)  # the config's seed is 0
+    for seed in range(2):
+        sweep.scored("ablation=m1", f"seed={seed}", psnr=20.0 + seed)
+    (row, *_), _ = summarize(sweep.folder)
+    assert (row.seeds, row.scores[PSNR]) == (2, 20.5)
+
+
 def test_different_numbers_of_scenes_have_a_remark(sweep) -> None:
     sweep.scored("ablation=m1", "seed=0", psnr=20.0, scenes=40, steps=9)
     sweep.scored("ablation=m1", "seed=1", psnr=20.0, scenes=38, steps=7)

@@ -60,6 +60,7 @@ def test_a_setting_that_names_an_existing_file_is_that_name_but_for_numbers_and_
         ("new", ["loss", "mine"], ["kind='loss'", "name='mine'"]),
         # As an agent of W&B's sweeps gives settings, unless its command has ${args_no_hyphens}.
         ("fit", ["--optimizer.lr=1", "-m", "--seed=0,1", "--test=0"], ["-m", "optimizer.lr=1", "seed=0,1", "test=0"]),
+        ("predict", ["a.png", "out=größe 写"], ["image='a.png'", "out='größe 写'"]),
         ("predict", ["--image=a.png", "--config-dir=b"], ["--config-dir=b", "image=a.png"]),
     ],
 )

@@ -144,6 +144,9 @@ def test_the_lines_of_the_readme_run_as_they_stand(tmp_path, monkeypatch, comman
     exec(lines, names)
     assert names["scores"]["test/full/novel/psnr"] > 5
     assert isinstance(names["model"], completesplat.ReconstructionModule)
+    exec('from pathlib import Path\ntrainer.model.save_weights(Path("W"))', names)
+    photo = next(tmp_path.glob("DATA/*/*/images/*.jpg"))
+    assert command("predict", f"image={photo}", "weights=W", "steps=2", "video=[]", "out=P").status == 0
 
 
 @pytest.mark.slow

@@ -118,7 +118,7 @@ def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
         folders = below if photos else [folder, *below]
     there = {path for searched in folders for path in searched.glob("[!.]*") if path.is_file()}
     if others := sorted({path.name for path in there.difference(photos)}):
-        advice = "" if "HEIF" in formats else '; HEIC needs: pip install "completesplat[heic]"'
+        advice = "" if "HEIF" in formats else files.NEEDS_HEIC
         logger.warning("left out: %s of other formats: %s%s", counted(len(others), "file"), first_names(others), advice)
     return photos
 

@@ -19,6 +19,7 @@ from completesplat.errors import ImageError
 from completesplat.files import by_numbers
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
+HEIC, NEEDS_HEIC = (".heic", ".heif"), '; HEIC needs: pip install "completesplat[heic]"'
 MOST_PIXELS = 50_000_000
 MOST_BYTES = 2**28
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
@@ -89,14 +90,14 @@ def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height w
     return torch.from_numpy(depth * np.float32(scale_adjustment))[None]
 
 
-def photo_formats() -> tuple[str, ...]:
+def photo_formats(formats: tuple[str, ...] = FORMATS) -> tuple[str, ...]:
     """Return the formats of photos, with that of HEIC where pillow-heif is installed."""
     try:
         import pillow_heif
     except ImportError:
-        return FORMATS
+        return formats
     pillow_heif.register_heif_opener()
-    return *FORMATS, "HEIF"
+    return *formats, "HEIF"
 
 
 def image_files(folder: Path, formats: Sequence[str] = FORMATS) -> list[Path]:
@@ -134,7 +135,8 @@ def open_image(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator
         except ImageError:
             raise
         except UnidentifiedImageError:
-            raise ImageError(f"not an image in one of the formats {', '.join(formats)}") from None
+            advice = "" if "HEIF" in formats or not str(source).lower().endswith(HEIC) else NEEDS_HEIC
+            raise ImageError(f"not an image in one of the formats {', '.join(formats)}{advice}") from None
         except Image.DecompressionBombError:
             raise ImageError(f"more than {MOST_PIXELS:,} pixels") from None
         # On damaged files, Pillow's decoders raise almost any exception: OSError, SyntaxError, struct.error, ...

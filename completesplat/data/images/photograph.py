@@ -120,7 +120,8 @@ def _loaded(source: ImageLike) -> tuple[Image.Image, Tags]:
         _require_content(Path(source))
     elif not isinstance(source, Image.Image):
         raise ImageError(f"{type(source).__name__}: give a file name, a PIL image, an array or a tensor")
-    with nullcontext(source) if isinstance(source, Image.Image) else files.open_image(source, FORMATS) as file:
+    formats = files.photo_formats(FORMATS)
+    with nullcontext(source) if isinstance(source, Image.Image) else files.open_image(source, formats) as file:
         if min(file.size) < SMALLEST_SIDE:
             raise ImageError(f"{file.size} pixels; at least {SMALLEST_SIDE} on a side are needed")
         if not isinstance(source, Image.Image):
