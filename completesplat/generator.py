@@ -148,7 +148,14 @@ class CompleteSplat(SceneModel):
             noise = sampling.draw_noise(len(images), samples, shape, seed).to(images.device)
             image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
             denoise = partial(self._denoise_in_bfloat16, images.device.type) if bfloat16 else self.denoiser
-            decode = partial(self._decode, image_of, features, weight, cameras, depth_range)
+
+            def decode(latent: Tensor, part: slice) -> Gaussians:
+                """Decode the latents of a part of all samples; `image_of` has the index of each one's image."""
+                indices = image_of[part]
+                skips = [feature[indices] for feature in features], weight
+                unscaled = latent * self.latent_std + self.latent_mean
+                splatter_image: SplatterImage = stage1.reconstructor(unscaled, *skips)
+                return splatter_image.gaussians(cameras[indices], depth_range[indices])
 
             def draw(part: slice) -> Tensor:
                 watch = None if on_step is None else lambda step, t, latent: on_step(step, t, decode(latent, part))
@@ -166,23 +173,6 @@ class CompleteSplat(SceneModel):
         with torch.autocast(device, torch.bfloat16):
             result: Tensor = self.denoiser(*inputs)
         return result
-
-    def _decode(
-        self,
-        image_of: Tensor,
-        features: Sequence[Tensor],
-        skip_weight: float,
-        cameras: Cameras,
-        depth_range: Tensor,
-        latent: Tensor,
-        part: slice,
-    ) -> Gaussians:
-        """Decode the latents of a part of all samples; `image_of` maps each sample to the index of its image."""
-        indices = image_of[part]
-        skips = [feature[indices] for feature in features], skip_weight
-        unscaled = latent * self.latent_std + self.latent_mean
-        splatter_image: SplatterImage = self.autoreconstructor.reconstructor(unscaled, *skips)
-        return splatter_image.gaussians(cameras[indices], depth_range[indices])
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Use another sampler from now on, with the noise schedule and prediction type of training.

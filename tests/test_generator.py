@@ -219,15 +219,16 @@ def test_an_image_is_encoded_once_for_all_samples_and_steps_and_only_as_far_as_s
 
 
 def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(model, photo, monkeypatch):
-    whole, decode, sizes = model(photo, samples=5, batch=5, steps=2), model._decode, []
+    whole, reconstructor, sizes = model(photo, samples=5, batch=5, steps=2), model.autoreconstructor.reconstructor, []
+    decode = reconstructor.forward
 
     def small(*inputs):
-        sizes.append(len(inputs[-2]))
+        sizes.append(len(inputs[0]))
         if sizes[-1] > 2:
             raise torch.cuda.OutOfMemoryError
         return decode(*inputs)
 
-    monkeypatch.setattr(model, "_decode", small)
+    monkeypatch.setattr(reconstructor, "forward", small)
     denoised = []
     hook = model.denoiser.register_forward_pre_hook(lambda _, inputs: denoised.append(len(inputs[0])))
     parts = model(photo, samples=5, batch=5, steps=2)
