@@ -20,12 +20,10 @@ BAD_NAME = {errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno
 PROBE_BYTES = 2**16
 LONGEST = 100  # bytes of UTF-8
 MOST_SHOWN, SHORT = 500, 120  # characters of a message, and of a value in it
-UNNAMED = "unnamed"
 SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")  # files of Gaussians that are read
 # Control characters, line breaks, changes of direction, and the surrogates that stand for bytes that are not UTF-8.
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}(\.\w+)?")  # names of temporary files
-SEPARATORS = re.compile(r"[/\\]")
 
 
 @contextmanager
@@ -185,9 +183,9 @@ def safe_name(text: str, ending: str = "") -> str:
     It is never empty, has no separators, leading dots or unprintable characters, and at most 100 bytes of UTF-8.
     `ending`, such as a number, is added to a name that is not empty without it.
     """
-    plain = SEPARATORS.sub("_", UNPRINTABLE.sub("_", text)).lstrip(".")
+    plain = re.sub(r"[/\\]", "_", UNPRINTABLE.sub("_", text)).lstrip(".")
     shortened = plain.encode()[: LONGEST - len(ending)].decode(errors="ignore")
-    return (shortened or UNNAMED) + ending
+    return (shortened or "unnamed") + ending
 
 
 def by_numbers(path: Path) -> list[tuple[int, str]]:

@@ -30,7 +30,6 @@ from completesplat.training.stage import Stage
 from completesplat.training.steps import Training, autocast
 
 VIEWS = 100
-MEGABYTE = 1e6
 
 
 class Duration(NamedTuple):
@@ -154,7 +153,7 @@ def time_and_memory(work: Work, repeats: int, device: torch.device, busy: int = 
     except (RuntimeError, AssertionError) as error:  # torch's compiler raises both kinds, too
         first = (str(error).strip().splitlines() or [""])[0]
         return {"not_measured": f"{type(error).__name__}: {first}"}
-    memory = {"memory_mb": torch.cuda.max_memory_allocated(device) / MEGABYTE} if device.type == "cuda" else {}
+    memory = {"memory_mb": torch.cuda.max_memory_allocated(device) / 1e6} if device.type == "cuda" else {}
     return {**row, **memory}
 
 

@@ -32,7 +32,6 @@ Scores = dict[tuple[str, str, str], float]
 DepthMaps = Float[Tensor, "image 1 height width"]
 SampledViews = Float[Tensor, "sample view 3 height width"]
 REGIONS = ("full", "object")
-PROPER_REGIONS = ("full", "hidden")
 MODEL, BEST, BEST_BY_METRIC, MEAN = "model", "best_of_k", "best_of_k_by_metric", "mean_of_k"
 BEST_RULES = {
     BEST: "of each region one sample for all metrics: that with the best `criterion` there, in novel views",
@@ -211,7 +210,7 @@ class Evaluation:
             for kind in ("curve", "curve_noisy_mean"):
                 results[BEST][kind] = _means([self.drawn[name][kind] for name in names])
             results[MEAN]["diversity"] = sum(self.drawn[name]["diversity"] for name in names) / len(names)
-            for region in PROPER_REGIONS:
+            for region in ("full", "hidden"):
                 ranks = [self.drawn[name]["ranks"] for name in names if region in self.drawn[name]["ranks"]]
                 if ranks:
                     results[MEAN][f"ranks_{region}"] = _means([shares[region] for shares in ranks])

@@ -32,7 +32,6 @@ from completesplat.training.callbacks import ExponentialMovingAverage
 from completesplat.training.stage import Stage
 
 ERROR_GAIN = 4
-PERCENTILES = (10, 50, 90)
 
 
 class DrawsFixedScenes(Callback):
@@ -219,7 +218,7 @@ def gaussian_figures(gaussians: Gaussians) -> dict[str, float]:
     """
     parts = {"opacity": gaussians.opacities, "log10_scale": gaussians.scales.log10(), "depth": gaussians.means[..., 2]}
     values = {name: tensor.float().flatten().cpu().numpy() for name, tensor in parts.items()}
-    return {f"gaussians/{name}_p{p}": float(np.percentile(x, p)) for name, x in values.items() for p in PERCENTILES}
+    return {f"gaussians/{name}_p{p}": float(np.percentile(x, p)) for name, x in values.items() for p in (10, 50, 90)}
 
 
 class Samples(DrawsFixedScenes):

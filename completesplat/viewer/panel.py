@@ -28,7 +28,6 @@ CUT_OUT = (
 )
 FILES = f"an image to complete, or a scene ({', '.join(SPLATS)}); or drop the file anywhere on the page"
 KEYS = 9  # keys 1 to 9 choose a sample; 0 shows all
-ONE_ANSWER = "One answer for each image: these weights draw no samples."
 VIDEO = "video"
 # Simulates a press of the number's key, which the page hears everywhere, because viser's HTML has no callbacks.
 CHOOSE = "this.dispatchEvent(new KeyboardEvent('keydown',{{key:'{0}',code:'Digit{0}',bubbles:true}}))"
@@ -51,7 +50,7 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
         remove = gui.add_checkbox("Cut the object out", start["remove_background"], hint=CUT_OUT)
     with gui.add_folder("Completion", order=2):
         if not draws:
-            gui.add_markdown(ONE_ANSWER)
+            gui.add_markdown("One answer for each image: these weights draw no samples.")
         free, diverse = "1: most faithful, 0: most free", "more: more diverse"
         slider, fits = cast(Any, partial(gui.add_slider, visible=draws)), start["color_fits"]
         return SimpleNamespace(

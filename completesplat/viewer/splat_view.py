@@ -24,7 +24,6 @@ from completesplat.viewer.sample import Sample
 LARGEST_COVARIANCE = 3e4
 GAP, NARROWEST_WINDOW, SAME = 1.25, 1.1, 0.15
 MARGIN = 1.15  # height and width that are shown, as multiples of the photo's
-ORBIT_CAMERAS = 12
 REFERENCE_COLOR, ORBIT_COLOR = (200, 60, 40), (60, 60, 60)
 
 
@@ -212,7 +211,7 @@ class SplatView:
             up = reference.intrinsics.new_tensor(self.up.tolist())
             groups = {
                 "reference": (reference[None], REFERENCE_COLOR),
-                "orbit": (orbit(reference, arrangement.pivots[i], up, ORBIT_CAMERAS), ORBIT_COLOR),
+                "orbit": (orbit(reference, arrangement.pivots[i], up, 12), ORBIT_COLOR),
             }
             look: Any = {"scale": 0.08 * arrangement.distance, "thickness": 1.5, "thickness_units": "screen"}
             for name in self.cameras & groups.keys():

@@ -14,13 +14,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 MULTIPLES = (1, 2, 2, 2)
-DROPOUT = 0.1
 HALF = math.sqrt(0.5)
-EPSILON = 1e-6
 
 
 def _norm(channels: int) -> nn.GroupNorm:
-    return nn.GroupNorm(min(32, channels // 4), channels, EPSILON)
+    return nn.GroupNorm(min(32, channels // 4), channels, eps=1e-6)
 
 
 class ScaledConvolution(nn.Conv2d):
@@ -52,7 +50,7 @@ class ResidualBlock(nn.Module):
         self.conv0 = ScaledConvolution(inputs, outputs, 3, scale)
         self.norm1 = _norm(outputs)
         self.conv1 = nn.Conv2d(outputs, outputs, 3, padding=1)
-        self.dropout = nn.Dropout(DROPOUT)
+        self.dropout = nn.Dropout(0.1)
         self.skip = ScaledConvolution(inputs, outputs, 1, scale) if scale or inputs != outputs else None
         self.attends = attends
         if attends:

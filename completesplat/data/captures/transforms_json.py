@@ -38,7 +38,6 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 RADIAL = {"SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2")}
 USED = {"SIMPLE_PINHOLE": (), "PINHOLE": (), **RADIAL, "OPENCV": COEFFICIENTS}
 OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
-JsonObject = Mapping[str, object]
 FEWEST_CAMERAS = 2
 SAME_FOCAL = 1e-3
 POLYCAM = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
@@ -188,7 +187,7 @@ def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
     return world_to_camera
 
 
-def _read_lens(values: JsonObject, image: Path) -> Lens:
+def _read_lens(values: Mapping[str, object], image: Path) -> Lens:
     model = values.get("camera_model", "OPENCV")
     others = [key for key in OTHER_LENSES if values.get(key)]
     if not isinstance(model, str) or model not in USED or others:

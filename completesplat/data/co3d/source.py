@@ -31,8 +31,6 @@ from completesplat.data.validation import BadImage, read_points
 from completesplat.errors import DataError, errors_at
 from completesplat.geometry.cameras import pixel_centers, unproject
 
-DEPTH_MAPS = 8
-DEPTH_QUANTILE = 0.99
 FOREGROUND = 128  # smallest mask value, of 255
 
 
@@ -79,11 +77,11 @@ def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
 
     The 99 % and 1 % quantiles replace the largest and smallest values, because depth maps have outliers.
     """
-    count, points = min(len(frames), DEPTH_MAPS), []
+    count, points = min(len(frames), 8), []
     for frame in (frames[i * len(frames) // count] for i in range(count)):
         with errors_at(frame=frame.number):
             points.append(_foreground(frame))
-    return from_points(np.concatenate(points), axes, "the depth maps' foreground", DEPTH_QUANTILE)
+    return from_points(np.concatenate(points), axes, "the depth maps' foreground", quantile=0.99)
 
 
 def _foreground(frame: CO3DFrame) -> np.ndarray:

@@ -18,7 +18,6 @@ from completesplat.settings.schema import Entries, Positive, Range, Share, check
 
 Images = Float[Tensor, "view 3 height width"]
 Plane = Float32[ndarray, " pixel"]
-Zoom = Annotated[float, Range(0.1, 10)]
 BRIGHTNESS, CONTRAST, SATURATION, HUE = range(4)
 GREY_WEIGHTS = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float32)[:, None, None]  # ITU-R BT.601
 ZERO, ONE, TWO, FOUR, SIX = (np.float32(number) for number in (0, 1, 2, 4, 6))
@@ -164,7 +163,7 @@ class CameraJitter:
     """
 
     roll: Annotated[float, Range(0, 180)] = 15.0
-    zoom: Annotated[Sequence[Zoom], Entries(2, 2)] = (0.85, 1.05)
+    zoom: Annotated[Sequence[Annotated[float, Range(0.1, 10)]], Entries(2, 2)] = (0.85, 1.05)
     shift: Annotated[float, Range(0, 0.5)] = 0.05
 
     def __post_init__(self) -> None:

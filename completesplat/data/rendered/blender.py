@@ -23,7 +23,6 @@ ADVICE = (
 )
 SCRIPT = Path(__file__).with_name("_scene_script.py")
 SECONDS_TO_START = 120
-SECONDS_BETWEEN_LOOKS = 0.1
 # Neither this package's modules nor those beside the script are for Blender's Python.
 PYTHON_OPTIONS = ("-E", "-P")
 
@@ -100,7 +99,7 @@ def run_job(
             while process.poll() is None:
                 if stopped.is_set() or time.monotonic() > end:
                     process.kill()
-                time.sleep(SECONDS_BETWEEN_LOOKS)
+                time.sleep(0.1)
     result = folder / "result.json"
     if process.returncode == 0 and result.is_file():
         return dict(json.loads(result.read_text()))

@@ -23,7 +23,6 @@ NEAREST, FARTHEST = 0.9, 1.2
 ROOM, SMALLEST_ROOM = 1.3, 3.0  # half size of a room: relative to the farthest camera, and at least
 TEXTURES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 ENVIRONMENTS = (".hdr", ".exr")
-GREY = 0.5
 WHITE_FLOOR = 0.5, 1.1
 ASIDE = 45.0
 """Largest angle in degrees between the first camera's azimuth and the object's front."""
@@ -161,7 +160,7 @@ def draw_surface(rng: np.random.Generator, surface: str) -> dict[str, Any] | Non
     if surface == "none":
         return None
     if surface == "plain":
-        return {"pattern": "checker", "colors": [[GREY] * 3] * 2, "repeats": 1.0, "file": ""}
+        return {"pattern": "checker", "colors": [[0.5] * 3] * 2, "repeats": 1.0, "file": ""}
     repeats = float(np.exp(rng.uniform(np.log(0.3), np.log(3))))
     if surface == "random":
         base = rng.uniform(0.1, 0.9) * (1 - rng.uniform(0, 0.5) * rng.uniform(size=3))

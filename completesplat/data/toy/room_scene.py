@@ -132,8 +132,6 @@ STEPS = (0.012, 0.032)
 LARGEST_TURN = np.radians(3.0)
 WAYPOINTS = 4
 FIELD_OF_VIEW = (55, 75)
-DENSE = 400
-ASPECT = 16 / 9
 
 
 @dataclass(frozen=True)
@@ -164,7 +162,7 @@ class CameraMove:
 
 def image_width(height: int) -> int:
     """Return the even number nearest to 16 / 9 of the height."""
-    return 2 * round(height * ASPECT / 2)
+    return 2 * round(height * (16 / 9) / 2)
 
 
 def draw_move(rng: np.random.Generator, frames: int, size: Array, furniture: Sequence[Part]) -> CameraMove:
@@ -195,7 +193,7 @@ def _path(rng: np.random.Generator, frames: int, size: Array, furniture: Sequenc
         waypoints = _waypoints(rng, size, stride)
         parameters = np.linspace(0, 1, WAYPOINTS)
         cubic = np.polynomial.polynomial.polyfit(parameters, waypoints, WAYPOINTS - 1)
-        dense = np.linspace(0, 1, DENSE)
+        dense = np.linspace(0, 1, 400)
         points = np.polynomial.polynomial.polyval(dense, cubic).T
         lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
         reached = np.linspace(0, min(step * (frames - 1), lengths[-1]), frames)
