@@ -8,7 +8,6 @@ import os
 import statistics
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -287,7 +286,7 @@ def count_work(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
     weights = counts.memory["weights"] if averaged else 0
     more = {"averages": weights, "copies for ddp": counts.memory["gradients"] if config.devices > 1 else 0}
     update = [*counts.update, Operation(0, 3 * weights)]  # weights and averages are read, averages are written
-    return replace(counts, update=update, memory={**counts.memory, **more})
+    return counts._replace(update=update, memory={**counts.memory, **more})
 
 
 def memory_limit(config: DictConfig) -> float:

@@ -1,7 +1,6 @@
 """Placement of a sequence's object: square images, a common object size, and depth ranges around the object."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -25,8 +24,7 @@ SMALLEST_BASELINE = 0.01
 Axes = Float[np.ndarray, "3 3"]
 
 
-@dataclass(frozen=True)
-class ObjectFraming:
+class ObjectFraming(NamedTuple):
     """Image size, and depth range in front of and behind the object's centre; the object's half size is 0.57."""
 
     image_size: int

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypedDict, cast
+from typing import Any, NamedTuple, TypedDict, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
@@ -76,8 +76,7 @@ def flat_scores(entry: Mapping[str, object]) -> FlatScores:
     return scores
 
 
-@dataclass(frozen=True)
-class ResultsFile:
+class ResultsFile(NamedTuple):
     """File of results: its folder, the folder's name, how it was measured, and its scores by predictor."""
 
     folder: Path

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from completesplat.files import atomic_path, write_text
 from completesplat.metrics import PSNR_LIMIT, STYLES, Style
@@ -77,8 +77,7 @@ def marks(values: Sequence[float | None], competing: Sequence[bool], style: Styl
     return [UNMARKED if value is None else mark_of.get(value, UNMARKED) for value in written]
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """Text of a cell, its mark (`BEST`, `SECOND` or `UNMARKED`), and the exact value of figures of ours."""
 
     text: str
@@ -94,16 +93,14 @@ def score_cell(style: Style, value: float | None, deviation: float | None = None
     return Cell(f"{style.text(value)}{after}", mark, value)
 
 
-@dataclass(frozen=True)
-class TableRow:
+class TableRow(NamedTuple):
     """Row of a table; a rule separates rows of different sources, such as the paper and a run."""
 
     source: str
     cells: list[Cell]
 
 
-@dataclass(frozen=True)
-class Heading:
+class Heading(NamedTuple):
     """Heading of a column, and the format of its values; the columns of a group share the heading above."""
 
     text: str

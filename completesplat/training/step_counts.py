@@ -8,7 +8,6 @@ tensors are freed when real ones would be.
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -53,8 +52,7 @@ class Operation(NamedTuple):
     bytes: float
 
 
-@dataclass(frozen=True)
-class StepCounts:
+class StepCounts(NamedTuple):
     """Work and memory of one optimizer step of one process.
 
     Attributes:

@@ -90,7 +90,7 @@ class CaptureSetDataModule(ObjectDataModule):
         }
 
     def packed_settings(self) -> dict[str, Scalar]:
-        return {"splits": self.splits} | self.seeded._asdict() | vars(self.framing)
+        return {"splits": self.splits, **self.seeded._asdict(), **self.framing._asdict()}
 
     def open(self, split: str) -> Mapping[str, CaptureSource]:
         """Read the cameras of all captures; one that cannot be read is only refused, unless all are."""

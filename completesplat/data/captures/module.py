@@ -205,7 +205,7 @@ class CaptureDataModule(ObjectDataModule):
         }
 
     def packed_settings(self) -> dict[str, Scalar]:
-        return {"hold_out": self.hold_out, **vars(self.framing)}
+        return {"hold_out": self.hold_out, **self.framing._asdict()}
 
     def open(self, split: str) -> Mapping[str, CaptureSource]:
         """Read the cameras of all captures; the error of one capture is only raised if no other can be read."""

@@ -79,7 +79,7 @@ class CO3DDataModule(ObjectDataModule):
 
     def packed_settings(self) -> dict[str, Scalar]:
         chosen = {name: getattr(self, name) for name in ("category", "subset", "allow_shared_sequences")}
-        return chosen | self.seeded._asdict() | vars(self.filters) | vars(self.framing)
+        return chosen | self.seeded._asdict() | self.filters._asdict() | self.framing._asdict()
 
     def open(self, split: str) -> Mapping[str, CO3DSource]:
         """Open all splits at once, because they share the annotations. Sequences without images are left out.

@@ -102,8 +102,7 @@ def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Lis
     return {split: {(name, number) for name in names[split] for number in frames[name]} for split in SPLITS}
 
 
-@dataclass(frozen=True)
-class Filters:
+class Filters(NamedTuple):
     """Criteria for the sequences that are used.
 
     Attributes:

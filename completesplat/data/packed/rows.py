@@ -3,7 +3,7 @@
 import io
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -73,8 +73,7 @@ def decode_square(content: bytes, channels: int, size: int, wanted: int) -> UInt
     return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
 
 
-@dataclass(frozen=True)
-class EncodedImage:
+class EncodedImage(NamedTuple):
     """Encoded files of an image and of its mask, if it has one."""
 
     image: bytes

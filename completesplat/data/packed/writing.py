@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import pyarrow as pa
 from rich.filesize import decimal
@@ -43,8 +43,7 @@ OnBad = Literal["raise", "skip"]
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class ShardPlan:
+class ShardPlan(NamedTuple):
     """File name and sequences of a shard to be written."""
 
     file: str

@@ -1,10 +1,9 @@
 """Data module of RealEstate10K, whose clips become posed sequences."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -27,8 +26,7 @@ from completesplat.weights import sha256_of
 Clips = TextClips | ChunkedClips
 
 
-@dataclass(frozen=True)
-class ClipFraming:
+class ClipFraming(NamedTuple):
     """Settings of images and cameras; see `RE10KDataModule`."""
 
     image_size: int
@@ -163,7 +161,7 @@ class RE10KDataModule(SceneDataModule):
         }
 
     def packed_settings(self) -> dict[str, Scalar]:
-        return {**vars(self.framing), "val_fraction": self.val_fraction, "val_seed": self.val_seed}
+        return {**self.framing._asdict(), "val_fraction": self.val_fraction, "val_seed": self.val_seed}
 
     def open(self, split: str) -> Mapping[str, RE10KSource]:
         """Open the test clips, or the clips of the folder `train` for both training and validation."""
