@@ -25,7 +25,7 @@ from completesplat.export.formats import write_splat
 from completesplat.export.images import write_png
 from completesplat.export.ply import write_ply
 from completesplat.export.video import write_video
-from completesplat.files import make_folder, write_text
+from completesplat.files import make_folder, write_json, write_text
 from completesplat.tensors import concatenate
 from completesplat.training.checkpoints import CheckpointFiles
 from completesplat.training.loggers import MetricsFile
@@ -84,7 +84,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "last.ckpt": checkpoint,
     "metrics.csv": rows,
     "metrics.json": lambda path: write_text(path, "figures " * 500),
-    "check.json": lambda path: AuditReport(1, 1, [], {"left out": dict.fromkeys("ab" * 50, 1)}, {}).write(path),
+    "check.json": lambda path: write_json(path, AuditReport(1, 1, [], {"left out": {"ab" * 50: 1}}, {}).json()),
     "sheet.png": image,
     "sample.ply": lambda path: write_ply(path, gaussians(100)),
     "sample.splat": lambda path: write_splat(path, gaussians(100)),

@@ -25,7 +25,7 @@ def check(data: Any, splits: SplitNames, workers: Positive | None, out: Path) ->
         findings = audit.check(sources, workers, splits_share_sequences=data.splits_share_sequences)
     except DataError as error:  # concerns the data set as a whole
         findings = audit.AuditReport(0, 0, [error], {}, {})
-    findings.write(out / "check.json")
+    write_json(out / "check.json", findings.json())
     audit.show_findings(findings)
     if not findings.sequences:
         print(out)

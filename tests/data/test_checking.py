@@ -11,6 +11,7 @@ from torch import Tensor
 from completesplat.data.validation import BadAnnotation, ChangedFile, MissingFile
 from completesplat.data.validation.audit import AuditReport, check, show_findings
 from completesplat.data.validation.processes import map_in_processes
+from completesplat.files import write_json
 
 
 def check_quietly(**sources: ListedSource) -> AuditReport:
@@ -59,7 +60,7 @@ def test_every_planted_fault_is_found_once_written_and_shown(tmp_path: Path, cap
     assert places(findings) == PLANTED
     assert len(findings.refused) == len(PLANTED)
     assert findings.splits == {"train": {"sequences": 2, "frames": 2 + 3}, "val": {"sequences": 2, "frames": 3 + 2}}
-    findings.write(tmp_path / "check.json")
+    write_json(tmp_path / "check.json", findings.json())
     written = strict_json(tmp_path / "check.json")
     assert written == findings.json()
     assert written["shared"] == {"train and val": ["b"]}

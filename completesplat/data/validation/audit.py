@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
 from rich.console import Console
 from rich.progress import Progress
@@ -14,7 +13,7 @@ from completesplat.data.sequences import SequenceSource, overlaps, shared_names
 from completesplat.data.validation import TooFewFrames, refused_to
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError, errors_at
-from completesplat.files import printable, write_json
+from completesplat.files import printable
 
 FEWEST_FRAMES = 2
 LARGEST_BATCH = 16
@@ -63,9 +62,6 @@ class AuditReport:
             "shared": self.shared,
         }
 
-    def write(self, path: Path) -> None:
-        write_json(path, self.json())
-
 
 def check(
     sources: Sources, workers: int | None = None, progress: bool = True, splits_share_sequences: bool = False
@@ -93,7 +89,7 @@ def _report(
     refused = refused + [error for sequence in sequences for error in sequence.refused]
     refused += _too_short(sequences, {error.sequence for error in refused})
     unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in refused}
-    usable = {split: [sequence.usable_in(split) for sequence in sequences] for split in sources}
+    usable = {split: [x.usable & x.frames.get(split, set()) for x in sequences] for split in sources}
     names = {split: source.names for split, source in sources.items()}
     return AuditReport(
         **_numbers([sequence.usable for sequence in sequences]),
@@ -143,9 +139,6 @@ class _Sequence:
     frames: dict[str, set[int]] = field(default_factory=dict)
     usable: set[int] = field(default_factory=set)
     refused: list[DataError] = field(default_factory=list)
-
-    def usable_in(self, split: str) -> set[int]:
-        return self.usable & self.frames.get(split, set())
 
 
 def _batches(sources: Sources) -> list[_Batch]:
