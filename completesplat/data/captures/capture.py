@@ -15,18 +15,8 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
+from completesplat.data.images import files
 from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, read_exif
-from completesplat.data.images.files import (
-    EIGHT_BIT_MODES,
-    FORMATS,
-    check_sums,
-    decode_image,
-    open_image,
-    over_grey,
-    refused_as_bad,
-    stored_size,
-    turn_upright,
-)
 from completesplat.data.sequences import first_names
 from completesplat.data.validation import LARGEST, BadAnnotation, BadCamera, BadImage, TooFewFrames, require_file
 from completesplat.errors import CompleteSplatError, ImageError, errors_at
@@ -106,16 +96,18 @@ class CapturedFrame:
         """
         with errors_at(self.image, frame=self.number):
             orientation, mask = self.check(), None
-            with refused_as_bad(str(self.image)), open_image(self.image, FORMATS) as stored:
-                check_sums(stored, self.image)
+            with files.refused_as_bad(str(self.image)), files.open_image(self.image, files.FORMATS) as stored:
+                files.check_sums(stored, self.image)
                 stored.load()
-                if stored.has_transparency_data and stored.mode in EIGHT_BIT_MODES:
-                    turned = turn_upright(stored, orientation)
-                    image, mask = over_grey(turned, 1.0), turned.convert("RGBA").getchannel("A")
+                if stored.has_transparency_data and stored.mode in files.EIGHT_BIT_MODES:
+                    turned = files.turn_upright(stored, orientation)
+                    image, mask = files.over_grey(turned, 1.0), turned.convert("RGBA").getchannel("A")
             if mask is None:
-                image = decode_image(self.image, str(self.image), "RGB", self.lens.image_size, orientation is not None)
+                turn = orientation is not None
+                image = files.decode_image(self.image, str(self.image), "RGB", self.lens.image_size, turn)
             if self.mask is not None:
-                mask = decode_image(self.mask, str(self.mask), "L").resize(image.size, Image.Resampling.BILINEAR)
+                mask = files.decode_image(self.mask, str(self.mask), "L")
+                mask = mask.resize(image.size, Image.Resampling.BILINEAR)
             image = undistort(image, self.lens)
             return image, Image.new("L", image.size, 255) if mask is None else undistort(mask, self.lens)
 
@@ -127,10 +119,10 @@ class CapturedFrame:
         """
         height, width = self.lens.image_size
         with errors_at(require_file(self.image), frame=self.number):
-            size = (height, width) if self.mask is None else stored_size(self.mask, str(self.mask))
+            size = (height, width) if self.mask is None else files.stored_size(self.mask, str(self.mask))
             if not _same_aspect(size, (height, width)):
                 raise BadImage(f"has {size[0]} x {size[1]} pixels, its image {height} x {width}", str(self.mask))
-            with refused_as_bad(str(self.image)), open_image(self.image, FORMATS) as image:
+            with files.refused_as_bad(str(self.image)), files.open_image(self.image, files.FORMATS) as image:
                 orientation = read_exif(image).get(ORIENTATION)
                 as_stored, sideways = image.size == (width, height), orientation in SIDEWAYS
                 as_upright = image.size == (height, width) if sideways else as_stored
@@ -184,7 +176,7 @@ def fit_lens(frame: CapturedFrame) -> CapturedFrame:
 
     An image that has another aspect, or that cannot be read, is refused by `CapturedFrame.check` and `read`.
     """
-    with suppress(ImageError), open_image(frame.image, FORMATS) as image:
+    with suppress(ImageError), files.open_image(frame.image, files.FORMATS) as image:
         for size in (image.size[::-1], image.size):
             if size == frame.lens.image_size:
                 break
