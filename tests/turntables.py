@@ -1,6 +1,5 @@
 """Toy objects on a turntable, photographed, cropped and enlarged photo by photo."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ def toy() -> ToyScene:
     scene = draw_mini(np.random.default_rng(0), 2)
     textures = scene.shapes.textures.copy()
     textures[0], scene.shapes.colors[0, 1] = [CHECKS, 6, 0], 0.1
-    return replace(scene, shapes=scene.shapes._replace(textures=textures), fov_degrees=20.0)
+    return scene._replace(shapes=scene.shapes._replace(textures=textures), fov_degrees=20.0)
 
 
 def draw(scene: ToyScene, azimuth: float) -> Image.Image:
@@ -27,7 +26,7 @@ def draw(scene: ToyScene, azimuth: float) -> Image.Image:
     pose[:3, :3] = rotation_about("y", azimuth) @ np.diag([1, -1, -1])  # at azimuth 0 it looks along -z
     pose[:3, 3] = -DISTANCE * pose[:3, 2]
     light = scene.light._replace(place=rotation_about("y", azimuth) @ [0.5, 0.6, 0.62])
-    moved = replace(scene, camera_to_world=pose[None], light=light)
+    moved = scene._replace(camera_to_world=pose[None], light=light)
     color, coverage, _ = render_frame(moved, 0, SIZE)
     return Image.fromarray(to_uint8(color + 0.5 * (1 - coverage[..., None])))  # the dome behind it is grey
 

@@ -7,7 +7,7 @@ learns only the overall frequency of the colours.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -39,8 +39,7 @@ from completesplat.geometry.cameras import invert_rigid, look_at
 DARK = np.full(3, 0.07)
 
 
-@dataclass(frozen=True)
-class Blueprint:
+class Blueprint(NamedTuple):
     """Parts of an object, the first of which carries the hidden patch within a range of local heights."""
 
     family: str
@@ -157,8 +156,7 @@ FROM_THE_FRONT = 0.35
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 
-@dataclass(frozen=True)
-class ToyScene:
+class ToyScene(NamedTuple):
     """Scene and its cameras (OpenCV axes, [frame 4 4]); `unit` and `origin` place it in an arbitrary world.
 
     `chances` are the probabilities of `PATCH_COLORS`, given everything except the patch.

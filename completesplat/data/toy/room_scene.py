@@ -1,7 +1,7 @@
 """Random toy rooms: size, colours, furniture, and the path of the camera."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -134,8 +134,7 @@ WAYPOINTS = 4
 FIELD_OF_VIEW = (55, 75)
 
 
-@dataclass(frozen=True)
-class CameraMove:
+class CameraMove(NamedTuple):
     """Poses in the room ([frame 4 4], OpenCV axes), the lens, and the transform to the world of the files.
 
     `focal` is in image widths, `principal_point` (x, y) in image widths and heights. A point of the room has the world
@@ -224,8 +223,7 @@ def _is_free(centers: Array, size: Array, furniture: Sequence[Part]) -> bool:
     return bool(inside.all() and high.all() and all((s.distances(centers) >= MARGIN).all() for s in furniture))
 
 
-@dataclass(frozen=True)
-class RoomScene:
+class RoomScene(NamedTuple):
     """Room and the camera that moves through it."""
 
     room: Room

@@ -2,7 +2,6 @@
 
 import colorsys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -37,8 +36,7 @@ class Shapes(NamedTuple):
     textures: Array
 
 
-@dataclass(frozen=True)
-class Part:
+class Part(NamedTuple):
     """Ellipsoid, frustum or box: centre, half sizes along its axes, directions of the axes (columns), and texture."""
 
     kind: int
@@ -57,7 +55,7 @@ class Part:
     def moved(self, rotation: Array, shift: Array, scale: float = 1.0) -> "Part":
         """Return the part after rotation, then shift, then scaling of the object."""
         center = scale * (rotation @ self.center + shift)
-        return replace(self, center=center, half_sizes=scale * self.half_sizes, axes=rotation @ self.axes)
+        return self._replace(center=center, half_sizes=scale * self.half_sizes, axes=rotation @ self.axes)
 
     def distances(self, points: Array) -> Array:
         """Return the distances of points [n 3] to the (bounding) box; 0 inside."""

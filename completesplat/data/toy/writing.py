@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypedDict, Unpack
@@ -80,7 +79,7 @@ def _splits(scenes: int, rooms: bool) -> list[str]:
 def draw_category(category: str, seed: int, index: int, frames: int, light: Array) -> ToyScene:
     """Draw a scene of a category (a key of `DRAW`) from a separate random generator; `light` is `Light.color`."""
     scene = DRAW[category](np.random.default_rng([seed, index]), frames)
-    return replace(scene, light=scene.light._replace(color=light), point_colors=scene.point_colors * light)
+    return scene._replace(light=scene.light._replace(color=light), point_colors=scene.point_colors * light)
 
 
 def _write_scene(
@@ -108,7 +107,7 @@ def _write_scene(
 def _write_modes(folder: Path, scene: ToyScene, size: int) -> None:
     for mode, color in PATCH_COLORS.items():
         (folder / mode).mkdir()
-        painted = replace(scene, patch=scene.patch._replace(color=np.array(color)))
+        painted = scene._replace(patch=scene.patch._replace(color=np.array(color)))
         for frame, image in enumerate(sorted((folder / "images").iterdir())):
             save_jpeg(render_frame(painted, frame, size)[0], in_mode(image, mode))
 
@@ -131,7 +130,7 @@ def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed
     index, split = place
     rng = np.random.default_rng([seed, index])
     scene = draw_room_scene(rng, frames)
-    scene = replace(scene, light=scene.light._replace(color=light))
+    scene = scene._replace(light=scene.light._replace(color=light))
     width, start = image_width(size), int(rng.integers(LATEST_START))
     intrinsics, poses = scene.move.intrinsics(size, width), scene.move.world_to_camera().reshape(frames, 12)
     rows = np.concatenate([np.broadcast_to(intrinsics, (frames, 4)), np.zeros((frames, 2)), poses], axis=1)

@@ -1,5 +1,4 @@
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -125,7 +124,7 @@ def test_bare_white_walls_follow_lamberts_law():
         colors=np.ones_like(room.colors),
         decals=np.full_like(room.decals, -1),
     )
-    empty = replace(full, room=bare, shapes=moved_away(full.shapes))
+    empty = full._replace(room=bare, shapes=moved_away(full.shapes))
     points = seen_points(empty, frame, height, width)
     middle = points - [0, room.size[1] / 2, 0]
     face = np.abs(np.abs(middle) - room.size / 2).argmin(axis=1)
@@ -155,7 +154,7 @@ def test_furniture_stands_in_the_room_and_pieces_do_not_overlap_and_most_are_see
                 assert all(other.distances(points.T).min() > 0.02 for other in others)
     shares = []
     for full in map(scene, range(5)):
-        empty = replace(full, shapes=moved_away(full.shapes))
+        empty = full._replace(shapes=moved_away(full.shapes))
         depth, behind = (rooms.render_room_frame(each, 0, 32, 58)[1] for each in (full, empty))
         assert (depth <= behind).all()
         shares.append((depth < behind).mean())
