@@ -87,5 +87,5 @@ def test_maps_of_any_size_are_cut_as_the_image_is(monkeypatch, shape):
     half_pixel = 12 / shape[1] / 2
     assert depths.shape == (1, 2, 2)
     assert depths[0].flatten().tolist() == pytest.approx([70, 90, 70, 90], abs=10 * half_pixel)
-    unknown = source.square_depth(replace(frame, depth=None), Square(6, 2, 4), 2, factor=10.0)
+    unknown = source.square_depth(frame._replace(depth=None), Square(6, 2, 4), 2, factor=10.0)
     assert not unknown.any()

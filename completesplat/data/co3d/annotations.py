@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,8 +37,7 @@ class DepthMap(NamedTuple):
     scale_adjustment: float
 
 
-@dataclass(frozen=True)
-class CO3DFrame:
+class CO3DFrame(NamedTuple):
     """One image with its mask; `camera` is in float64 and in the sequence's own units."""
 
     number: int

@@ -110,10 +110,10 @@ class CO3DSource(SequenceSource):
 
     def with_images(self, path_of: Callable[[Path], Path]) -> "CO3DSource":
         frames = {
-            name: [replace(frame, image=path_of(frame.image)) for frame in frames]
+            name: [frame._replace(image=path_of(frame.image)) for frame in frames]
             for name, frames in self._members.frames.items()
         }
-        return CO3DSource(replace(self._members, frames=frames), self.framing, self._files, self.refused)
+        return CO3DSource(self._members._replace(frames=frames), self.framing, self._files, self.refused)
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the annotations, not of the images."""

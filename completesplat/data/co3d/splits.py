@@ -3,7 +3,6 @@
 import logging
 import os
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -117,8 +116,7 @@ class Filters(NamedTuple):
     most_training_sequences: int | None = None
 
 
-@dataclass(frozen=True)
-class SplitMembers:
+class SplitMembers(NamedTuple):
     """Frames and point clouds of one split by sequence, and the names left out by reason.
 
     Attributes:
@@ -136,7 +134,7 @@ class SplitMembers:
         """Return the split without some sequences, which are left out for this reason."""
         frames = {name: frames for name, frames in self.frames.items() if name not in names}
         lost = [name for name in self.frames if name in names]
-        return replace(self, frames=frames, left_out={**self.left_out, **({reason: lost} if lost else {})})
+        return self._replace(frames=frames, left_out={**self.left_out, **({reason: lost} if lost else {})})
 
 
 class Category(NamedTuple):

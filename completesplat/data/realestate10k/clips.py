@@ -10,10 +10,9 @@ import json
 import os
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from os.path import isfile
 from pathlib import Path
-from typing import TypeGuard
+from typing import NamedTuple, TypeGuard
 
 import torch
 from jaxtyping import Float, UInt8
@@ -49,8 +48,7 @@ Chunk = dict[str, dict[str, object]]
 Images = Sequence[Path] | Sequence[UInt8[Tensor, " _"]]
 
 
-@dataclass(frozen=True)
-class Clip:
+class Clip(NamedTuple):
     """Frames of a clip, in order.
 
     Attributes:
