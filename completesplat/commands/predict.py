@@ -129,13 +129,8 @@ def output_files(config: DictConfig) -> OutputFiles:
     formats, videos = _names(config.formats), _names(config.video)
     if not formats and not videos:
         raise CompleteSplatError(f"formats=[] video=[]: choose a format ({', '.join(FORMATS)}) or a video")
-    wanted = OutputFiles(
-        formats=formats,
-        videos=videos,
-        frames=config.frames,
-        maps=config.maps,
-        screen_space_dilation=config.screen_space_dilation,
-    )
+    settings = {name: config[name] for name in ("frames", "maps", "screen_space_dilation")}
+    wanted = OutputFiles(formats, videos, **settings)
     if set(formats) & set(CONVERTED):
         find_splat_transform()  # before the model runs
     return wanted
