@@ -28,7 +28,6 @@ BACKENDS = {"reference": ReferenceRasterizer, **FASTER}
 LONGEST_SECONDS = 4.0  # a backend that has run this long on a workload does not repeat it
 OPACITIES = ("trained", "initial")
 MOST_REFERENCE_PAIRS = 2**28  # of a Gaussian and a pixel; the reference takes a second for a tenth of them
-OnProgress = Callable[[str], None]
 
 
 class Backend(NamedTuple):
@@ -85,7 +84,7 @@ def working_backends(names: Sequence[str], constants: RenderingConstants) -> tup
 
 
 def speed_rows(
-    backends: Sequence[Backend], sizes: Sequence[int], views: Sequence[int], repeats: int, tick: OnProgress
+    backends: Sequence[Backend], sizes: Sequence[int], views: Sequence[int], repeats: int, tick: Callable[[str], None]
 ) -> list[Row]:
     """Return a row for each backend and workload (size, number of views, kind of opacities)."""
     rows: list[Row] = []
