@@ -27,7 +27,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.files import UNFINISHED, atomic_path, write_bytes, write_json, writing
 from completesplat.imports import importing, postponing
 from completesplat.settings.checks import check_parts_of_verb, check_values
-from completesplat.settings.composition import resolved_settings, shard_folder, use_working_folder
+from completesplat.settings.composition import shard_folder, use_working_folder
 from completesplat.settings.options import did_you_mean
 from completesplat.signals import Interrupted, ended_by_signals
 from completesplat.version import __version__
@@ -133,7 +133,7 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     folder, out = job_folders(config)
     OmegaConf.set_struct(config, False)
     config.out = str(out)
-    resolved = resolved_settings(config)
+    resolved = cast(dict[str, object], OmegaConf.to_container(config, resolve=True))
     if is_finished(out, resolved, hydra_config.overrides.task):
         print(f"{out}: finished before, not repeated")
         return optimized(config.get("optimized_metric"), out)

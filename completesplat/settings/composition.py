@@ -73,11 +73,6 @@ def _composed(verb: str, overrides: Sequence[str] = ()) -> DictConfig:
         return compose_by_hydra(verb, overrides=list(overrides))
 
 
-def resolved_settings(config: DictConfig) -> dict[str, object]:
-    """Return a config as a plain mapping without references."""
-    return cast(dict[str, object], OmegaConf.to_container(config, resolve=True))
-
-
 def without_unused_parts(config: DictConfig) -> DictConfig:
     """Return a config without those `PARTS_OF_STAGES` to which no other part refers."""
     plain = cast(dict[str, object], OmegaConf.to_container(config, resolve=False))
