@@ -27,7 +27,7 @@ from completesplat.data.placement import (
     square_of,
     upright_axes,
 )
-from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
+from completesplat.data.sequences import SPLITS, MaskedImage, PosedSequence, SequenceSource
 from completesplat.data.validation import MissingFile, refused_to
 from completesplat.errors import DataError, errors_at
 from completesplat.settings.schema import Range
@@ -223,6 +223,5 @@ class CaptureDataModule(ObjectDataModule):
             message = "no cameras there: neither transforms.json nor sparse/0, nor folders that have one; photos or a "
             message += f"video get cameras by: {command}"
             raise refused[0] if refused else MissingFile(message, str(self.root))
-        training, held_out = partial(members, self.hold_out, False), partial(members, self.hold_out, True)
-        parts = {"train": training, "val": held_out, "test": held_out}
-        return {part: CaptureSource(captures, members, self.framing, refused) for part, members in parts.items()}
+        chosen = {part: partial(members, self.hold_out, part != "train") for part in SPLITS}
+        return {part: CaptureSource(captures, chosen[part], self.framing, refused) for part in SPLITS}
