@@ -134,8 +134,7 @@ def make_folder(folder: Path) -> None:
 
 def file_refusal(error: BaseException) -> CompleteSplatError | None:
     """Return the error to show for an OSError about a named file: no space, or an unusable name; None for others."""
-    name = (error.filename2 or error.filename) if isinstance(error, OSError) else None
-    if not isinstance(error, OSError) or not isinstance(name, str):
+    if not isinstance(error, OSError) or not isinstance(name := error.filename2 or error.filename, str):
         return None
     if error.errno in BAD_NAME:
         return CompleteSplatError(f"{printable(name)}: cannot be used: {error.strerror}; choose another name")
