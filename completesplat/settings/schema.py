@@ -156,7 +156,7 @@ def violations(annotation: object, value: object) -> list[Violation]:
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
-        return violations(kind, value) or _against_rules(rules, value)
+        return violations(kind, value) or [Violation("", value, x) for rule in rules if (x := rule.refusal(value))]
     if origin is Literal:
         return _in_choice(arguments, value)
     if origin in (Union, UnionType):
@@ -171,11 +171,6 @@ def violations(annotation: object, value: object) -> list[Violation]:
     if value is None and (is_part or origin is Callable):
         return [Violation("", value, "must not be null; leave it out")]
     return []
-
-
-def _against_rules(rules: Sequence[Any], value: object) -> list[Violation]:
-    reasons = [rule.refusal(value) for rule in rules]
-    return [Violation("", value, reason) for reason in reasons if reason is not None]
 
 
 def _in_choice(choices: Sequence[object], value: object) -> list[Violation]:
