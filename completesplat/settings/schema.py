@@ -21,13 +21,7 @@ from typing import (
 from completesplat.errors import CompleteSplatError
 
 MOST_SHOWN = 1e6  # help texts leave out larger bounds
-KINDS: dict[object, str] = {
-    int: "a whole number",
-    float: "a number",
-    bool: "true or false",
-    str: "a text",
-    NoneType: "null",
-}
+KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "null"}
 
 
 @dataclass(frozen=True)
