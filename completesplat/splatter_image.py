@@ -7,7 +7,6 @@ Gaussians are in the reference camera's frame, ordered by layer, row, column.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
@@ -64,10 +63,7 @@ def incremental_depths(raw: LayerMaps, near: Tensor, far: Tensor) -> LayerMaps:
     return torch.cat([first, steps], dim=-3).cumsum(dim=-3)
 
 
-LAYER_DEPTHS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
-    "independent": independent_depths,
-    "incremental": incremental_depths,
-}
+LAYER_DEPTHS = {"independent": independent_depths, "incremental": incremental_depths}
 
 Length = Annotated[float, Range(1e-9, 1e9)]
 Degree = Annotated[int, Range(0, LARGEST_DEGREE)]
