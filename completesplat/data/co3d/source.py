@@ -31,6 +31,7 @@ from completesplat.data.validation import BadImage, read_points
 from completesplat.errors import DataError, errors_at
 from completesplat.geometry.cameras import pixel_centers, unproject
 
+DEPTH_MAPS = 8
 FOREGROUND = 128  # smallest mask value, of 255
 
 
@@ -77,7 +78,7 @@ def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
 
     The 99 % and 1 % quantiles replace the largest and smallest values, because depth maps have outliers.
     """
-    count, points = min(len(frames), 8), []
+    count, points = min(len(frames), DEPTH_MAPS), []
     for frame in (frames[i * len(frames) // count] for i in range(count)):
         with errors_at(frame=frame.number):
             points.append(_foreground(frame))

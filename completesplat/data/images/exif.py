@@ -18,6 +18,7 @@ TRANSPOSITIONS = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
+FULL_FRAME_WIDTH = 36.0  # mm
 MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # by FocalPlaneResolutionUnit; 4 and 5 are in common use
 
 
@@ -45,7 +46,7 @@ def crop_fov(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:
     image size. Then fov = 2 atan(shorter side / (2 focal)). The result is wrong for cropped or stitched images.
     """
     equivalent = _positive(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    focal = equivalent / 36 * max(size) if equivalent else _focal_from_sensor(exif, max(size))
+    focal = equivalent / FULL_FRAME_WIDTH * max(size) if equivalent else _focal_from_sensor(exif, max(size))
     if focal is None:
         return None
     fov = math.degrees(2 * math.atan(min(size) / (2 * focal)))

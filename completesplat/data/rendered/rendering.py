@@ -40,6 +40,7 @@ logger = logging.getLogger(__name__)
 
 CATEGORY = "rendered"
 DESCRIPTION, OBJECT, BROKEN, LOCK = "rendered.json", "object.json", "broken.json", ".rendered.lock"
+FORMAT_VERSION = 2
 SUFFIXES = ("glb", "gltf", "obj", "ply", "stl", "fbx", "usd", "usda", "usdc", "usdz")
 MOST_POINTS = 20_000
 SKY = 1e9  # Cycles has 1e10 where no surface is
@@ -192,7 +193,7 @@ def render(
     program, category = find_blender(blender), out / CATEGORY
     objects = objects or procedural_objects(program, str(factory), count)
     mine = share_of(objects, job["shard"], job["shards"])
-    parameters, lock = {"format": 2, **settings}, FileLock(out / LOCK)
+    parameters, lock = {"format": FORMAT_VERSION, **settings}, FileLock(out / LOCK)
     out.mkdir(parents=True, exist_ok=True)
     with lock:
         if not writing.is_written(category / DESCRIPTION, parameters):

@@ -24,6 +24,7 @@ from completesplat.errors import DataError
 from completesplat.files import atomic_folder
 from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
 
+FORMAT_VERSION = 3
 DESCRIPTION = "toy.json"
 MOST_FRAMES = 1000
 ROOM_FRAMES_PER_SECOND = 30
@@ -171,7 +172,7 @@ def write(
         reason = rule.refusal(number := numbers[name])  # type: ignore[literal-required]
         if reason is not None:
             raise DataError(f"{folder.name}: {name}={number}: {reason}")
-    parameters = {"format": 3, **numbers} | ({} if tuple(light) == WHITE else {"light": list(light)})
+    parameters = {"format": FORMAT_VERSION, **numbers} | ({} if tuple(light) == WHITE else {"light": list(light)})
     if writing.is_written(folder / DESCRIPTION, parameters):
         if progress:
             Console().print(f"{folder} already holds these scenes")
