@@ -29,6 +29,7 @@ EXTRAS = {
     "background": "to cut objects out of photos",
     "grabcut": "to cut them out roughly, by colour, without a download",
     "mesh": "to write meshes",
+    "heic": "to read the photos of iPhones",
     "colmap": "to find cameras of photos, to read captures whose lens distorts",
     "slurm": "to spread sweeps over a cluster",
     "perceptual": "to train on perceptual features without a download",
