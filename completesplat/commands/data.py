@@ -76,8 +76,8 @@ def prepare(
 
     if manifest.is_packed(data.root):
         raise CompleteSplatError(f"{data.root} is prepared already")
-    if out.resolve() == Path(data.root).resolve():
-        raise CompleteSplatError(f"out={out}: holds what is to be prepared; choose another out=DIR")
+    if Path(data.root).resolve().is_relative_to(out.resolve()):
+        raise CompleteSplatError(f"out={out}: the data to be prepared lie there; choose another out=DIR")
     sources, settings = _sources(data, splits), data.packed_settings()
     writing.prepare(sources, settings, out, codec, sequences_per_shard, workers, (on_bad, max_bad_fraction))
 

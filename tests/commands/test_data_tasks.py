@@ -83,7 +83,7 @@ def test_prepared_data_pass_the_check_until_a_bit_flips_and_are_not_prepared_aga
     assert made[0] == made[1]
     assert "prepared already" in refused("data", "data_task=prepare", *settings)
     own_place = f"out={sets['rooms'][2].removeprefix('data.root=')}"
-    assert "is to be prepared" in command.refuses("data", "prepare", *sets["rooms"], own_place)
+    assert "the data to be prepared lie there" in command.refuses("data", "prepare", *sets["rooms"], own_place)
     assert checked()["refused"] == []
     shard = next(store.glob("train-*.arrow"))
     content = bytearray(shard.read_bytes())
