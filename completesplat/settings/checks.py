@@ -152,6 +152,8 @@ VERBS: dict[str, type] = {
 
 def check_values(verb: str, config: DictConfig) -> None:
     """Raise CompleteSplatError for the first unfit setting of a verb itself, without importing torch."""
+    if lost := [group for group in ("experiment", "ablation") if group in config]:
+        raise CompleteSplatError(f"{lost[0]}: its file needs `# @package _global_` as its first line, to set anything")
     if verb in VERBS:
         check_settings(VERBS[verb], config)
 

@@ -64,6 +64,12 @@ def test_a_loss_and_an_ablation_of_the_working_folder_are_trained_with_and_the_r
     command.succeeds("test", "ckpt=RUN/checkpoints/last.ckpt", "trainer.accelerator=cpu", "out=TEST")
 
 
+def test_an_ablation_that_would_set_nothing_is_refused(command, own, toy_root):
+    (own / "conf/ablation/mine.yaml").write_text(ABLATION.partition("\n")[2])
+    refused = command.refuses("fit", "experiment=toy_var", "ablation=mine", f"data.root={toy_root}")
+    assert refused == "ablation: its file needs `# @package _global_` as its first line, to set anything"
+
+
 def test_a_folder_of_settings_is_added_to_those_of_the_package(command, own, toy_root):
     (own / "more/data").mkdir(parents=True)
     (own / "more/data/mine.yaml").write_text(f"defaults: [toy_objects]\nroot: {toy_root}\nimage_size: 32\n")
