@@ -420,7 +420,7 @@ PREDICTION = [
     (put("scene.json", keys, value), CompleteSplatError, "scene.json", why)
     for keys, value, why in [
         (f"{R}.image_size", [INF, 32], "Infinity is no JSON"),
-        (f"{R}.image_size", [0, 32], "image_size must be from 1 to 50,000,000 pixels, not [0, 32]"),
+        (f"{R}.image_size", [0, 32], "image_size must be from 1 to 64,000,000 pixels, not [0, 32]"),
         (f"{R}.image_size", [32, 1e300], "image_size is not finite in float32"),
         (f"{R}.image_size", [32], "image_size must be 2 numbers"),
         (f"{R}.intrinsics", np.zeros((3, 3)).tolist(), "intrinsics of no camera"),

@@ -55,7 +55,7 @@ pytestmark = [
 ]
 PIXELS = np.random.default_rng(0).integers(0, 256, (12, 16, 4), dtype=np.uint8)
 COMPRESSIONS = (None, "tiff_lzw", "tiff_adobe_deflate", "jpeg", "packbits")
-MOST_MEMORY_OF_A_PHOTO = 2**31  # for the largest allowed photo, of 50 million pixels
+MOST_MEMORY_OF_A_PHOTO = 2**31  # for the largest allowed photo, of 64 million pixels
 
 
 def each(*reads: Any) -> None:

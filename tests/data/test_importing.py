@@ -158,7 +158,7 @@ def test_what_makes_no_capture_is_one_line_and_leaves_nothing(tmp_path, monkeypa
     assert line("blank").startswith("blank: COLMAP finds poses for 0 of 6 images; a capture needs 6: take more")
     assert line("blank", None).endswith("get cameras by: completesplat data import blank cameras=colmap")
     Path("-a.mp4").write_bytes(bytes(1000))
-    assert line("-a.mp4") == "-a.mp4: ffmpeg finds no video of at most 50,000,000 pixels there"
+    assert line("-a.mp4") == "-a.mp4: ffmpeg finds no video of at most 64,000,000 pixels there"
     assert line("typo") == "typo: no such file or folder"
     assert not list(Path("out").iterdir())
     monkeypatch.setitem(sys.modules, "pycolmap", None)

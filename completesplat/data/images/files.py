@@ -20,7 +20,7 @@ from completesplat.files import by_numbers
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 HEIC, NEEDS_HEIC = (".heic", ".heif"), '; HEIC needs: pip install "completesplat[heic]"'
-MOST_PIXELS = 50_000_000
+MOST_PIXELS = 64_000_000  # cameras of 61 million pixels are common
 MOST_BYTES = 2**28
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
 SIXTEEN_BIT_MODES = ("I;16", "I;16B", "I;16L")
@@ -121,7 +121,7 @@ def open_image(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator
     """Open an image and read its header, but not its pixels; convert Pillow's exceptions within the context.
 
     Raises:
-        ImageError: the image is damaged, has another format, or has more than 50 million pixels.
+        ImageError: the image is damaged, has another format, or has more than 64 million pixels.
     """
     # Pillow only warns about images between 89 and 179 million pixels; the limit here is lower and an error.
     with warnings.catch_warnings():
@@ -130,7 +130,7 @@ def open_image(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator
             with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=formats) as image:
                 width, height = image.size
                 if width * height > MOST_PIXELS:
-                    raise ImageError(f"{width} x {height} are more than {MOST_PIXELS:,} pixels")
+                    raise ImageError(f"{width} x {height} are more than {MOST_PIXELS:,} pixels; make it smaller first")
                 yield image
         except ImageError:
             raise

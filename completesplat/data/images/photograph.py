@@ -76,7 +76,7 @@ def read_photograph(
             the object's longer side fills this share of it; None: crop the central square.
 
     Raises:
-        ImageError: the file is missing or not a complete image of one of these formats, has more than 50 million pixels
+        ImageError: the file is missing or not a complete image of one of these formats, has more than 64 million pixels
             (checked before decoding) or less than 8 pixels on a side, or its pixel values are ambiguous.
         CompleteSplatError: the field of view is outside `FOVS`, or errors of `without_background`.
     """
