@@ -14,6 +14,7 @@ from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
+from yaml import YAMLError
 
 from completesplat.commands import jobs, new
 from completesplat.errors import CompleteSplatError
@@ -128,7 +129,7 @@ def refusal(error: BaseException) -> str | None:
         message = f"{key} is needed: give {key}=VALUE"
     elif isinstance(error, InstantiationException):
         message = _of_a_part(error)
-    elif isinstance(error, HydraException | OmegaConfBaseException):
+    elif isinstance(error, HydraException | OmegaConfBaseException | YAMLError):
         message = str(error)
     return None if message is None else " ".join(message.split())
 

@@ -68,6 +68,10 @@ def test_an_ablation_that_would_set_nothing_is_refused(command, own, toy_root):
     (own / "conf/ablation/mine.yaml").write_text(ABLATION.partition("\n")[2])
     refused = command.refuses("fit", "experiment=toy_var", "ablation=mine", f"data.root={toy_root}")
     assert refused == "ablation: its file needs `# @package _global_` as its first line, to set anything"
+    (own / "conf/ablation/mine.yaml").write_text(ABLATION.replace("}}", ""))
+    refused = command.refuses("fit", "experiment=toy_var", "ablation=mine", f"data.root={toy_root}")
+    assert "mine.yaml" in refused
+    assert "line 2" in refused
 
 
 def test_a_folder_of_settings_is_added_to_those_of_the_package(command, own, toy_root):
