@@ -157,7 +157,7 @@ BAD: dict[str, tuple[bytes, str, str]] = {
         png(1, 1, (b"zTXt", b"k\0\0" + zlib.compress(bytes(10**7))), (b"IDAT", zlib.compress(bytes(4)))),
         "RGB", "cannot be decoded",
     ),
-    "bomb_of_65_megapixels": (png(8100, 8000, (b"IDAT", zlib.compress(bytes(99)))), "RGB", "pixels; make it smaller first"),
+    "bomb_of_65_megapixels": (png(8100, 8000, (b"IDAT", zlib.compress(bytes(99)))), "RGB", "make it smaller first"),
     "animated_png": (saved(LARGE, save_all=True, append_images=[Image.fromarray(255 - LARGE)]), "RGB", "2 frames"),
     "hardly_translucent": (saved(np.dstack([LARGE, 255 - np.eye(24, 32, dtype=np.uint8)])), "RGB", "transparent"),
     "transparent_colour": (saved(LARGE, transparency=tuple(LARGE[0, 0].tolist())), "RGB", "transparent"),
