@@ -70,5 +70,6 @@ def _images_of(path: Path) -> list[Path]:
     except OSError as error:
         raise CompleteSplatError(f"{path}: {error.strerror}") from error
     if not images:
-        raise CompleteSplatError(f"{path}: no image {'in this folder' if folder else 'fits'} ({', '.join(SUFFIXES)})")
+        where = f"in this folder (below it: '{path}/**')" if folder else "fits"
+        raise CompleteSplatError(f"{path}: no image {where}: {', '.join(SUFFIXES)}")
     return images
