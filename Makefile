@@ -5,8 +5,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 # The rasterizer's kernels are compiled in the background, while the target that needed .venv begins.
-# LOCKED=1 installs the versions of requirements.lock, whose files must have the hashes in it. torch is the version of
-# most figures in the documents, of which some machines have the CPU build at hand.
+# LOCKED=1 installs the versions of requirements.lock, whose files must have the hashes in it. Most figures in the
+# documents are by this TORCH; some machines have its CPU build at hand.
 READY := .venv/installed$(if $(LOCKED),-locked)
 TORCH := torch<2.14
 DEMO := outputs/demo

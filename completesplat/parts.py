@@ -199,14 +199,14 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
 
 def _check_part(place: str, part: object, allowed: Sequence[type]) -> None:
     kind = class_of(part)
-    is_users = kind is not None and kind not in PARTS.values()
-    if not isinstance(part, Mapping) or not (is_users or kind in allowed):
+    is_custom = kind is not None and kind not in PARTS.values()
+    if not isinstance(part, Mapping) or not (is_custom or kind in allowed):
         target = part.get("_target_") if isinstance(part, Mapping) else part
         names = ", ".join([*(kind.__name__ for kind in allowed), "classes of your own modules"])
         reason = f"names {printable(target, SHORT)}, which is no part of a model; allowed are {names}"
         raise WeightsError(f"{place} {reason}")
     settings = {name: value for name, value in part.items() if name != "_target_"}
-    if is_users:
+    if is_custom:
         return _check_parts_in(place, settings)
     _check_settings(place, settings_of(kind), settings)
 

@@ -11,10 +11,7 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import printable
 from completesplat.weights import AUTO, check_name
 
-SUFFIXES = (
-    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm"),
-    *(".heic", ".heif"),
-)
+SUFFIXES = tuple(".jpg .jpeg .png .webp .tif .tiff .avif .jp2 .bmp .gif .ppm .pgm .pnm .heic .heif".split())  # noqa: SIM905
 
 
 def check_inputs(verb: str, config: DictConfig) -> None:
@@ -55,8 +52,9 @@ def find_images(image: object) -> list[Path]:
 def left_out(image: object, images: Sequence[Path]) -> list[str]:
     """Return the names of other files, without hidden ones, in folders that are given as `image`."""
     entries = image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
-    there = [file for entry in entries for file in Path(str(entry)).glob("[!.]*") if file.is_file()]
-    return sorted(file.name for file in there if file not in images)
+    folders = [Path(str(entry)) for entry in entries if os.path.isdir(str(entry))]
+    there = {file for folder in folders for file in folder.glob("[!.]*") if file.is_file()}
+    return sorted(file.name for file in there.difference(images))
 
 
 def _images_of(path: Path) -> list[Path]:
@@ -70,6 +68,6 @@ def _images_of(path: Path) -> list[Path]:
     except OSError as error:
         raise CompleteSplatError(f"{path}: {error.strerror}") from error
     if not images:
-        where = f"in this folder (below it: '{path}/**')" if folder else "fits"
+        where = f"in this folder (for those below it: image='{path}/**')" if folder else "fits"
         raise CompleteSplatError(f"{path}: no image {where}: {', '.join(SUFFIXES)}")
     return images

@@ -199,7 +199,7 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
     Raises:
         CompleteSplatError: the directory holds a run that would be lost, or that had other settings.
     """
-    begun = (out / LAST).is_file() or (out / METRICS).is_file()
+    begun = (out / METRICS).is_file() or any((out / LAST).parent.glob("*.ckpt"))
     if "ckpt_path" not in config or not begun or not (out / CONFIG).is_file():
         return False
     if config["ckpt_path"] != "last":
@@ -218,7 +218,7 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
 def _refuse_another_run(out: Path, config: Mapping[str, object], earlier: object, overrides: Sequence[str]) -> None:
     """Raise CompleteSplatError if a directory's run had settings that a run cannot continue with."""
     before = cast(dict[str, object], OmegaConf.to_container(earlier))
-    different = _differences(before, config, (str(before.get("out")), str(config.get("out"))))
+    different = _differences(before, config, (str(before.get("out") or "/nowhere"), str(config.get("out"))))
     others = {key for key in different if not key.startswith((*MAY_CHANGE, *ENDS))}
     if not others:
         return
@@ -251,7 +251,8 @@ def _refuse_earlier_end(out: Path, ends: Mapping[str, Any], earlier: Mapping[str
 def _differences(first: object, second: object, moved: tuple[str, str], key: str = "") -> set[str]:
     """Return the keys of settings that differ by more than the folder's move."""
     if not isinstance(first, dict) or not isinstance(second, dict):
-        first = first.replace(*moved) if isinstance(first, str) else first
+        if isinstance(first, str) and f"{first}/".startswith(f"{moved[0]}/"):
+            first = moved[1] + first.removeprefix(moved[0])
         return set() if first == second else {key}
     parts = [(f"{key}.{part}".lstrip("."), part) for part in first.keys() | second.keys()]
     return {name for place, part in parts for name in _differences(first.get(part), second.get(part), moved, place)}

@@ -102,9 +102,11 @@ def find_results(folder: Path) -> RunTree:
         raise CompleteSplatError(f"runs={folder}: no such folder")
     tree, results, visited = RunTree(folder), list[Path](), set[str]()
     for place, folders, names in os.walk(folder, followlinks=True):
-        visited.add(os.path.realpath(place))
-        inner = sorted(name for name in folders if not name.startswith("."))
-        folders[:] = [name for name in inner if os.path.realpath(Path(place, name)) not in visited]
+        if (real := os.path.realpath(place)) in visited:
+            folders.clear()
+            continue
+        visited.add(real)
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
         path = Path(place)
         if PLAN in names:
             tree.sweeps.append(path)
@@ -232,7 +234,7 @@ def planned_jobs(folder: Path) -> list[list[str]]:
             texts = list(override.sweep_string_iterator()) if sweep else [override.get_value_element_as_str()]
             key = override.get_key_element()
             values[key] = [f"{key}={text}" for text in texts]
-    except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError):
+    except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError, AttributeError, TypeError):
         return []
     return [list(job) for job in itertools.product(*values.values())]
 
@@ -252,7 +254,7 @@ def _job(folder: Path, name: str) -> Job:
         config = cast(Mapping[str, object], OmegaConf.to_container(OmegaConf.load(folder / CONFIG)))
     except (OmegaConfBaseException, YAMLError, OSError, ValueError):  # its writer was killed
         config = {}
-    if not config or "overrides" not in record:
+    if not config or not isinstance(config, dict) or "overrides" not in record:
         return Job(name)
     tested = _mapping(metrics.get("test"))
     test = {name: flat_scores(_mapping(entry)) for name, entry in tested.items() if name != PROTOCOL}

@@ -65,7 +65,7 @@ def sweep_rows(finished: Sequence[Job]) -> list[Entry]:
     settings: dict[frozenset[tuple[str, str]], dict[object, Job]] = {}
     for job in finished:
         shared = frozenset((key, value) for key, value in job.overrides.items() if key != SEED)
-        # An extended sweep may have jobs of one seed with and without an override.
+        # An extended sweep may repeat the default seed as seed=N.
         seed = job.overrides.get(SEED, str(job.config.get(SEED)))
         settings.setdefault(shared, {})[seed] = job
 

@@ -59,7 +59,7 @@ def place_cross(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Cross:
 
 
 def level_axes(cameras: Cameras) -> Float[Tensor, "3 3"]:
-    """Return unit vectors as rows: right, up and ahead of the first camera [view], levelled to `world_up`."""
+    """Return the first camera's right, up and ahead as unit rows in the world, levelled to `world_up`."""
     _, down, forward = cameras.world_to_camera[:, :3, :3].unbind(dim=1)
     up = world_up(cameras)
     # Ahead is at the upper edge of an image taken straight down, and at the lower edge of one taken straight up.

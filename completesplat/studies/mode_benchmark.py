@@ -27,11 +27,11 @@ from completesplat.tensors import concatenate
 from completesplat.training.latent_diffusion import DiffusionScorer
 from completesplat.training.scoring import Scorer
 
+OTHER_SCENE = "other_scene"
 Renders = Float[Tensor, "sample view 3 height width"]
 Predictor = Callable[[SceneBatch, SceneBatch, int], Renders]
 """Function from a scene, another scene (batches of one) and a seed to renders of all targets in [0, 1]."""
 
-OTHER_SCENE = "other_scene"
 Method = Callable[[SceneBatch, SceneBatch, int], Gaussians]
 """Function from the same arguments to Gaussians [sample], or [1] if it draws nothing."""
 

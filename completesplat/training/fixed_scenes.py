@@ -186,7 +186,7 @@ def scene_panels(
         "opacity": whole.alpha.expand(-1, 3, -1, -1),
     }
     pixels = scenes.reference.images.shape[-2] * scenes.reference.images.shape[-1]
-    for layer in range(0 if gaussians.count % pixels else gaussians.count // pixels):  # none in a capture's
+    for layer in range(0 if gaussians.count % pixels else gaussians.count // pixels):  # captures have none
         part = gaussians[:, layer * pixels : (layer + 1) * pixels]
         panels[f"layer {layer + 1}"] = render(part).over(background)
     return {name: panel.clamp(0, 1).nan_to_num() for name, panel in panels.items()}

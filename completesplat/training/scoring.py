@@ -266,7 +266,7 @@ class SceneFiles(Scorer):
         if factor is None:
             reason = "at the pixels that its first sample covers"
             if scene.reference.depths is None:
-                reason = "(prepared data lack it, and images at another evaluation.resolution)"
+                reason = "(prepared data have none, nor has another evaluation.resolution)"
             raise CompleteSplatError(f"align=scale: {scene.names}: no true depth {reason}; use align=none")
         return [replace(x, means=factor * x.means, scales=factor * x.scales) for x in sets]
 

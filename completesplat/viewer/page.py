@@ -31,7 +31,6 @@ from completesplat.viewer.splat_view import SplatView
 Task = Callable[[], None]
 
 THUMBNAIL, MOST_THUMBNAILS = 96, 24  # px
-LONGEST_JOB = 30.0  # seconds that the end waits for a job
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +67,7 @@ class Worker:
             self._waiting.clear()
             self.closed = True
             self._changed.notify_all()
-        self._thread.join(LONGEST_JOB)
+        self._thread.join(timeout=30)
 
     def _run(self) -> None:
         while True:

@@ -154,12 +154,11 @@ class SplatView:
             start.position, start.look_at, start.fov = view.position, view.look_at, view.fov
             for browser in list(self.server.get_clients().values()) if client is None else [client]:
                 camera = browser.camera
-                if camera.image_width * camera.image_height == 0:  # hidden; `_welcome` fits its view later
-                    continue
                 with browser.atomic():
                     camera.up_direction = self.up
                     camera.position, camera.look_at = view.position, view.look_at
-                    camera.fov = view.fov_in(camera.image_width / camera.image_height)
+                    if camera.image_width * camera.image_height:  # else hidden: `_welcome` fits its view when it shows
+                        camera.fov = view.fov_in(camera.image_width / camera.image_height)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Fit the view to a new browser's window, even a phone's; show a notice until it has drawn an image."""

@@ -71,7 +71,9 @@ def test_a_folder_is_its_images_sorted(tmp_path):
     refusals = [([], "at least one"), *((odd, no_list) for odd in (None, "", ["a.png", None], {"a": 1}))]
     refusals += [("nofile.jpg", r"^nofile\.jpg: no such file"), ("a" * 5000, "^a{200,500}: no such file$")]
     refusals += [(f"{folder}/*.gif", r"gif: no image fits: \.jpg, ")]
-    refusals += [(f"{folder}/c.png", rf"no image in this folder \(below it: '{folder}/c.png/\*\*'\): \.jpg")]
+    refusals += [
+        (f"{folder}/c.png", rf"no image in this folder \(for those below it: image='{folder}/c.png/\*\*'\): \.jpg")
+    ]
     for given, message in refusals:
         with pytest.raises(CompleteSplatError, match=message):
             find_images(given)

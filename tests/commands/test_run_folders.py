@@ -136,6 +136,11 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     assert not jobs.is_finished(moved, placed[moved])
     with pytest.raises(CompleteSplatError, match="a run with another folder: "):
         jobs.is_finished(moved, placed[moved] | {"folder": "elsewhere"})
+    # Another folder that begins with the same letters did not move.
+    assert not jobs._differences({"a": "/r/run_data"}, {"a": "/r/run_data"}, ("/r/run", "/r/run2"))
+    (moved / jobs.LAST).rename(moved / "checkpoints/step=9.ckpt")
+    with pytest.raises(CompleteSplatError, match="a run with another folder: "):
+        jobs.is_finished(moved, placed[moved] | {"folder": "elsewhere"})
     shutil.rmtree(moved)
     advice = f"give all settings of {tmp_path}/run.json again, or continue in another folder"
     again = f"completesplat fit optimizer.lr=2 ckpt_path={tmp_path}/checkpoints/last.ckpt out=MORE"

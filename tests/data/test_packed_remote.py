@@ -98,7 +98,7 @@ def test_a_store_that_was_fetched_is_read_when_its_address_does_not_answer(serve
     first = local_root(address)
     (folder / "manifest.json").unlink()
     assert local_root(address) == first
-    assert "the manifest of the last time is used" in caplog.text
+    assert "the manifest fetched before is used" in caplog.text
 
 
 def test_a_store_that_is_made_anew_is_another_one(served):

@@ -174,6 +174,8 @@ def test_folders_that_links_lead_to_are_searched_once(runs, run, tmp_path) -> No
     (tmp_path / "links/there").symlink_to(runs)
     (runs / "good/back").symlink_to(runs)
     assert [score.name for score in find_results(tmp_path / "links").scores] == ["there/good"]
+    (runs / "latest").symlink_to(runs / "good")  # beside its target
+    assert len(find_results(runs).scores) == 1
 
 
 def test_a_folder_without_results_is_refused_with_what_makes_them(runs) -> None:

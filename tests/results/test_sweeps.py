@@ -259,7 +259,7 @@ def test_jobs_that_have_not_started_are_named_and_a_plan_that_depends_on_files_i
 
 
 @pytest.mark.parametrize("file", ["job=1/config.yaml", "job=1/run.json", "multirun.yaml"])
-@pytest.mark.parametrize("content", ["", "{}", "[", None])
+@pytest.mark.parametrize("content", ["", "{}", "[]", "[", "hydra:\n", "hydra: {overrides: {task: }}", None])
 def test_a_sweep_with_a_damaged_file_has_a_summary(sweep, file, content) -> None:
     sweep.plan(["seed=0,1"])
     sweep.scored("seed=1", psnr=20.0)

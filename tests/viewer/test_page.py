@@ -207,7 +207,7 @@ def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(comple
     [
         ("notes.txt", png(50, 40)[:60], "notes.txt: "),
         ("../../\n\x1betc/passwd", b"nothing", "../../\\n\\x1betc/passwd: not an image"),  # no path, no markup
-        ("bomb.png", png(8000, 8000, "1"), "bomb.png: "),  # some kilobytes, 64 million pixels
+        ("bomb.png", png(9000, 9000, "1"), "bomb.png: "),  # some kilobytes, 81 million pixels
         ("a.splat", b"nothing", "a.splat: damaged"),
         ("a.PLY", b"nothing", "a.PLY: not a .ply file"),
     ],

@@ -138,7 +138,7 @@ def open_image(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator
             advice = "" if "HEIF" in formats or not str(source).lower().endswith(HEIC) else NEEDS_HEIC
             raise ImageError(f"not an image in one of the formats {', '.join(formats)}{advice}") from None
         except Image.DecompressionBombError:
-            raise ImageError(f"more than {MOST_PIXELS:,} pixels") from None
+            raise ImageError(f"more than {MOST_PIXELS:,} pixels; make it smaller first") from None
         # On damaged files, Pillow's decoders raise almost any exception: OSError, SyntaxError, struct.error, ...
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__

@@ -65,7 +65,7 @@ class SceneDataModule(LightningDataModule):
         latent_cache: folder of latents from which stage 2 is trained (`CachedTrainingScenes`), without colour jitter,
             flips or `background`; validation and test read images.
         on_bad: "skip" items that cannot be read (counted and reported), or "raise" the error.
-        max_bad_fraction: share of an epoch's items that may be skipped, and at least one unless this is 0.
+        max_bad_fraction: share of an epoch's items that may be skipped; one always may, unless this is 0.
         allow_changed: a resumed run may continue with training data that have changed.
     """
 

@@ -18,7 +18,7 @@ from completesplat.geometry.cameras import Cameras
 SEQUENCES, IMAGES = 400, 8192
 # Fewer images suffice for the standard deviations of eight features.
 FEATURE_IMAGES, SMALLEST_DEVIATION = 1024, 1e-3
-LEAST_TURN = 0.1  # root mean square, in radians, from which on the image axes determine the horizon
+LEAST_TURN = 0.1  # radians, root mean square; image axes that turn less show no horizon
 
 
 class TypicalCamera(NamedTuple):

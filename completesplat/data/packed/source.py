@@ -46,11 +46,12 @@ def local_root(root: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / ".lock"):
         try:
-            _get(root, MANIFEST, folder / MANIFEST)
+            with atomic_path(folder / MANIFEST) as temporary:
+                _get(root, MANIFEST, temporary)
         except MissingFile as error:
             if not (folder / MANIFEST).is_file():
                 raise
-            logger.warning("%s; the manifest of the last time is used", error)
+            logger.warning("%s; the manifest fetched before is used", error)
         store = folder / _digest((folder / MANIFEST).read_bytes())
         store.mkdir(exist_ok=True)
         for name, content in ((ADDRESS, root.encode()), (MANIFEST, (folder / MANIFEST).read_bytes())):
