@@ -17,7 +17,7 @@ from completesplat.autoreconstructor.encoder import Images
 from completesplat.autoreconstructor.model import DepthRange, VariationalAutoReconstructor
 from completesplat.baselines.splatter_image.model import PublishedModel, is_published
 from completesplat.diffusion import sampling
-from completesplat.diffusion.guidance import Latents, allowed_skip_weight
+from completesplat.diffusion.guidance import Latents, allowed_skip_weight, in_bfloat16
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -147,7 +147,7 @@ class CompleteSplat(SceneModel):
             shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
             noise = sampling.draw_noise(len(images), samples, shape, seed).to(images.device)
             image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
-            denoise = partial(self._denoise_in_bfloat16, images.device.type) if bfloat16 else self.denoiser
+            denoise = partial(in_bfloat16, self.denoiser) if bfloat16 else self.denoiser
 
             def decode(latent: Tensor, part: slice) -> Gaussians:
                 """Decode the latents of a part of all samples; `image_of` has the index of each one's image."""
@@ -168,11 +168,6 @@ class CompleteSplat(SceneModel):
             latents = torch.cat(parts(draw, most=batch or (None if on_step else drawn)))
             scenes = concatenate(parts(lambda part: decode(latents[part], part), most=batch or decoded))
         return self.fitted(scenes, images, cameras, visible, color_fits)
-
-    def _denoise_in_bfloat16(self, device: str, *inputs: Tensor) -> Latents:
-        with torch.autocast(device, torch.bfloat16):
-            result: Tensor = self.denoiser(*inputs)
-        return result
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Use another sampler from now on, with the noise schedule and prediction type of training.
