@@ -78,8 +78,9 @@ def prepare(
         raise CompleteSplatError(f"{data.root} is prepared already")
     if Path(data.root).resolve().is_relative_to(out.resolve()):
         raise CompleteSplatError(f"out={out}: the data to be prepared lie there; choose another out=DIR")
-    sources, settings = _sources(data, splits), data.packed_settings()
-    writing.prepare(sources, settings, out, codec, sequences_per_shard, workers, (on_bad, max_bad_fraction))
+    policy = on_bad, max_bad_fraction
+    sources, settings = _sources(data, splits, policy), data.packed_settings()
+    writing.prepare(sources, settings, out, codec, sequences_per_shard, workers, policy)
 
 
 def latents(
@@ -120,9 +121,9 @@ def latents(
     logger.info("standard deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 
-def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:
-    """Return the sources of the splits that exist; each source collects the errors in its files instead of raising."""
-    data.policy = "skip", 1.0
+def _sources(data: Any, splits: Sequence[str], policy: tuple[str, float] = ("skip", 1.0)) -> dict[str, Any]:
+    """Return the sources of the splits that exist; by default each collects the errors in its files."""
+    data.policy = policy
     data.prepare_data()
     sources, missing = {}, []
     for split in splits:

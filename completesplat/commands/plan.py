@@ -22,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from completesplat.data.loading.data_module import MOST_WORKERS
 from completesplat.data.loading.distributed import batch_per_process
+from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import write_json
 from completesplat.results.tables import Table, records_table, show
@@ -193,7 +194,7 @@ def parts_beside_steps(
         loading: seconds in which one process loads a scene; None: unknown.
     """
     data, trainer, checkpoint = config.data, config.trainer, config.get("callbacks", {}).get("checkpoint") or {}
-    workers = min(MOST_WORKERS, os.cpu_count() or 1) if data.workers is None else data.workers
+    workers = min(MOST_WORKERS, usable_cores()) if data.workers is None else data.workers
     load = None if loading is None else loading * data.batch_size / config.devices / max(workers, 1)
     waiting = load if load is None or workers == 0 else max(0.0, load - seconds)
 

@@ -146,6 +146,10 @@ def test_an_image_of_the_right_size_is_hidden_to_the_pixel_and_others_three_pixe
     first, _, mask = photos(32, 32)
     assert torch.equal(outside_of_box(first, SHIPPED, 32), expected)
     assert torch.equal(outside_of_mask(first, mask, 32), expected)
+    white = Image.new("LA", (32, 32), (255, 0))  # as a paint program saves white strokes
+    white.putalpha(Image.open(mask).convert("L"))
+    white.save(mask)
+    assert torch.equal(outside_of_mask(first, mask, 32), expected)
     assert torch.equal(outside_of_box(photos(640, 640)[0], SHIPPED, 32), grown)
 
 

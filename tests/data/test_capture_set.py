@@ -8,6 +8,7 @@ import pytest
 from support import write_capture
 
 from completesplat.data.captures.capture_set import CaptureSetDataModule
+from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.packed.writing import prepare
 from completesplat.data.validation import BadAnnotation, MissingFile, SharedSequences
 from completesplat.errors import DataError
@@ -94,3 +95,20 @@ def test_packed_captures_are_the_same_data_set(root: Path, tmp_path: Path) -> No
         assert sorted(packed.source(part).names) == names
         sequence = packed.source(part).read(names[0])
         assert (sequence.read(3).image == data.source(part).read(names[0]).read(3).image).all()
+
+
+def test_a_list_may_name_a_capture_that_cannot_be_read(root: Path) -> None:
+    (root / "splits.json").write_text(json.dumps({"train": ["apple", "cherry"], "val": ["pear"]}))
+    (root / "apple/r1/transforms.json").write_text("{}")
+    assert split(module(root))["train"] == ["apple/r0", "cherry/r0", "cherry/r1"]
+
+
+def test_captures_are_those_of_data_capture_and_linked_ones_but_no_hidden_ones(root: Path) -> None:
+    (root / "apple/r0/transforms.json").rename(root / "apple/r0/transforms_train.json")
+    (root / "cherry").rename(root.parent / "elsewhere")
+    for name in ("cherry", "again"):
+        (root / name).symlink_to(root.parent / "elsewhere/r0")
+    (root / "pear").rename(root / ".turntable.unfinished")
+    expected = ["again", "apple/r0", "apple/r1", "cherry", "plum/r0", "plum/r1"]
+    assert sorted(name for names in split(module(root)).values() for name in names) == expected
+    assert CaptureDataModule(str(root)).open("test")["test"].names == ["again", "cherry"]

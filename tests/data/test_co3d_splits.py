@@ -8,6 +8,7 @@ import co3d_trees as trees
 import numpy as np
 import pytest
 
+from completesplat.commands.data import prepare
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.splits import Category, Filters, SeededSplit, read_category
 from completesplat.data.validation import BadCamera, OutsidePath
@@ -74,7 +75,7 @@ def test_three_sequences_are_one_for_each_split_and_fewer_are_refused(tmp_path):
     annotate(tmp_path / "3", many(3))
     assert [len(taken) for taken in names(read(tmp_path / "3", None, SeededSplit(0, 0, 0))).values()] == [1, 1, 1]
     annotate(tmp_path / "2", many(2))
-    with pytest.raises(DataError, match="2 sequences cannot be split"):
+    with pytest.raises(DataError, match="2 objects cannot be split"):
         read(tmp_path / "2", subset=None)
 
 
@@ -288,3 +289,5 @@ def test_a_partial_download_is_refused_at_once_with_the_setting_that_uses_what_i
     assert [batch.names for batch in data.train_dataloader()] == [("a",)]
     with pytest.raises(DataError, match="2 of 4 sequences have no images"):
         module(tmp_path, on_bad="raise").source("test")
+    with pytest.raises(DataError, match="2 of 4 sequences have no images"):
+        prepare(module(tmp_path), ["train", "test"], tmp_path / "STORE", "png", 4, 1, "skip", 0.1)

@@ -243,3 +243,10 @@ def test_a_bad_depth_map_is_refused_by_name(tmp_path: Path, content, scale, part
     path = tmp_path / "d.png"
     path.write_bytes(content)
     refuse(lambda: read_depth(path, scale), str(path), part)
+
+
+def test_a_mask_of_0_and_1_is_refused_because_it_would_be_empty(tmp_path):
+    Image.new("L", (4, 4), 1).save(tmp_path / "mask.png")
+    with pytest.raises(BadImage, match="a mask has values from 0 to 255, not 0 and 1"):
+        decode_image(tmp_path / "mask.png", "mask.png", "L")
+    assert decode_image(tmp_path / "mask.png", "mask.png", "RGB").getextrema() == ((1, 1),) * 3

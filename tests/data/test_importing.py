@@ -113,14 +113,14 @@ def test_photos_become_upright_keep_their_focal_length_and_the_unusable_are_name
     (tmp_path / "cut.jpg").write_bytes((tmp_path / "a b.jpg").read_bytes()[:-200])
     (tmp_path / "notes.txt").touch()
     os.mkfifo(tmp_path / "pipe.png")
-    assert copied(tmp_path, images) == ["a_b.jpg", "a_b_2.png", "c.tiff"]
+    assert copied(tmp_path, images) == ["a_b.jpg", "a_b_2.png", "c.png"]
     for copy in images.iterdir():
         image = Image.open(copy)
         assert image.size == (30, 40)
         upper, lower = (np.asarray(image.crop(box)).mean() for box in ((0, 0, 30, 19), (0, 21, 30, 40)))
         assert upper > 250 > 5 > lower
         assert image.getexif().get(274) is None
-        assert copy.suffix == ".tiff" or image.getexif().get_ifd(0x8769)[41989] == 28
+        assert copy.stem == "c" or image.getexif().get_ifd(0x8769)[41989] == 28
     assert caplog.text.count("left out: ") == 2
     assert "left out: 1 file of other formats: notes.txt" in caplog.text
     assert f"left out: {tmp_path / 'cut.jpg'}: cannot be decoded" in caplog.text
@@ -128,6 +128,33 @@ def test_photos_become_upright_keep_their_focal_length_and_the_unusable_are_name
     monkeypatch.setattr(importing.files, "save_image", full)
     with pytest.raises(OSError, match="No space left"):
         importing._copy_photos(tmp_path, images)
+
+
+def test_photos_are_written_in_a_format_that_holds_them_whatever_their_names_say(tmp_path):
+    colors = Image.radial_gradient("L").convert("RGB")
+    colors.save(tmp_path / "lzw.tif", compression="tiff_lzw")
+    colors.convert("CMYK").save(tmp_path / "print.png", format="TIFF")
+    colors.quantize(64).save(tmp_path / "palette.jpg", format="PNG")
+    colors.convert("RGBA").save(tmp_path / "screenshot.jpg", format="PNG")
+    colors.save(tmp_path / "web.webp")
+    expected = ["lzw.png", "palette.png", "print.png", "screenshot.png", "web.jpg"]
+    assert copied(tmp_path, tmp_path / "images") == expected
+    for path in (tmp_path / "images").iterdir():
+        difference = np.asarray(Image.open(path).convert("RGB"), dtype=float) - np.asarray(colors)
+        assert np.abs(difference).mean() < 4
+
+
+def test_colmap_gets_the_photos_in_the_order_of_their_numbers(tmp_path, monkeypatch):
+    for camera in ("cam.1", "cam.2"):
+        (tmp_path / "film" / camera).mkdir(parents=True)
+        for number in range(12):
+            Image.new("L", (8, 8)).save(tmp_path / f"film/{camera}/f{number}.png")
+    given = Mock(side_effect=DataError("enough"))
+    monkeypatch.setattr(importing, "_find_cameras", given)
+    with pytest.raises(DataError, match="enough"):
+        import_capture(str(tmp_path / "film"), "colmap", 100, 1000, tmp_path / "out")
+    ends = {"cam.1": ".png", "cam.2": "_2.png"}
+    assert given.call_args.args[1] == [f"{camera}/f{number}{ends[camera]}" for camera in ends for number in range(12)]
 
 
 @pytest.mark.parametrize(("asked", "expected"), [(8, range(0, 40, 5)), (100, range(40))])

@@ -68,8 +68,12 @@ def test_workers_do_not_change_the_batches_nor_what_is_skipped(root, epochs):
         assert one.refused
 
 
-def test_by_default_there_are_no_more_workers_than_cores(tmp_path, monkeypatch):
-    for cores, expected in ((2, 2), (64, 4), (None, 1)):
+def test_by_default_there_are_no_more_workers_than_usable_cores(tmp_path, monkeypatch):
+    for usable, cores, expected in (({0, 5}, 64, 2), (set(range(64)), 128, 4), (None, 2, 2), (None, None, 1)):
+        if usable is None:  # as on Macs and Windows
+            monkeypatch.delattr("os.sched_getaffinity", raising=False)
+        else:
+            monkeypatch.setattr("os.sched_getaffinity", lambda _, usable=usable: usable, raising=False)
         monkeypatch.setattr("os.cpu_count", lambda cores=cores: cores)
         assert module(tmp_path, workers=None).workers == expected
 

@@ -125,3 +125,15 @@ def test_training_reads_it_in_worker_processes(served, toy_root):
     assert len(shards_asked(asked)) == len(set(shards_asked(asked))) == 3
     with pytest.raises(DataError, match="prepared with image_size=16"):
         CO3DDataModule(address, "toy_objects", **settings | {"image_size": 32}).setup("fit")
+
+
+def test_what_was_not_fetched_is_no_fault_of_the_store(served):
+    address, folder, asked = served
+    make(folder)
+    source = PackedSource(local_root(address), "train")
+    assert source.verify() == []
+    source.read("s0")
+    (fetched,) = source.root.glob("*.arrow")
+    fetched.write_bytes(b"another" + fetched.read_bytes()[7:])
+    assert [error.file for error in source.verify()] == [str(fetched)]
+    assert len(shards_asked(asked)) == 1

@@ -257,6 +257,16 @@ def test_photographs_with_stored_pixels_are_not_turned(tmp_path):
     torch.testing.assert_close(read_photographs(*given).images, expected)
 
 
+def test_windows_separators_lead_to_the_images(tmp_path):
+    write_transforms(tmp_path)
+    expected, file = sequence(tmp_path), tmp_path / "transforms.json"
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        frame["file_path"] = frame["file_path"].replace("/", "\\")
+    file.write_text(json.dumps(content))
+    must_agree(sequence(tmp_path), expected)
+
+
 def without_size(content: dict) -> None:
     del content["w"], content["h"]
 
@@ -366,6 +376,7 @@ def test_keyframes_of_polycam_are_a_capture(tmp_path, kind):
     move("images", f"keyframes/{kind}images")(tmp_path)
     for number, frame in enumerate(content["frames"]):
         entry = {f"t_{row}{column}": frame["transform_matrix"][row][column] for row in range(3) for column in range(4)}
+        entry = {key: int(value) if value == int(value) else value for key, value in entry.items()}
         entry |= {"fx": 19, "fy": 19.5, "cx": 8, "cy": 6, "width": WIDTH, "height": HEIGHT, "blur_score": 80}
         (cameras / f"{number}.json").write_text(json.dumps(entry))
     must_agree(sequence(tmp_path), expected)

@@ -183,6 +183,10 @@ def test_an_interrupted_import_leaves_nothing_and_can_be_repeated(turns, tmp_pat
     killed.mkdir(parents=True)
     out = import_turns(turns, tmp_path / "out")
     assert sorted(path.name for path in out.iterdir()) == ["a", "b", "sheet.png"]
+    (turns / "a").rename(turns / "c")
+    shutil.rmtree(turns / "b")
+    with pytest.raises(DataError, match=r"sheet\.png: exists already: choose another out=DIR"):
+        import_turns(turns, out)
 
 
 def test_the_object_is_what_transparency_or_the_remover_says_or_what_white_does_not_reach(rembg, tmp_path):

@@ -35,6 +35,11 @@ ODD = [
     ("fit", "test=1", "test=1: must be true or false"),
     ("fit", "data.image_size=50", "data.image_size=50: must be a multiple of 8 for the levels of these networks"),
     ("fit", "data.color_jitter=1", "data.color_jitter=1: must be a mapping"),
+    (
+        "data",
+        "data_task=check data.camera_jitter={rol:3}",
+        "data: {'rol': 3}: got an unexpected keyword argument 'rol'",
+    ),
     ("fit", "+data.rot=x", "ToyObjectsDataModule has no setting rot (data.rot); did you mean root?"),
     ("fit", "optimizer.lr=nan", f"optimizer.lr=nan: {NUMBER}"),
     ("fit", "callbacks.images.scenes=0", "callbacks.images.scenes=0: must be at least 1"),

@@ -97,9 +97,9 @@ class CapturedFrame:
         with errors_at(self.image, frame=self.number):
             orientation, mask = self.check(), None
             with files.refused_as_bad(str(self.image)), files.open_image(self.image, files.FORMATS) as stored:
-                files.check_sums(stored, self.image)
-                stored.load()
                 if stored.has_transparency_data and stored.mode in files.EIGHT_BIT_MODES:
+                    files.check_sums(stored, self.image)
+                    stored.load()
                     turned = files.turn_upright(stored, orientation)
                     image, mask = files.over_grey(turned, 1.0), turned.convert("RGBA").getchannel("A")
             if mask is None:
@@ -112,7 +112,7 @@ class CapturedFrame:
             return image, Image.new("L", image.size, 255) if mask is None else undistort(mask, self.lens)
 
     def check(self) -> object:
-        """Check the headers of image and mask, with the errors of `read`.
+        """Check the headers of image and mask; `read` also finds damaged contents.
 
         Returns:
             The EXIF orientation by which the image is to be turned; None: its pixels stay as they are stored.

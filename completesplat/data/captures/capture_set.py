@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from completesplat.data.captures.module import CaptureSource, read_captures
+from completesplat.data.captures.module import MODELS, TRANSFORMS, CaptureSource, read_captures
 from completesplat.data.co3d.splits import SeededSplit, split_by_seed
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
@@ -15,6 +15,7 @@ from completesplat.errors import errors_at
 from completesplat.settings.schema import Natural, Share
 
 SPLITS_FILE = "splits.json"
+MARKS = {*TRANSFORMS, "keyframes", *(model.split("/")[0] for model in MODELS)}  # a folder with one is a capture
 
 
 def object_of(name: str) -> str:
@@ -25,7 +26,7 @@ def object_of(name: str) -> str:
 def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
     """Read a list of splits: {"train": [...], "val": [...], "test": [...]} of captures, or of folders of captures.
 
-    Captures that it does not name belong to no split. Without "val", nothing validates.
+    Captures that it does not name belong to no split. Training needs "val".
 
     Returns:
         The captures of each split, in the order of `names`.
@@ -56,7 +57,7 @@ def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
 class CaptureSetDataModule(ObjectDataModule):
     """Scenes of many captures; all frames of a capture belong to the same split, as all captures of an object do.
 
-    The captures are the folders below `root`, at any depth, that hold `transforms.json` or `sparse`. A capture's name
+    The captures are the folders below `root`, at any depth, that hold one of `MARKS`. A capture's name
     is its path below `root`, and its object is the first folder of that path.
 
     Args:
@@ -100,9 +101,9 @@ class CaptureSetDataModule(ObjectDataModule):
         captures, refused = read_captures(folders)
         if not captures:
             raise refused[0] if refused else MissingFile("no folders with transforms.json or sparse/0", str(self.root))
-        members = self._members(list(captures))
+        members = self._members(list(folders))
         return {
-            name: CaptureSource({k: captures[k] for k in names}, range, self.framing, refused)
+            name: CaptureSource({k: captures[k] for k in names if k in captures}, range, self.framing, refused)
             for name, names in members.items()
         }
 
@@ -116,9 +117,10 @@ class CaptureSetDataModule(ObjectDataModule):
 
 def _capture_folders(root: Path) -> list[Path]:
     folders: list[Path] = []
-    for folder, below, files in os.walk(root):
-        below.sort()
-        if Path(folder) != root and ("transforms.json" in files or "sparse" in below):
-            folders.append(Path(folder))
-            below.clear()
+    for child in sorted(path for path in root.glob("[!.]*/") if path.is_dir()):  # links are followed here alone
+        for folder, below, files in os.walk(child):
+            below[:] = sorted(name for name in below if not name.startswith("."))
+            if MARKS & {*below, *files}:
+                folders.append(Path(folder))
+                below.clear()
     return folders

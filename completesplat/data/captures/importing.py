@@ -1,7 +1,6 @@
 """Import of captures: a check of their cameras, or cameras for photos or a video, by COLMAP or of a turntable."""
 
 import logging
-import os
 import re
 import shlex
 import subprocess
@@ -20,8 +19,9 @@ from completesplat.data.captures.turntable import TurntableSettings, import_turn
 from completesplat.data.images import files
 from completesplat.data.sequences import first_names
 from completesplat.data.validation import refused_to
+from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import DataError
-from completesplat.files import atomic_folder, counted, folder_names
+from completesplat.files import atomic_folder, by_numbers, counted, folder_names
 from completesplat.settings.schema import Positive
 
 logger = logging.getLogger(__name__)
@@ -73,7 +73,8 @@ def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> 
             _split_video(source, images, frames)
         else:
             _copy_photos(source / "images" if (source / "images").is_dir() else source, images)
-        names = sorted(path.relative_to(images).as_posix() for path in images.glob("**/*.*"))
+        paths = (path.relative_to(images) for path in images.rglob("*.*") if path.is_file())
+        names = [path.as_posix() for path in sorted(paths, key=by_numbers)]
         if len(names) < FEWEST_FRAMES:
             raise DataError(f"{len(names)} usable images; a capture needs {FEWEST_FRAMES}", str(source))
         posed = _find_cameras(unfinished, names, video or len(names) > MOST_WITH_ALL_PAIRS, max_image_size)
@@ -105,7 +106,10 @@ def _copy_photos(folder: Path, images: Path) -> None:
             options = {"quality": 95, "subsampling": 0, "exif": upright.info.get("exif", b"")}
             place = images if photo.parent == folder else images / names[photo.parent]
             place.mkdir(exist_ok=True)
-            suffix = ".jpg" if image.format == "HEIF" else photo.suffix.lower()
+            if upright.mode in ("CMYK", "YCbCr"):
+                upright = upright.convert("RGB")
+            lossy = image.format in ("JPEG", "MPO", "HEIF", "WEBP") and upright.mode in ("L", "RGB")
+            suffix = ".jpg" if lossy else ".png"
             files.save_image(upright, place / f"{stem}{suffix}", **options)
 
 
@@ -148,7 +152,7 @@ def image_pairs(images: int, sequential: bool) -> list[tuple[int, int]]:
 def _find_cameras(folder: Path, names: list[str], sequential: bool, max_image_size: int) -> set[str]:
     """Write COLMAP's largest model as `folder`/sparse/0; return its images. Those of a folder and size share a lens."""
     pycolmap = import_pycolmap()
-    images, database, pairs, at_a_time = folder / "images", folder / "db", folder / "pairs", os.cpu_count() or 1
+    images, database, pairs, at_a_time = folder / "images", folder / "db", folder / "pairs", usable_cores()
     pycolmap.Database.open(database).close()
     sizes = {(Path(name).parent, files.stored_size(images / name, name)) for name in names}
     uniform = len(sizes) == len({Path(name).parent for name in names})

@@ -217,7 +217,7 @@ class CaptureDataModule(ObjectDataModule):
         captures, refused = read_captures({self.root.resolve().name or "capture": self.root})
         if not captures and not refused:
             folders = sorted(path for path in self.root.glob("[!.]*/") if path.is_dir())
-            captures, refused = read_captures({folder.resolve().name: folder for folder in folders})
+            captures, refused = read_captures({folder.name: folder for folder in folders})
         if not captures:
             command = shlex.join(["completesplat", "data", "import", str(self.root), "cameras=colmap"])
             message = "no cameras there: neither transforms.json nor sparse/0, nor folders that have one; photos or a "

@@ -156,7 +156,7 @@ def _read_frames(path: Path, content: Any) -> list[CapturedFrame]:
         entries = field(content, "frames", list)
         for number, entry in enumerate(entries):
             with errors_at(frame=number):
-                name = field(entry, "file_path", str)
+                name = field(entry, "file_path", str).replace("\\", "/")
                 # `path_below` resolves links, which takes long for many missing images.
                 suffix = next((suffix for suffix in SUFFIXES if isfile(root / (name + suffix))), None)
                 image = path_below(root, name + (suffix or ""))

@@ -42,6 +42,7 @@ logger = logging.getLogger(__name__)
 
 FEWEST_PHOTOS = 8
 MOST_SIDE = 512  # pixels; larger photos are reduced
+SHEET = "sheet.png"
 WHITE = 245  # least value of a white background's pixels, in every channel
 FULL = 0.98  # a mask that covers more than this share of the photo is refused
 LEAST_FACTOR, LARGEST_FACTOR = 0.8, 1.25  # bounds of the scale that undoes a crop
@@ -75,7 +76,7 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
     """
     folders = _folders_of_photos(folder)
     splits = {} if settings["splits"] is None else read_splits(Path(settings["splits"]), list(folders))
-    for name in folders:
+    for name in (*folders, SHEET):
         if (out / name).exists():
             raise DataError("exists already: choose another out=DIR", str(out / name))
     unfinished = out / ".turntable.unfinished"
@@ -84,11 +85,11 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
         with writing(out, unfinished):
             turns = _write_turns(folders, unfinished, settings)
             _write_cameras(turns, unfinished, settings["direction"])
-            write_sheet(turns, out / "sheet.png")
+            write_sheet(turns, unfinished / SHEET)
             if splits:
                 usable = {split: [name for name in names if name in turns] for split, names in splits.items()}
-                (out / SPLITS_FILE).write_text(json.dumps(usable, indent=1) + "\n")
-            for name in turns:
+                (unfinished / SPLITS_FILE).write_text(json.dumps(usable, indent=1) + "\n")
+            for name in (*turns, *([SPLITS_FILE] if splits else []), SHEET):
                 (out / name).parent.mkdir(parents=True, exist_ok=True)
                 (unfinished / name).rename(out / name)
     finally:

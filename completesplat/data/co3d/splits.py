@@ -93,7 +93,7 @@ def remove_test_sequences(path: Path, listed: Listed, rule: SeededSplit) -> tupl
 def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Listed:
     """Split at least three sequences by seed, each as a whole; a `test_fraction` of 1 tests all, however many."""
     if len(frames) < 3 and rule.test_fraction < 1:
-        raise DataError(f"{len(frames)} sequences cannot be split into train, val and test; write a set list")
+        raise DataError(f"{len(frames)} objects cannot be split into train, val and test; write a list of splits")
     rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.split_seed)
     # The hashes of the remaining names lie above the test fraction; validation gets the next interval.
     train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.split_seed)

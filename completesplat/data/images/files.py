@@ -239,6 +239,8 @@ def _eight_bits(image: Image.Image, tiff_tags: Mapping[int, object], mode: Liter
         image = image.convert("RGBA")
         if image.getchannel("A").getextrema() != (255, 255):
             raise ImageError(TRANSPARENT)
+    if mode == "L" and image.mode == "L" and image.getextrema()[1] == 1:
+        raise ImageError("a mask has values from 0 to 255, not 0 and 1")
     if mode == "L" and image.mode not in ("1", "L"):
         red, green, blue = image.convert("RGB").split()
         if red.tobytes() != green.tobytes() or red.tobytes() != blue.tobytes():

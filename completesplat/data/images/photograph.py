@@ -310,7 +310,7 @@ def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[T
 
 def outside_of_mask(photograph: Path, mask: Path, size: int) -> Float[Tensor, "1 size size"]:
     """Return the same for a mask image, which is white where the photo is hidden, and is cropped like the photo."""
-    hidden = read_photograph(mask, square_side(photograph)).image.mean(0).numpy() > 0.5
+    hidden = read_photograph(mask, square_side(photograph), background=0.0).image.mean(0).numpy() > 0.5
     if not hidden.any():
         raise CompleteSplatError(f"{mask}: hides nothing; a mask is white where the photograph is hidden")
     return visible_pixels(hidden, size)

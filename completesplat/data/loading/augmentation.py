@@ -44,10 +44,10 @@ class ColorJitter:
         CompleteSplatError: a strength is negative or not finite, or the hue is above 0.5.
     """
 
-    brightness: Annotated[float, Range(0)]
-    contrast: Annotated[float, Range(0)]
-    saturation: Annotated[float, Range(0)]
-    hue: Annotated[float, Range(0, 0.5)]
+    brightness: Annotated[float, Range(0)] = 0.0
+    contrast: Annotated[float, Range(0)] = 0.0
+    saturation: Annotated[float, Range(0)] = 0.0
+    hue: Annotated[float, Range(0, 0.5)] = 0.0
 
     def __post_init__(self) -> None:
         _check("data.color_jitter", self)

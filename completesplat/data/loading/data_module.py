@@ -1,7 +1,6 @@
 """Base classes of all data modules: settings and loaders."""
 
 import logging
-import os
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -27,6 +26,7 @@ from completesplat.data.packed.source import PackedSource, local_root
 from completesplat.data.placement import ObjectFraming
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import TooFewFrames
+from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import CompleteSplatError, DataError, errors_at
 from completesplat.files import counted
 from completesplat.settings.schema import Natural, Positive, Range, Share, Side, check_value, hints_of
@@ -42,7 +42,10 @@ logger = logging.getLogger(__name__)
 
 
 def _built(kind: Callable[..., T], settings: Mapping[str, Any] | None) -> T | None:
-    return None if settings is None else kind(**settings)
+    try:
+        return None if settings is None else kind(**settings)
+    except TypeError as error:  # a name is misspelt
+        raise CompleteSplatError(f"data: {dict(settings or {})}: {error}") from None
 
 
 class SceneDataModule(LightningDataModule):
@@ -116,7 +119,7 @@ class SceneDataModule(LightningDataModule):
             horizontal_flip=horizontal_flip,
             camera_jitter=_built(CameraJitter, camera_jitter),
         )
-        self.workers = min(MOST_WORKERS, os.cpu_count() or 1) if workers is None else workers
+        self.workers = min(MOST_WORKERS, usable_cores()) if workers is None else workers
         self.cache = cache
         self.latent_cache = None if latent_cache is None else Path(latent_cache)
         self.policy = on_bad, max_bad_fraction
@@ -236,7 +239,7 @@ class SceneDataModule(LightningDataModule):
             logger.warning(
                 "data.batch_size=%d: an epoch has %d scenes; taken are %d", self.batch_size, len(scenes), most
             )
-            self.batch_size = most  # Lightning's `BatchSizeFinder` doubles it after `setup`
+            self.batch_size = max(1, most)  # Lightning's `BatchSizeFinder` doubles it after `setup`
         batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
         sampler = RepeatedEpoch if getattr(self.trainer, "overfit_batches", 0) else EpochSampler
         return SceneLoader(scenes, batch_size, sampler(scenes.groups(), self.seed), self.workers, *self.policy)

@@ -162,9 +162,10 @@ class PackedSource(SequenceSource):
         return self._fingerprint
 
     def verify(self) -> list[ChangedFile]:
-        """Read all shards of this split and return those whose checksum differs from the manifest's."""
+        """Read all shards of this split, of a store behind an address those fetched, and return those that changed."""
         reason = "its checksum is no longer that of the manifest: remove it and prepare again into the same folder"
-        paths = {require_file(self.root / shard.file): shard.sha256 for shard in self.shards}
+        there = [shard for shard in self.shards if self.address is None or (self.root / shard.file).exists()]
+        paths = {require_file(self.root / shard.file): shard.sha256 for shard in there}
         return [ChangedFile(reason, str(path)) for path, checksum in paths.items() if sha256_of(path) != checksum]
 
     def __getstate__(self) -> dict[str, object]:

@@ -191,7 +191,7 @@ def draw_back(rng: np.random.Generator, first: Cameras, hidden: str) -> dict[str
 
 
 def textures_of(folder: Path) -> list[str]:
-    paths = [path for path in folder.glob("*") if path.suffix.lower() in TEXTURES and path.is_file()]
+    paths = [path for path in folder.glob("[!.]*") if path.suffix.lower() in TEXTURES and path.is_file()]
     if not paths:
         raise MissingFile(f"no textures there ({', '.join(TEXTURES)})", str(folder))
     return sorted(str(path.absolute()) for path in paths)

@@ -30,7 +30,7 @@ from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
 from completesplat.data.rendered.drawing import PAINTS, RenderSettings, check_surroundings, draw_rendered_scene
 from completesplat.data.validation import MissingFile, UnreadableFile, read_points
-from completesplat.data.validation.processes import share_of
+from completesplat.data.validation.processes import share_of, usable_cores
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import atomic_folder, counted, folder_names, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
@@ -73,7 +73,7 @@ def find_meshes(folder: Path) -> list[Asset]:
     """
     if not folder.is_dir():
         raise MissingFile("no such folder", str(folder))
-    paths = sorted(path for path in folder.rglob("*") if path.suffix[1:].lower() in SUFFIXES and path.is_file())
+    paths = sorted(path for path in folder.rglob("[!.]*") if path.suffix[1:].lower() in SUFFIXES and path.is_file())
     if not paths:
         raise MissingFile(f"no meshes there ({', '.join(SUFFIXES)})", str(folder))
     relative = [path.relative_to(folder).as_posix() for path in paths]
@@ -90,7 +90,8 @@ def check_named_files(mesh: Path, root: Path) -> None:
         BrokenMesh: there is such a file, or an OBJ's material file is missing.
     """
     names = _uris(mesh) if mesh.suffix.lower() in (".gltf", ".glb") else []
-    for library in _lines(mesh, "mtllib") if mesh.suffix.lower() == ".obj" else ():
+    for line in _lines(mesh, "mtllib") if mesh.suffix.lower() == ".obj" else ():
+        library = line.strip('"').replace("\\", "/")
         _check_named_file(mesh, library, root)
         if not os.path.isfile(mesh.parent / library):
             raise BrokenMesh(f"its material file {library} is missing")
@@ -218,7 +219,9 @@ def _write_lists(category: Path, objects: Sequence[Asset], broken: dict[str, str
     missing = sorted(asset.name for asset in objects if not (category / asset.name).exists())
     broken = {name: reasons[name] for name in missing if name in reasons}
     write_text(path, json.dumps(broken, indent=1) + "\n")
-    records = [json.loads(path.read_text()) for path in sorted(category.glob(f"[!.]*/{OBJECT}"))]
+    rendered = {path.parent.name: json.loads(path.read_text()) for path in sorted(category.glob(f"[!.]*/{OBJECT}"))}
+    names = {asset.key: asset.name for asset in objects}  # an object that was added may have renamed another
+    records = [record for name, record in rendered.items() if names.get(record["source"], name) == name]
     if len(broken) == len(objects) and not records:
         raise DataError(f"none of {len(broken)} objects can be rendered: {next(iter(broken.values()))}", str(category))
     frames = [frame for record in records for frame in record["frames"]]
@@ -231,7 +234,7 @@ def _in_threads(
 ) -> Iterator[tuple[str, str]]:
     """Yield the results as they come; at an exception, end those that run and start no others."""
     stopped = Event()
-    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+    with ThreadPoolExecutor(workers or usable_cores()) as pool:
         futures = [pool.submit(function, asset, stopped) for asset in assets]
         try:
             for future in as_completed(futures):

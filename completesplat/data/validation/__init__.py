@@ -172,6 +172,8 @@ def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
         return {key: parsed(arguments[1], item, key) for key, item in value.items()}
     if isinstance(kind, type) and is_dataclass(kind) and type(value) is dict:
         return kind(**{key: parsed(hint, _entry(value, key), key) for key, hint in get_type_hints(kind).items()})
+    if kind is float and type(value) is int:  # some programs write 0 for 0.0
+        return value
     if type(value) in (arguments if origin is UnionType else (kind,)):
         return value
     preview = printable(repr(value), SHORT)

@@ -15,6 +15,12 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+def usable_cores() -> int:
+    """Return the number of cores that this process may use, which a cluster or container may limit."""
+    affinity = getattr(os, "sched_getaffinity", None)  # not on Macs and Windows
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
 def share_of(items: Sequence[Item], shard: int, shards: int) -> Sequence[Item]:
     """Return every `shards`-th item from number `shard` on; raise CompleteSplatError if there is no such shard."""
     if not 0 <= shard < shards:
@@ -23,13 +29,13 @@ def share_of(items: Sequence[Item], shard: int, shards: int) -> Sequence[Item]:
 
 
 def map_in_processes(work: Callable[[Item], Result], items: Sequence[Item], workers: int | None) -> Iterator[Result]:
-    """Yield `work` of every item in order, by `workers` processes (None: one for each core) that get it once.
+    """Yield `work` of every item in order, by `workers` processes (None: one for each usable core) that get it once.
 
     Raises:
         CompleteSplatError: a process ended unexpectedly.
         Interrupted: the run was interrupted; the processes end with the same exception.
     """
-    workers = min(workers or os.cpu_count() or 1, len(items))
+    workers = min(workers or usable_cores(), len(items))
     if workers <= 1:
         yield from map(work, items)
         return

@@ -2,6 +2,7 @@
 
 import json
 import math
+from unittest.mock import Mock
 
 import meshes
 import numpy as np
@@ -10,8 +11,17 @@ import torch
 from support import write_capture
 
 from completesplat.data.captures.transforms_json import read_cameras, read_transforms
-from completesplat.data.rendered.drawing import PAINTS, draw_back, draw_cameras, draw_light, draw_surface, room_size
-from completesplat.data.rendered.rendering import find_meshes
+from completesplat.data.rendered import rendering
+from completesplat.data.rendered.drawing import (
+    PAINTS,
+    draw_back,
+    draw_cameras,
+    draw_light,
+    draw_surface,
+    room_size,
+    textures_of,
+)
+from completesplat.data.rendered.rendering import OBJECT, BrokenMesh, check_named_files, find_meshes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.tensors import stack
@@ -143,3 +153,35 @@ def test_an_objects_folder_has_its_name_without_the_suffix_unless_another_file_h
     for name in ("x/box0.obj", "a.b.glb", "a.b.obj", "lamp.GLB"):
         (tmp_path / name).touch()
     assert [mesh.name for mesh in find_meshes(tmp_path)] == ["a.b.glb", "a.b.obj", "lamp", "x_box0"]
+
+
+def test_hidden_files_are_neither_meshes_nor_textures(tmp_path):
+    for name in ("._chair.glb", "chair.glb", "._wood.jpg", "wood.jpg"):  # as in archives of macOS
+        (tmp_path / name).touch()
+    assert [mesh.key for mesh in find_meshes(tmp_path)] == ["chair.glb"]
+    assert textures_of(tmp_path) == [str(tmp_path / "wood.jpg")]
+
+
+@pytest.mark.parametrize("library", ['"t.mtl"', ".\\t.mtl", "t.mtl"])
+def test_a_material_file_is_found_as_programs_write_its_name(tmp_path, library):
+    (tmp_path / "a.obj").write_text(f"mtllib {library}\n")
+    with pytest.raises(BrokenMesh, match=r"its material file (\./)?t\.mtl is missing"):
+        check_named_files(tmp_path / "a.obj", tmp_path)
+    (tmp_path / "t.mtl").touch()
+    check_named_files(tmp_path / "a.obj", tmp_path)
+
+
+def test_a_mesh_that_another_one_renames_is_not_twice_in_the_data(tmp_path, monkeypatch):
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes/chair.glb").touch()
+    written = Mock()
+    monkeypatch.setattr(rendering.writing, "write_annotations", written)
+    for names in (["chair"], ["chair.glb", "chair.obj"]):
+        objects = find_meshes(tmp_path / "meshes")
+        for mesh in objects:
+            (tmp_path / mesh.name).mkdir()
+            record = {"source": mesh.key, "frames": [], "sequence": mesh.name}
+            (tmp_path / mesh.name / OBJECT).write_text(json.dumps(record))
+        rendering._write_lists(tmp_path, objects, {}, len(objects))
+        assert written.call_args.args[2] == names
+        (tmp_path / "meshes/chair.obj").touch()
