@@ -98,7 +98,7 @@ def test_packed_captures_are_the_same_data_set(root: Path, tmp_path: Path) -> No
 
 
 def test_a_list_may_name_a_capture_that_cannot_be_read(root: Path) -> None:
-    (root / "splits.json").write_text(json.dumps({"train": ["apple", "cherry"], "val": ["pear"]}))
+    (root / "splits.json").write_text(json.dumps({"train": ["apple/r0", "apple/r1", "cherry"], "val": ["pear"]}))
     (root / "apple/r1/transforms.json").write_text("{}")
     assert split(module(root))["train"] == ["apple/r0", "cherry/r0", "cherry/r1"]
 
