@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from completesplat.version import __version__ as __version__
 
 # By default, threads of torch's GNU OpenMP spin for milliseconds while they wait for the next of hundreds of small
-# parallel regions. Beside another busy process they keep the threads that they wait for off the cores. If none
-# spins, regions on free cores begin late. torch reads this when it is loaded; what a user has set stays.
+# parallel regions. Beside another busy process they take the cores from the threads that they wait for. Without
+# spinning, regions begin late on free cores. torch reads this when it is loaded; what a user has set stays.
 if "torch" not in sys.modules:
     os.environ.setdefault("GOMP_SPINCOUNT", "1500")
 

@@ -9,7 +9,7 @@ import shutil
 import unicodedata
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from completesplat.errors import CompleteSplatError, DiskError
@@ -30,7 +30,7 @@ UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}(\.\w+)?")  # names of temporary fil
 def atomic_path(path: str | Path, name: str | None = None) -> Iterator[Path]:
     """Yield a temporary path beside `path` that replaces it when the block ends without an exception.
 
-    The folder must exist, because a folder that is removed during a run must not come back without its other files.
+    The folder must exist: one that was removed during a run must not come back with this file alone.
     After an exception the old file is unchanged and the temporary one removed. A link at `path` is not followed.
 
     Args:
@@ -49,7 +49,8 @@ def atomic_path(path: str | Path, name: str | None = None) -> Iterator[Path]:
                 os.fsync(file.fileno())
             os.replace(temporary, path)
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # of a disk that failed in the block
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -57,7 +57,7 @@ class Gaussians(TensorDataclass):
 
 @dataclass(frozen=True)
 class DirectionalGaussians(Gaussians):
-    """Gaussians whose colours depend on the direction, by spherical harmonics of degree 1 or 2.
+    """Gaussians whose colours depend on the direction, by spherical harmonics of degree 1 to 3.
 
     Seen along a unit vector d, the colour is max(0, colors + Y(d) @ harmonics) (`completesplat.geometry.harmonics`), so
     `colors` are means over all directions.

@@ -18,7 +18,7 @@ POSTPONED = ("requests", *SCIPY, "torch._dynamo", "torch.distributed._functional
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Pause the garbage collector during imports, because it took a third of the time from the first to the exit.
+    """Pause the garbage collector during imports, because it took a third of the time of a prediction.
 
     The objects that exist after the first import of torch are frozen: the collector does not examine them again.
     """

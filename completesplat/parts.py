@@ -62,10 +62,10 @@ PartConfig = Mapping[str, object]  # config of a part: `_target_`, and arguments
 class TrainingImages(TypedDict, total=False):
     """Facts about the training images that are stored with weights; older weights have none.
 
-    `content`: what they show, in words, for weights in the package. `log_odds`: logarithm of how likely a photo shows
-    this and not anything else, before it is seen (0: no saying); renders are rare, and what lies on white is often
-    fruit. `box_masks`: how often parts of an image were hidden. `background`: grey value behind the objects, if images
-    show nothing else. `depth_before`: depth range before the centre of an object of the common size. The others: mean
+    `content`: what they show, in words, for weights in the package. `log_odds`: logarithm of the odds that a photo
+    shows this, before it is seen (0: even); low for renders, which are rare, and high for fruit on white. `box_masks`:
+    how often parts of an image were hidden. `background`: grey value behind the objects, if images show nothing else.
+    `depth_before`: depth range before the centre of an object of the common size. The others: mean
     and standard deviation of the training images' features, see `completesplat.data.images.photograph.image_features`.
     """
 

@@ -195,7 +195,7 @@ class SceneModel(nn.Module):
         """Scale the world of cameras in any units to the model's units.
 
         The point nearest to all optical axes gets the depth at which untrained Gaussians start
-        (`Parameterization.first_depth`), because a data set's objects should lie there.
+        (`Parameterization.first_depth`): objects lie there in the data of training.
 
         Raises:
             CompleteSplatError: the axes are parallel, or meet behind the first camera.

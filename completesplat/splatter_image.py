@@ -19,7 +19,7 @@ from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_rays
 from completesplat.geometry.harmonics import LARGEST_DEGREE, SH_C0, coefficients
 from completesplat.geometry.rotations import normalize_quaternion
-from completesplat.settings.schema import Few, Range, Share
+from completesplat.settings.schema import Few, Range
 from completesplat.tensors import TensorDataclass
 
 
@@ -91,7 +91,7 @@ class Parameterization:
 
     layers: Few = 2
     layer_depths: Literal["independent", "incremental"] = "independent"
-    first_depth: Share = 0.5
+    first_depth: Annotated[float, Range(1e-3, 0.999)] = 0.5
     first_scale: Length = 0.02
     layer_step: Length = 1.0
     smallest_scale: Length = 1e-4

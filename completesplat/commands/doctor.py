@@ -36,7 +36,7 @@ EXTRAS = {
 }
 DEVICES = {
     "cuda": "networks and splats of all verbs",
-    "mps": "networks of all verbs but report, whose splats the CPU draws (tiled). Not run yet;"
+    "mps": "networks of all verbs but plan, report and hidden modes, whose splats the CPU draws (tiled). Not run yet;"
     " PYTORCH_ENABLE_MPS_FALLBACK=1 has the CPU compute what MPS lacks",
     "cpu": "all networks and splats",
 }
@@ -149,8 +149,9 @@ def check_tools(place: Path) -> Iterator[Finding]:
         yield Finding("ffmpeg", "yes", imageio_ffmpeg.get_ffmpeg_exe())
     except Exception as error:  # the program is missing or cannot be run
         yield Finding("ffmpeg", "broken", f"{error}; for videos, `pip install --force-reinstall imageio-ffmpeg`")
-    node = shutil.which("node")
-    yield Finding("node", "yes" if node else "no", node or "formats spz, sog and html need it: https://nodejs.org")
+    node = shutil.which("splat-transform") or shutil.which("npx")
+    advice = "formats spz, sog and html need Node.js 20 or newer with npm: https://nodejs.org"
+    yield Finding("node", "yes" if node else "no", node or advice)
     try:
         blender = find_blender()
         yield Finding("blender", "yes", f"{blender.version}, {blender.command[0]}: to render meshes (data render)")

@@ -118,6 +118,8 @@ def is_running(out: Path) -> bool:
     try:
         with FileLock(path).acquire(timeout=0.2):  # for which another process may look, too
             return False
+    except PermissionError:  # another user's run, which a lock cannot tell about
+        return False
     except (Timeout, OSError):
         return True
 

@@ -80,6 +80,8 @@ class TrainedModel:
         check_one_model(self.ckpt, self.weights, self.scenes)
         if self.scenes is None and (self.frame, self.align, self.method) != ("opencv", "none", None):
             raise CompleteSplatError("frame, align, method: these apply to files only; give scenes=DIR")
+        if self.ckpt is None and self.overrides:
+            raise CompleteSplatError("overrides change a run's settings: give ckpt=FILE, or else data.KEY=VALUE")
         if self.ckpt is not None and self.data is not None:
             raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
         if self.ckpt is not None:

@@ -18,7 +18,7 @@ from completesplat.signals import Interrupted
 from completesplat.weights import AUTO, CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, shipped
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
-KINDS = dict.fromkeys(SPLATS, "scene") | {".ckpt": "weights", ".pth": "weights"}
+KINDS = dict.fromkeys(SPLATS, "scene") | dict.fromkeys((".ckpt", ".pth", ".safetensors"), "weights")
 PAUSE = 2.0  # seconds between two checks for new scenes of a run
 SCENE_FILES = ("sample_*.ply", "scene.ply")
 AT_STEP = "step {} of the training"
@@ -38,6 +38,8 @@ def run(config: DictConfig, out: Path) -> None:
     from completesplat.viewer.access import start_server, stop_server
 
     config.update(setting_of_path(Path(config.path)) if config.path is not None else {})
+    if (shown := config.scene or config.watch) is not None and (config.image is not None or config.weights != AUTO):
+        raise CompleteSplatError(f"{shown}: is shown as it is; image= and weights= are for new scenes")
     own_files = (config.image, config.scene) != (None, None) or config.weights not in (AUTO, *shipped())
     server = start_server(0 if config.export is not None else config.port)
     address, page, step = f"{server.address} (Ctrl-C ends it)", None, None

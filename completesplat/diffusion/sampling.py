@@ -3,7 +3,7 @@
 import copy
 import logging
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Annotated, Any, TypeVar
@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 SMALL = 20_000_000
 """Parameters of a denoiser below which samples are drawn side by side (notebooks/experiments.md)."""
 PART, LARGEST_PART = 4, 10
-"""Fewest and most samples of a small denoiser that a thread draws at a time; it decodes `PART` at a time."""
+"""Fewest and most samples that a thread draws at a time with a small denoiser; a thread decodes `PART` at a time."""
 
 _callers: list[int] = []  # for each call of `one_thread_each` that has not ended, torch's threads before the first
 _callers_lock = threading.Lock()
@@ -144,11 +144,11 @@ def draw_noise(
     Raises:
         CompleteSplatError: `seed` is neither one seed for all noise nor one seed for each image.
     """
-    seeds = [seed] if isinstance(seed, int) else list(seed)
-    if not isinstance(seed, int) and len(seeds) != images:
+    seeds = list(seed) if isinstance(seed, Iterable) else [seed]
+    if isinstance(seed, Iterable) and len(seeds) != images:
         raise CompleteSplatError(f"seed={seeds}: {len(seeds)} seeds for {images} images; give one for each image")
     shape = (images * samples // len(seeds), *shape)
-    return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(number)) for number in seeds])
+    return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(int(number))) for number in seeds])
 
 
 @contextmanager

@@ -145,7 +145,9 @@ def look_at(eye: Vectors, target: Vectors, up: Vectors) -> Float[Tensor, "*batch
     """Return `world_to_camera` of a camera at `eye` with `target` in the image's centre and `up` pointing up."""
     eye, target, up = torch.broadcast_tensors(eye, target, up)  # type: ignore[no-untyped-call]
     forward = torch.nn.functional.normalize(target - eye, dim=-1)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)
+    aside, other = torch.linalg.cross(forward, up), torch.linalg.cross(forward, up.roll(1, -1))
+    straight = aside.norm(dim=-1, keepdim=True) < 1e-6 * up.norm(dim=-1, keepdim=True)  # along `up`
+    right = torch.nn.functional.normalize(torch.where(straight, other, aside), dim=-1)
     down = torch.linalg.cross(forward, right)
     rotation = torch.stack([right, down, forward], dim=-2)
     return _rigid(rotation, -(rotation @ eye[..., None]))

@@ -44,7 +44,7 @@ def harmonics(directions: Directions, degree: int) -> Float[Tensor, "*batch coef
         terms += [-outer * y * (3 * xx - yy), mixed * x * y * z, -inner * y * (4 * zz - xx - yy)]
         terms += [zonal * z * (2 * zz - 3 * xx - 3 * yy), -inner * x * (4 * zz - xx - yy)]
         terms += [difference * z * (xx - yy), -outer * x * (xx - 3 * yy)]
-    return torch.stack(terms[: coefficients(degree)], dim=-1)
+    return torch.stack(terms, dim=-1)
 
 
 def rotated(

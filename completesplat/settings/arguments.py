@@ -128,6 +128,8 @@ def _with_file(argument: str) -> str:
 
 def _refuse_unreadable(argument: str, sweep: bool) -> None:
     key, equals, value = argument.partition("=")
+    if equals and not key:
+        raise CompleteSplatError(f"{printable(argument, SHORT)}: settings are key=value, without spaces")
     if not equals and not argument.startswith("~"):
         chosen = [f"{group}={argument}" for group in groups() if argument in options(group)]
         nearest = f"; did you mean {' or '.join(chosen)}?" if chosen else did_you_mean(argument, groups())
@@ -142,5 +144,6 @@ def _refuse_unreadable(argument: str, sweep: bool) -> None:
     if override.is_sweep_override() and not sweep:
         message = f"several values; -m makes a run of each, and a list is {key}=[{value}]"
         raise CompleteSplatError(f"{printable(argument, SHORT)}: {printable(message, SHORT)}")
-    if override.key_or_group == "out" and not override.is_sweep_override() and override.value() in ("", None):
+    is_out = override.key_or_group == "out" and not override.is_sweep_override()
+    if is_out and (override.value() in ("", None) or isinstance(override.value(), list | dict)):
         raise CompleteSplatError(f"{argument}: names no folder; give out=DIR")

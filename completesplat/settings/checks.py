@@ -73,6 +73,9 @@ class PlanSettings(FitSettings):
     frames: Positive
     pixel_bytes: Annotated[float, Range(0)]
     loading_rate: Annotated[float, Range(1e-3)]
+    bandwidth_share: Annotated[float, Range(0.01, 1)]
+    checkpoint_rate: Annotated[float, Range(1e-3)]
+    gaussian_ns: Annotated[float, Range(0)]
     operation_us: Annotated[float, Range(0)]
     usable: Annotated[float, Range(0.01, 1)]
     gpus: Mapping[str, Mapping[str, Annotated[float, Range(1e-3)]]]
@@ -83,7 +86,6 @@ class SceneSettings(TypedDict):
 
     weights: str
     trust: bool
-    skip_weight: Share | None
     guidance_weight: Share
     color_fits: Annotated[int, Range(0, 100)]
     steps: Annotated[int, Range(1, 1000)] | None
@@ -99,6 +101,7 @@ class PredictSettings(SceneSettings):
     shards: Positive
     devices: Positive
     samples: Annotated[int, Range(1, 1000)]
+    skip_weight: Share | None
     seed: Seed
     batch: Positive | None
     mask: str | None
@@ -114,6 +117,7 @@ class ViewSettings(SceneSettings):
     """Settings of `completesplat view`."""
 
     samples: Annotated[int, Range(1, 8)]
+    skip_weight: Share
     seed: Annotated[int, Range(0, 2**31)]
     port: Annotated[int, Range(1, 65535)]
 

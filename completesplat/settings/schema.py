@@ -4,6 +4,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import (
     Annotated,
@@ -21,6 +22,7 @@ from typing import (
 from completesplat.errors import CompleteSplatError
 
 MOST_SHOWN = 1e6  # help texts leave out larger bounds
+NUMBERS: Mapping[type, type] = {int: Integral, float: Real}  # NumPy's are such, too
 KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "null"}
 
 
@@ -223,4 +225,4 @@ def described(annotation: object) -> str:
 def _is_a(kind: type, value: object) -> bool:
     if kind is bool or isinstance(value, bool):
         return kind is bool and isinstance(value, bool)
-    return isinstance(value, int | float if kind is float else kind)
+    return isinstance(value, NUMBERS.get(kind, kind))

@@ -94,7 +94,7 @@ class DepthBounds(NamedTuple):
     def range(self, given: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """Return near and far for scenes whose data have the depth range `given`.
 
-        Its far end tells an object's distance; its near end does not, because it is clamped in front of the camera.
+        The far depth tells an object's distance; the near depth does not, which is clamped in front of the camera.
         """
         limits = given.new_tensor([self.near, self.far])
         if self.around_object:
