@@ -1,13 +1,15 @@
 """Files appear whole or not at all, and whatever an image is called, its folder lies in `out`."""
 
+import errno
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.files import (
     LONGEST,
     MOST_SHOWN,
@@ -107,3 +109,13 @@ def test_only_errors_about_unusable_file_names_become_refusals(tmp_path: Path) -
         assert str(file_refusal(caught.value)).startswith(name[:200])
     assert file_refusal(FileNotFoundError(2, "No such file", "x")) is None
     assert file_refusal(ValueError("x")) is None
+
+
+def test_a_disk_that_fails_is_named_by_the_users_file_even_if_the_unfinished_one_cannot_be_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failed = OSError(errno.EROFS, "Read-only file system")
+    monkeypatch.setattr(Path, "unlink", Mock(side_effect=failed))
+    with pytest.raises(DiskError, match=r"x\.txt: cannot be written") as caught:
+        write_text(tmp_path / "x.txt", "a")
+    assert ".x" not in str(caught.value).removeprefix(str(tmp_path))

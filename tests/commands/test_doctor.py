@@ -92,3 +92,10 @@ def test_the_device_is_named_with_what_runs_on_it(monkeypatch):
         monkeypatch.setattr("torch.backends.mps.is_available", lambda mps=mps: mps)
         details = {finding.name: finding.details for finding in doctor.check_device()}
         assert details["used device"] == f"{device}: {doctor.DEVICES[device]}"
+
+
+def test_node_without_its_package_manager_converts_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(doctor.shutil, "which", {"node": "/usr/bin/node"}.get)
+    assert states(doctor.check_tools(tmp_path))["node"] == "no"
+    monkeypatch.setattr(doctor.shutil, "which", {"npx": "/usr/bin/npx"}.get)
+    assert states(doctor.check_tools(tmp_path))["node"] == "yes"

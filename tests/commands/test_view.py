@@ -4,11 +4,13 @@ import subprocess
 import sys
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 from urllib.parse import urlsplit
 from urllib.request import ProxyHandler, build_opener
 
 import pytest
 import torch
+from PIL import Image
 from scenes_for_training import scene_batch
 from support import LIMIT
 from viewer_scenes import balls
@@ -39,6 +41,7 @@ PATHS = [
     ("A.PLY photo.jpg", "A.PLY", "scene"),
     ("A.PLY photo.jpg", "", "scene"),
     ("A.PLY photo.jpg", "photo.jpg", "image"),
+    ("config.json model.safetensors", "model.safetensors", "weights"),
 ]
 
 
@@ -75,6 +78,15 @@ def test_weights_that_are_not_there_are_refused_before_the_page_opens(command):
     assert finished.err.startswith("error: nowhere: no such folder")
 
 
+@pytest.mark.parametrize("beside", ["image=a.png", "weights=toy_objects"])
+def test_a_scene_is_not_shown_in_the_place_of_a_photo_or_weights_that_are_given_too(command, tmp_path, beside):
+    (tmp_path / "g.ply").touch()
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
+    assert (
+        command.refuses("view", "g.ply", beside) == "g.ply: is shown as it is; image= and weights= are for new scenes"
+    )
+
+
 def run_in_training(path, step: int = 2):
     """A run's folder as far as it is watched."""
     newest = path / "images/newest"
@@ -93,6 +105,12 @@ def test_a_run_is_watched_while_a_process_is_at_work_in_it(tmp_path):
     with hold_job_lock(run, run):
         assert setting_of_path(run) == {"watch": str(run)}
         assert (run / ".lock").read_text().split()[0] == str(os.getpid())  # as it was
+
+
+def test_a_run_of_another_user_whose_lock_may_not_be_opened_is_not_watched(tmp_path, monkeypatch):
+    run = run_in_training(folder(tmp_path / "run", ".lock", "config.json", "model.safetensors"))
+    monkeypatch.setattr("filelock.FileLock.acquire", Mock(side_effect=PermissionError))
+    assert setting_of_path(run) == {"weights": str(run)}
     assert setting_of_path(run) == {"weights": str(run)}
 
 

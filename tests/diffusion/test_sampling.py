@@ -1,10 +1,12 @@
 """Samplers against closed forms: equations, and latents whose exact denoiser is known."""
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import product
 from threading import Barrier
 
+import numpy as np
 import pytest
 import torch
 from diffusers import DDIMScheduler, DDPMScheduler, HeunDiscreteScheduler
@@ -15,6 +17,8 @@ from support import compose_config
 from completesplat.commands import conf_folder
 from completesplat.diffusion.sampling import Sampler, with_forward_process
 from completesplat.errors import CompleteSplatError
+from completesplat.generator import CompleteSplat
+from completesplat.settings.schema import check_value
 
 NOISE = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 DDIM = NOISE | {"clip_sample": False, "set_alpha_to_one": True, "timestep_spacing": "trailing"}
@@ -207,3 +211,20 @@ def test_another_sampler_keeps_what_training_was_done_with(kind):
     assert (own.steps, own.scheduler.config.prediction_type) == (20, kind)
     levels = instantiate(trained).scheduler.alphas_cumprod  # DPM-Solver++ writes 2^-24 for 0
     torch.testing.assert_close(own.scheduler.alphas_cumprod, levels, rtol=0, atol=1e-7)
+
+
+def test_seeds_and_weights_may_be_numpys():
+    check_value("seed", int, np.int64(7))
+    check_value("skip_weight", float, np.float32(0.5))
+    with pytest.raises(CompleteSplatError, match="must be a whole number"):
+        check_value("seed", int, np.float32(7))
+    with pytest.raises(CompleteSplatError, match="must be a number"):
+        check_value("skip_weight", float, np.bool_(True))
+
+
+@pytest.mark.parametrize("verb", ["predict", "view", "test"])
+def test_the_samplers_that_the_help_recommends_fit_the_weights_that_it_names(verb):
+    model = CompleteSplat.from_pretrained("toy_objects")
+    (line,) = re.findall("# Sampler that replaces .*", (conf_folder() / f"{verb}.yaml").read_text())
+    name = re.search(r"(\w+) for (those|weights) in the package", line).group(1)
+    model.replace_sampler(OmegaConf.to_container(config(name), resolve=True))

@@ -110,6 +110,9 @@ def test_look_at_puts_the_eye_at_the_origin_and_the_target_on_the_axis() -> None
     assert_close(seen_up[:, 0], torch.zeros(50, dtype=torch.float64))
     assert (seen_up[:, 1] < 0).all()
     assert_rotation(matrix[:, :3, :3])
+    straight = look_at(eye, target, target - eye)  # from above, where `up` does not say how the camera is turned
+    assert_rotation(straight[:, :3, :3])
+    assert_close(transform_points(straight, target[:, None])[:, 0, :2], torch.zeros(50, 2, dtype=torch.float64))
 
 
 def test_relative_to_makes_the_reference_the_world_and_keeps_the_poses_between_cameras() -> None:

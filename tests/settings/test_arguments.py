@@ -86,6 +86,8 @@ def test_words_and_flags_become_settings(verb, typed, given):
         ("fit", ["out=a=b"], "out=a=b: cannot be read; a text with such characters wants quotes: \"out='a=b'\""),
         ("bench", ["settings=[a=b,c]"], "settings=[a=b,c]: cannot be read; a text with such characters wants quotes"),
         ("predict", ["image=a (1).png"], "image=a (1).png: cannot be read; a text with such characters wants quotes: "),
+        ("predict", ["a.png", "samples", "=", "8"], "=: settings are key=value, without spaces"),
+        ("predict", ["a.png", "=3"], "=3: settings are key=value, without spaces"),
         ("fit", ["seed=0,1"], "seed=0,1: several values; -m makes a run of each, and a list is seed=[0,1]"),
     ],
 )

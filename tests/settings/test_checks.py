@@ -19,6 +19,7 @@ ONE = "give one of ckpt=FILE, weights=DIR and scenes=DIR; all but ckpt need data
 NO_DATA = "weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR"
 PRETRAINED = "CompVis/stable-diffusion-v1-4, or null for random weights"
 WHOLE, NUMBER = "must be a whole number", "must be a number"
+FIRST_DEPTH = "autoreconstructor.reconstructor.parameterization.first_depth"
 ODD = [
     ("predict", "samples=abc", f"samples=abc: {WHOLE}"),
     ("predict", "samples=-1", "samples=-1: must lie between 1 and 1000"),
@@ -44,6 +45,11 @@ ODD = [
     ("fit", "optimizer.lr=nan", f"optimizer.lr=nan: {NUMBER}"),
     ("fit", "callbacks.images.scenes=0", "callbacks.images.scenes=0: must be at least 1"),
     ("fit", "schedule=exponential schedule.final_ratio=0", "schedule.final_ratio=0: must lie between 1e-09 and 1"),
+    ("plan", "bandwidth_share=0", "bandwidth_share=0: must lie between 0.01 and 1"),
+    ("plan", "checkpoint_rate=0", "checkpoint_rate=0: must be at least 0.001"),
+    ("plan", "gaussian_ns=-100", "gaussian_ns=-100: must be at least 0"),
+    ("view", "skip_weight=null", f"skip_weight=null: {NUMBER}"),
+    ("fit", f"{FIRST_DEPTH}=1", f"{FIRST_DEPTH}=1: must lie between 0.001 and 0.999"),
     ("fit", "optimizer.lr=-1", "optimizer: Invalid learning rate: -1"),
     ("fit", "trainer.val_check_interval=0", "trainer.val_check_interval=0: must be at least "),
     ("fit", "trainer.precision=half", "trainer.precision=half: choose one of "),
@@ -90,6 +96,7 @@ ODD = [
     ("test", "ckpt=null scenes=a weights=b data=toy_objects data.root=x", ONE),
     ("test", "ckpt=null scenes=a", NO_DATA),
     ("test", "ckpt=null weights=a", NO_DATA),
+    ("test", "ckpt=null weights=a overrides=['data.targets=1']", "overrides change a run's settings: give ckpt=FILE"),
     ("test", "data=toy_objects data.root=x", "a checkpoint's data are its run's"),
     ("test", "ckpt=null data=toy_objects data.root=x scenes=no", "scenes=no: no such folder; give one with SCENE/"),
     ("test", "scenes=a frame=colmap", "frame=colmap: choose one of opencv, opengl"),
@@ -169,7 +176,7 @@ def test_a_refusal_is_one_line_that_suggests_the_nearest_name(command, typed, me
     assert len(refused) < 700
 
 
-@pytest.mark.parametrize("empty", ["out=", "out=''", "out=null"])
+@pytest.mark.parametrize("empty", ["out=", "out=''", "out=null", "out=[x]"])
 def test_an_empty_name_of_the_output_folder_is_refused_and_nothing_is_written(command, tmp_path, empty):
     assert command.refuses("fit", empty) == f"{empty}: names no folder; give out=DIR"
     assert not list(tmp_path.iterdir())
