@@ -10,7 +10,7 @@ from torch import Tensor
 
 from completesplat.data.images.crop import Square, principal_square
 from completesplat.data.sequences import MaskedImage, PosedSequence
-from completesplat.data.validation import BadCamera, BadPlacement
+from completesplat.errors import BadCamera, BadPlacement
 from completesplat.geometry.cameras import Cameras, crop_resize, nearest_to_axes, transform_points
 from completesplat.tensors import stack
 

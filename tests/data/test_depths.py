@@ -14,7 +14,7 @@ from completesplat.data.images.crop import Square
 from completesplat.data.loading.scenes import LoadedScenes, collate
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.data.toy.writing import SUBSET
-from completesplat.data.validation import BadImage
+from completesplat.errors import BadImage
 from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.scene import SceneBatch
 

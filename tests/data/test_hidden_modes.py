@@ -18,8 +18,7 @@ from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModu
 from completesplat.data.toy.object_scene import PATCH_COLORS, render_frame
 from completesplat.data.toy.raytracing import trace
 from completesplat.data.toy.writing import draw_category
-from completesplat.data.validation import BadAnnotation
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import BadAnnotation, CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
 
 

@@ -11,8 +11,7 @@ from realestate10k_trees import epoch, equal, make_clip, module, same, write_tre
 
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.loader import EpochSampler, SceneLoader
-from completesplat.data.validation import BadCamera, BadImage
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import BadCamera, BadImage, CompleteSplatError, DataError
 from completesplat.scene import SceneBatch
 from completesplat.settings.schema import check_value, hints_of
 

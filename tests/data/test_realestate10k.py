@@ -22,9 +22,8 @@ from realestate10k_trees import (
 from support import compose_config
 
 from completesplat.data.realestate10k import clips
-from completesplat.data.validation import BadAnnotation, BadCamera, OutsidePath, UnreadableFile
 from completesplat.data.validation.audit import check
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import BadAnnotation, BadCamera, CompleteSplatError, DataError, OutsidePath, UnreadableFile
 from completesplat.geometry.cameras import project
 
 TRAIN = [make_clip(f"train{i}", frames=5 + i % 3) for i in range(7)]

@@ -10,8 +10,8 @@ from completesplat.data.co3d.splits import SeededSplit, split_by_seed
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.sequences import SPLITS
-from completesplat.data.validation import BadAnnotation, MissingFile, SharedSequences, field, read_json, require_file
-from completesplat.errors import errors_at
+from completesplat.data.validation import field, read_json, require_file
+from completesplat.errors import BadAnnotation, MissingFile, SharedSequences, errors_at
 from completesplat.settings.schema import Natural, Share
 
 SPLITS_FILE = "splits.json"

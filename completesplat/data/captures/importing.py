@@ -19,8 +19,7 @@ from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.turntable import TurntableSettings, import_turntables
 from completesplat.data.images import files
 from completesplat.data.sequences import first_names
-from completesplat.data.validation import refused_to
-from completesplat.errors import DataError
+from completesplat.errors import DataError, refused_to
 from completesplat.files import atomic_folder, counted, folder_names
 from completesplat.settings.schema import Positive
 

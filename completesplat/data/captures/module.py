@@ -28,8 +28,7 @@ from completesplat.data.placement import (
     upright_axes,
 )
 from completesplat.data.sequences import SPLITS, MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import MissingFile, refused_to
-from completesplat.errors import DataError, errors_at
+from completesplat.errors import DataError, MissingFile, errors_at, refused_to
 from completesplat.settings.schema import Range
 
 logger = logging.getLogger(__name__)
@@ -92,7 +91,7 @@ def read_captures(folders: Mapping[str, Path]) -> tuple[dict[str, Capture], list
     """Read the captures in some of the folders, by name; return also the errors of those that cannot be read."""
     captures, refused = dict[str, Capture](), list[DataError]()
     for name, folder in folders.items():
-        with refused_to(refused.append), errors_at(sequence=name):
+        with refused_to(refused.append, sequence=name):
             capture = read_capture(folder)
             if capture is not None:
                 captures[name] = capture

@@ -27,8 +27,8 @@ from completesplat.data.placement import (
     upright_axes,
 )
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import BadImage, read_points
-from completesplat.errors import DataError, errors_at
+from completesplat.data.validation import read_points
+from completesplat.errors import BadImage, DataError, errors_at
 from completesplat.geometry.cameras import pixel_centers, unproject
 
 DEPTH_MAPS = 8

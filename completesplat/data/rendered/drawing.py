@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 
 from completesplat.data.captures.transforms_json import read_cameras
-from completesplat.data.validation import MissingFile, require_file
-from completesplat.errors import CompleteSplatError
+from completesplat.data.validation import require_file
+from completesplat.errors import CompleteSplatError, MissingFile
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
 
