@@ -13,14 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
+from completesplat.metrics.proper_scores import SampledValues, TrueValues, crps, energy_score, rank_histogram
 from completesplat.metrics.scoring import novel_values
 from completesplat.studies.controls import OnProgress, Scenes
 from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import SampleRenderer, mean_over_scenes
 
-SampledValues = Float[Tensor, "sample value"]
-TrueValues = Float[Tensor, " value"]
 BINS = 10
 
 
