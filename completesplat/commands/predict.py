@@ -50,8 +50,6 @@ sha256_of_weights = cache(sha256_of)  # a process has one model, of up to gigaby
 RESIZING = 0.1  # change of a distance that resizing to another model's size and back may cause
 ELSEWHERE = "for objects weights=splatter_image:objaverse (226 MB), for scenes github.com/apple/ml-sharp"
 
-log = logging.getLogger(__name__)
-
 
 def run(config: DictConfig, out: Path) -> None:
     """Write the files of each photo in this shard into `out/<its name>/`, by `devices` processes.
@@ -184,7 +182,7 @@ def _warn_of_hidden_parts(config: DictConfig, model: SceneModel) -> None:
     hiding = [name for name in ("mask", "box") if config[name] is not None]
     if hiding and not model.architecture.get("training", {}).get("box_masks"):
         text = "these weights were not trained with parts of the image hidden (data.box_masks, conf/experiment/"
-        log.warning("%s: %s*_masked.yaml): hidden parts may come out black or grey", hiding[0], text)
+        logger.warning("%s: %s*_masked.yaml): hidden parts may come out black or grey", hiding[0], text)
 
 
 def _succeeds(predict: Callable[[], None], image: Path, is_only: bool) -> bool:
@@ -202,7 +200,7 @@ def _succeeds(predict: Callable[[], None], image: Path, is_only: bool) -> bool:
         if is_only:
             raise CompleteSplatError(message) from error
         if is_fault:
-            log.error("a fault of the program, not of the image", exc_info=error)
+            logger.error("a fault of the program, not of the image", exc_info=error)
         print(f"error: {message}", file=sys.stderr, flush=True)
         return False
     return True
@@ -257,7 +255,7 @@ def _predict(
     photograph = model.read(image, config.fov, config.background == REMOVE)
     visible = visible_part(config, image, model.image_size)
     for warning in photo_warnings(photograph, model, whole=visible is None):
-        log.warning("%s: %s", printable(image.name), warning)
+        logger.warning("%s: %s", printable(image.name), warning)
     settings = {name: config[name] for name in ("samples", "seed", "color_fits")}
     sampler = {}
     if isinstance(model, CompleteSplat):

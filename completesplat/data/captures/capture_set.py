@@ -82,12 +82,8 @@ class CaptureSetDataModule(ObjectDataModule):
 
     def describe(self) -> dict[str, str | None]:
         val, test, seed = self.seeded
-        seeded = f"by seed {seed}: {val:g} of the objects for validation, {test:g} for the test"
-        return {
-            "data_set": "captures",
-            "split": f"of a list, or {seeded}",
-            **self.described_views("a capture's first frame"),
-        }
+        split = f"of a list, or by seed {seed}: {val:g} of the objects for validation, {test:g} for the test"
+        return {"data_set": "captures", "split": split, **self.described_views("a capture's first frame")}
 
     def packed_settings(self) -> dict[str, Scalar]:
         return {"splits": self.splits, **self.seeded._asdict(), **self.framing._asdict()}
