@@ -26,8 +26,7 @@ from completesplat.files import counted, printable, write_json
 from completesplat.results.measured import MODE_COLUMNS, evaluation_table
 from completesplat.results.runs import MODEL, read_record
 from completesplat.results.tables import records_table, show
-from completesplat.settings.checks import EvaluationSettings, TestSettings
-from completesplat.settings.schema import Natural, Positive, Range
+from completesplat.settings.schema import EvaluationSettings, Natural, Positive, Range, TestSettings
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.scoring import Scorer
 from completesplat.training.stopping import stopped_together
