@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
-from lightning.pytorch.utilities.types import STEP_OUTPUT
 from rich import get_console
 from rich.progress import TaskID
 from torch import Tensor
@@ -158,9 +157,7 @@ class ExponentialMovingAverage(WeightAveraging):
             self._swap_models(module)
 
     @torch.no_grad()
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: STEP_OUTPUT, batch: object, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
         """Update the average after an optimizer step; torch's own way waits for the GPU twice."""
         if (step := trainer.global_step) == self._latest_update_step:
             return
