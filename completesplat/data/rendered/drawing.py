@@ -182,12 +182,8 @@ def draw_back(rng: np.random.Generator, first: Cameras, hidden: str) -> dict[str
     drawn = str(rng.choice(list(PAINTS), p=[paint.chance for paint in PAINTS.values()]))
     names = [drawn, *(name for name in PAINTS if name != drawn and hidden == "modes")]
     distance = first.centers.norm().item()
-    return {
-        "toward": (first.centers / distance).tolist(),
-        "least": 1 / distance,
-        "modes": names,
-        "colors": [PAINTS[name].color for name in names],
-    }
+    toward, colors = (first.centers / distance).tolist(), [PAINTS[name].color for name in names]
+    return {"toward": toward, "least": 1 / distance, "modes": names, "colors": colors}
 
 
 def textures_of(folder: Path) -> list[str]:
