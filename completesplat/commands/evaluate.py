@@ -2,10 +2,9 @@
 
 import re
 import shlex
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypedDict, Unpack
+from typing import Annotated, TypedDict, Unpack
 
 import torch
 from hydra.utils import instantiate
@@ -17,7 +16,7 @@ from rich.progress import track
 
 from completesplat.commands import quieten
 from completesplat.commands.jobs import CONFIG, METRICS
-from completesplat.commands.protocol import protocol, provenance, sampler_settings
+from completesplat.commands.protocol import Config, protocol, provenance, sampler_settings
 from completesplat.commands.trained import TrainedModel
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
@@ -30,8 +29,6 @@ from completesplat.settings.schema import EvaluationSettings, Natural, Positive,
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.scoring import Scorer
 from completesplat.training.stopping import stopped_together
-
-Config = Mapping[str, Any]
 
 METRIC = re.compile(r"\+*evaluation\.metrics\.(\w+)")
 

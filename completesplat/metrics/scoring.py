@@ -15,7 +15,7 @@ from completesplat.data.loading.distributed import gather_values
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.surfaces import hidden_from
 from completesplat.metrics.image_sets import ImageSets, SetMetric
-from completesplat.metrics.images import ImageMetric, MissingMetrics, psnr, sharpness, ssim, style_of, values_of
+from completesplat.metrics.images import ImageMetric, Images, MissingMetrics, psnr, sharpness, ssim, style_of, values_of
 from completesplat.metrics.proper_scores import SampledValues, TrueValues, crps, energy_score, rank_histogram
 from completesplat.scene import SceneBatch, Views
 
@@ -255,9 +255,7 @@ def novel_values(images: SampledViews, truth: Views) -> dict[str, tuple[SampledV
     return {name: (values[0][:, mask].flatten(1), values[1][mask].flatten()) for name, mask in masks.items()}
 
 
-def object_only(
-    images: Float[Tensor, "image 3 height width"], masks: Float[Tensor, "image 1 height width"]
-) -> Float[Tensor, "image 3 height width"]:
+def object_only(images: Images, masks: Float[Tensor, "image 1 height width"]) -> Images:
     """Make the background of images black, by the true mask binarised at 0.5 (supplement, "Objects only").
 
     The paper does not say whether its masks are soft; CO3D's own challenge binarises at 0.5.

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import mean
+from typing import Any
 
 import numpy as np
 import torch
@@ -206,9 +207,7 @@ class Progress(RichProgressBar):
             self.updated_at = now
             super()._update_metrics(trainer, pl_module)
 
-    def get_metrics(
-        self, trainer: Trainer, pl_module: LightningModule
-    ) -> dict[str, int | str | float | dict[str, float]]:
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         logged = {name: x.item() for name, x in trainer.callback_metrics.items() if name in IN_PROGRESS_BAR}
         hidden = {"v_num"} if logged.get(BAD_STEPS) else {"v_num", BAD_STEPS}
         metrics = super().get_metrics(trainer, pl_module) | logged
