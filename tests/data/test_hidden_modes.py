@@ -139,9 +139,7 @@ def renders(toy_root: Path, tmp_path: Path) -> Path:
     return category.parent
 
 
-def test_modes_of_renders_are_the_images_of_every_paint_and_the_true_one_is_what_the_data_module_yields(
-    renders: Path,
-) -> None:
+def test_modes_of_renders_are_the_images_of_every_paint_and_the_true_one_is_the_data_modules(renders: Path) -> None:
     data = RenderedDataModule(str(renders), image_size=32, test_fraction=1.0)
     data.setup("test")
     painted = next(renders.glob("rendered/*/red")).parent.name  # the toys' test scene

@@ -87,9 +87,8 @@ LARGE = [pytest.param((experiment,), marks=pytest.mark.slow) for experiment in P
 
 
 @pytest.mark.parametrize("settings", [("toy_var", *SMALL), ("toy_diffusion", *SMALL), *LARGE])
-def test_a_forward_pass_on_a_gpu_finds_all_tensors_there_and_keeps_what_is_counted(
-    settings: tuple[str, ...], pretended_gpu: None
-) -> None:
+@pytest.mark.usefixtures("pretended_gpu")
+def test_a_forward_pass_on_a_gpu_finds_all_tensors_there_and_keeps_what_is_counted(settings: tuple[str, ...]) -> None:
     experiment, *sizes = settings
     config = compose_config("plan", f"experiment={experiment}", *sizes)
     copied = without_weights(config)
