@@ -33,11 +33,8 @@ from completesplat.viewer.sample import read_newest, read_scene
 Damage = Callable[[Path], object]
 CLIPS = [make_clip(key, frames=4) for key in ("bad", "one", "two")]
 VAE = random_vae()
-CAMERA = {
-    "world_to_camera": np.eye(4).tolist(),
-    "intrinsics": [[50, 0, 16], [0, 50, 16], [0, 0, 1]],
-    "image_size": [32, 32],
-}
+INTRINSICS = [[50, 0, 16], [0, 50, 16], [0, 0, 1]]
+CAMERA = {"world_to_camera": np.eye(4).tolist(), "intrinsics": INTRINSICS, "image_size": [32, 32]}
 UP = [0, -1, 0]
 
 

@@ -160,11 +160,7 @@ def train(root: Path, out: Path, steps: int, workers: int, resume: Path | None =
 
 @pytest.mark.parametrize(
     ("workers", "options"),
-    [
-        (0, {"limit_train_batches": 3}),
-        (0, {"val_check_interval": 2}),
-        pytest.param(2, {}, marks=pytest.mark.processes),
-    ],
+    [(0, {"limit_train_batches": 3}), (0, {"val_check_interval": 2}), pytest.param(2, {}, marks=pytest.mark.processes)],
 )
 def test_a_resumed_run_sees_the_rest_and_worker_processes_end_with_it(clips, tmp_path, workers, options):
     before = set(multiprocessing.active_children())
