@@ -1,6 +1,6 @@
 """Errors that the user sees as one line, `error: ...`; the exit status is 2 for refused input, 1 for failed work."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,7 +12,7 @@ class CompleteSplatError(Exception):
 
 
 class DataError(CompleteSplatError):
-    """A missing or broken part of a data set, or one with another layout; its subclasses are in `data/validation`.
+    """A missing or broken part of a data set, or one with another layout; each subclass is one kind of it.
 
     Args:
         reason: description of the problem, without the place.
@@ -34,6 +34,50 @@ class DataError(CompleteSplatError):
         frame = None if self.frame is None else f"frame {self.frame}"
         place = ", ".join(part for part in (self.file, self.sequence, frame) if part)
         return f"{place}: {self.reason}" if place else self.reason
+
+
+Refuse = Callable[[DataError], None]
+"""Function that collects an error, or raises it."""
+
+
+class MissingFile(DataError, kind="missing file"):
+    """File that an annotation or a layout requires, and that does not exist."""
+
+
+class OutsidePath(DataError, kind="path outside of the data"):
+    """Path in an annotation that leads out of the data's folder, or nowhere."""
+
+
+class UnreadableFile(DataError, kind="unreadable file"):
+    """File other than an image that is damaged, too large, unsafe to read or of another format."""
+
+
+class BadAnnotation(DataError, kind="malformed annotation"):
+    """Annotation without a required key, or with a value of another type or shape."""
+
+
+class BadCamera(DataError, kind="impossible camera"):
+    """Pose or intrinsics that no camera can have."""
+
+
+class BadImage(DataError, kind="unusable image"):
+    """Image, mask or depth map that is damaged, too large, of another size or ambiguous."""
+
+
+class BadPlacement(DataError, kind="object without a place"):
+    """Sequence whose object has an unknown position or size."""
+
+
+class TooFewFrames(DataError, kind="too few frames"):
+    """Sequence with too few (usable) frames."""
+
+
+class SharedSequences(DataError, kind="shared sequence"):
+    """List of training or validation sequences that contains test sequences."""
+
+
+class ChangedFile(DataError, kind="changed file"):
+    """File that has changed since its checksum was computed."""
 
 
 class ImageError(CompleteSplatError):
@@ -72,3 +116,15 @@ def errors_at(file: Path | str | None = None, sequence: str | None = None, frame
     except DataError as error:
         place = error.file or (None if file is None else str(file)), error.sequence or sequence
         raise type(error)(error.reason, *place, frame if error.frame is None else error.frame) from error.__cause__
+
+
+@contextmanager
+def refused_to(
+    refuse: Refuse, file: Path | str | None = None, sequence: str | None = None, frame: int | None = None
+) -> Iterator[None]:
+    """Pass a DataError raised within the context, with the place that `errors_at` adds, to `refuse`."""
+    try:
+        with errors_at(file, sequence, frame):
+            yield
+    except DataError as error:
+        refuse(error)

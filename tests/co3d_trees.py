@@ -16,6 +16,7 @@ FRAMES, SEQUENCES, SET_LIST = "frame_annotations.jgz", "sequence_annotations.jgz
 # Landscape, so that height and width cannot be mixed up.
 SIZE = (24, 32)
 RADIUS = 4.0
+Entry = Mapping[str, Any]  # of a frame, of its viewpoint or of a sequence
 OCTAHEDRON = np.concatenate([np.eye(3), -np.eye(3)])
 
 
@@ -36,9 +37,7 @@ def look(eye: np.ndarray, target: np.ndarray, layout: str = "ndc_isotropic", **i
     return {"R": rotation.tolist(), "T": (-eye @ rotation).tolist(), **viewpoint}
 
 
-def pytorch3d_pixels(
-    viewpoint: Mapping[str, Any], size: tuple[int, int], points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def pytorch3d_pixels(viewpoint: Entry, size: tuple[int, int], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """PyTorch3D's documentation, cameras.md: NDC has +x left and +y up, pixels start at the top left corner.
 
     Normalised by image bounds, the left border is x = 1; isotropically, the shorter side's borders are at +-1.
@@ -56,7 +55,7 @@ def pytorch3d_pixels(
     return np.stack([x, y], axis=-1), camera[:, 2]
 
 
-def splatter_image(points: np.ndarray, viewpoints: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, np.ndarray, float]:
+def splatter_image(points: np.ndarray, viewpoints: Sequence[Entry]) -> tuple[np.ndarray, np.ndarray, float]:
     """Splatter Image's `data_preprocessing/co3d_normalisation.py`, step by step on PyTorch3D's row vectors.
 
     Returns:
@@ -98,9 +97,7 @@ def write_cloud(path: Path, points: np.ndarray) -> Path:
     return path
 
 
-def frame_entry(
-    sequence: str, number: int, viewpoint: Mapping[str, Any], size: tuple[int, int] = SIZE
-) -> dict[str, Any]:
+def frame_entry(sequence: str, number: int, viewpoint: Entry, size: tuple[int, int] = SIZE) -> dict[str, Any]:
     """A frame's annotation, with a number in the file's name that is not the frame's, as CO3D has it."""
     folder, stem = f"{CATEGORY}/{sequence}", f"frame{number + 1:06d}"
     return {
@@ -121,10 +118,7 @@ def sequence_entry(name: str, quality: float | None = 1.0, cloud_quality: float 
 
 
 def write_annotations(
-    root: Path,
-    frames: Sequence[Mapping[str, Any]],
-    sequences: Sequence[Mapping[str, Any]],
-    splits: Mapping[str, Sequence[str]] | None,
+    root: Path, frames: Sequence[Entry], sequences: Sequence[Entry], splits: Mapping[str, Sequence[str]] | None
 ) -> Path:
     """The annotations and the set list (split -> names of sequences); without one there is none.
 

@@ -5,9 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
+from completesplat.data.rendered.blender import find_blender
+from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras, invert_rigid
 
 SQUARES = 4
@@ -49,6 +52,14 @@ def write_ply(path: Path, vertices: Sequence[Sequence[float]]) -> Path:
     content = np.array(vertices, dtype="<f4").tobytes() + bytes([3]) + np.arange(3, dtype="<i4").tobytes()
     path.write_bytes(header.encode() + content)
     return path
+
+
+def need_blender() -> None:
+    """Skip the test if there is no Blender."""
+    try:
+        find_blender()
+    except CompleteSplatError as reason:
+        pytest.skip(str(reason))
 
 
 def write_usd(path: Path, corner: str = "0 1 0") -> Path:

@@ -10,8 +10,7 @@ import torch
 
 from completesplat.data.packed.writing import prepare
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import BadImage
-from completesplat.errors import DataError
+from completesplat.errors import BadImage, DataError
 from completesplat.geometry.cameras import Cameras, look_at
 
 SIZE = 16

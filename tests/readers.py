@@ -24,8 +24,7 @@ from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.data.rendered.rendering import render
 from completesplat.data.sequences import SequenceSource
-from completesplat.data.validation import refused_to
-from completesplat.errors import DataError, errors_at
+from completesplat.errors import DataError, refused_to
 from completesplat.export.ply import write_ply
 from completesplat.ply_files import read_vertices
 from completesplat.training.encoding import FrameEncoder, encode_training_set
@@ -34,11 +33,8 @@ from completesplat.viewer.sample import read_newest, read_scene
 Damage = Callable[[Path], object]
 CLIPS = [make_clip(key, frames=4) for key in ("bad", "one", "two")]
 VAE = random_vae()
-CAMERA = {
-    "world_to_camera": np.eye(4).tolist(),
-    "intrinsics": [[50, 0, 16], [0, 50, 16], [0, 0, 1]],
-    "image_size": [32, 32],
-}
+INTRINSICS = [[50, 0, 16], [0, 50, 16], [0, 0, 1]]
+CAMERA = {"world_to_camera": np.eye(4).tolist(), "intrinsics": INTRINSICS, "image_size": [32, 32]}
 UP = [0, -1, 0]
 
 
@@ -60,10 +56,10 @@ def read_frames(source: SequenceSource) -> Usable:
     """Read every frame of a source."""
     result = Usable(set(), list(source.refused))
     for name in source.names:
-        with refused_to(result.refused.append), errors_at(sequence=name):
+        with refused_to(result.refused.append, sequence=name):
             sequence = source.read(name)
             for index, frame in enumerate(sequence.frames):
-                with refused_to(result.refused.append), errors_at(sequence=name, frame=frame):
+                with refused_to(result.refused.append, sequence=name, frame=frame):
                     sequence.read(index)
                     result.frames.add((name, frame))
     return result

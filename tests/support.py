@@ -6,7 +6,8 @@ import math
 import pickle
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,21 @@ def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 1
     return 0
+
+
+@contextmanager
+def interrupted_at(number: int, stage: type) -> Iterator[None]:
+    """Training of a stage is interrupted, as by Ctrl-C, at the step of this number."""
+    step = stage.training_step
+
+    def training_step(self, *inputs):
+        if self.global_step == number:
+            raise KeyboardInterrupt
+        return step(self, *inputs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stage, "training_step", training_step)
+        yield
 
 
 def script(folder: Path) -> Path:

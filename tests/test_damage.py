@@ -22,18 +22,21 @@ from readers import CLIPS, READERS, VAE, Damage, Usable, edit, put, write_chunks
 from realestate10k_trees import StoredClip, chunk_entry, make_clip
 
 from completesplat.baselines.splatter_image.model import STATE
-from completesplat.data.validation import (
+from completesplat.errors import (
     BadAnnotation,
     BadCamera,
     BadImage,
     BadPlacement,
     ChangedFile,
+    CompleteSplatError,
+    DataError,
     MissingFile,
     OutsidePath,
+    PlyError,
     TooFewFrames,
     UnreadableFile,
+    WeightsError,
 )
-from completesplat.errors import CompleteSplatError, DataError, PlyError, WeightsError
 
 NAN, INF = float("nan"), float("inf")
 

@@ -9,18 +9,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from completesplat import files
 from completesplat.errors import CompleteSplatError, DiskError
-from completesplat.files import (
-    LONGEST,
-    MOST_SHOWN,
-    atomic_path,
-    file_refusal,
-    folder_names,
-    make_folder,
-    printable,
-    safe_name,
-    write_text,
-)
 
 # What a file system may hold (any bytes but NUL and the slash), and what only a program may hand over.
 FILES = st.binary(min_size=1, max_size=300).map(os.fsdecode)
@@ -36,40 +26,40 @@ STEMS = st.one_of(FILES, ODD, st.text(st.characters(), max_size=300))
 @example(["x" * 100] * 12)
 def test_every_name_stays_in_the_folder_and_is_its_own(stems):
     out = Path("/out")
-    names = folder_names(stems)
+    names = files.folder_names(stems)
     assert len(names) == len(stems)
     for name in names:
         assert Path(os.path.normpath(out / name)).parent == out
         assert Path(os.path.normpath(out / name)).name == name
         assert not name.startswith(".")
         assert "\\" not in name
-        assert 0 < len(name.encode()) <= LONGEST
-        assert printable(name) == name
+        assert 0 < len(name.encode()) <= files.LONGEST
+        assert files.printable(name) == name
     assert len({name.casefold() for name in names}) == len(names)
 
 
 @settings(max_examples=100, deadline=None)
 @given(STEMS)
 def test_what_is_shown_is_one_line_and_can_be_written(text):
-    shown = printable(text)
+    shown = files.printable(text)
     assert shown.encode().decode() == shown
     assert len(shown.splitlines()) <= 1
-    assert printable(shown) == shown
+    assert files.printable(shown) == shown
     assert "\x1b" not in shown
-    assert len(printable(text * 10)) <= MOST_SHOWN
+    assert len(files.printable(text * 10)) <= files.MOST_SHOWN
 
 
 def test_plain_names_stay_as_they_are():
     for name in ("a", "c.tar", "Bär 3", "雪", "👩‍🚀", "a:b", "x" * 100, "a\u202fb"):
-        assert safe_name(name) == printable(name) == name
-    assert [safe_name(dots) for dots in (".", "..", ".a", "..a.b")] == ["unnamed", "unnamed", "a", "a.b"]
-    assert printable("a\n\udcff\x1b[31m") == "a\\n\\udcff\\x1b[31m"
+        assert files.safe_name(name) == files.printable(name) == name
+    assert [files.safe_name(dots) for dots in (".", "..", ".a", "..a.b")] == ["unnamed", "unnamed", "a", "a.b"]
+    assert files.printable("a\n\udcff\x1b[31m") == "a\\n\\udcff\\x1b[31m"
 
 
 def test_a_written_file_replaces_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "x.txt"
     for text in ("one", "two ±"):
-        write_text(path, text)
+        files.write_text(path, text)
         assert path.read_text(encoding="utf-8") == text
     assert list(path.parent.iterdir()) == [path]
 
@@ -77,7 +67,7 @@ def test_a_written_file_replaces_the_old_one(tmp_path: Path) -> None:
 def test_an_exception_leaves_the_old_file_unchanged_and_no_unfinished_one(tmp_path: Path) -> None:
     path = tmp_path / "x.txt"
     path.write_text("old")
-    with pytest.raises(ZeroDivisionError) as caught, atomic_path(path) as temporary:
+    with pytest.raises(ZeroDivisionError) as caught, files.atomic_path(path) as temporary:
         raise ZeroDivisionError(temporary.parent, temporary.suffix, temporary.write_text("ne"))
     assert caught.value.args[:2] == (path.parent, ".txt")
     assert path.read_text() == "old"
@@ -89,7 +79,7 @@ def test_a_link_at_the_path_of_a_file_or_of_its_unfinished_version_is_replaced(t
     target = tmp_path / "target"
     target.write_text("kept")
     (tmp_path / name).symlink_to(target)
-    with atomic_path(tmp_path / "x.txt", ".x.txt.unfinished") as temporary:
+    with files.atomic_path(tmp_path / "x.txt", ".x.txt.unfinished") as temporary:
         temporary.write_text("new")
     assert (target.read_text(), (tmp_path / "x.txt").read_text()) == ("kept", "new")
     assert not (tmp_path / "x.txt").is_symlink()
@@ -99,16 +89,16 @@ def test_a_folder_that_is_a_link_is_refused(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "folder").symlink_to("elsewhere")
     with pytest.raises(CompleteSplatError, match="folder: is a link, and results are not written through links"):
-        make_folder(tmp_path / "folder")
+        files.make_folder(tmp_path / "folder")
 
 
 def test_only_errors_about_unusable_file_names_become_refusals(tmp_path: Path) -> None:
     for name, message in (("x" * 5000, "name too long"), (f"{tmp_path}", "exists"), (f"{__file__}/x", "Not a dir")):
         with pytest.raises(OSError, match=message) as caught:
             Path(name).mkdir()
-        assert str(file_refusal(caught.value)).startswith(name[:200])
-    assert file_refusal(FileNotFoundError(2, "No such file", "x")) is None
-    assert file_refusal(ValueError("x")) is None
+        assert str(files.file_refusal(caught.value)).startswith(name[:200])
+    assert files.file_refusal(FileNotFoundError(2, "No such file", "x")) is None
+    assert files.file_refusal(ValueError("x")) is None
 
 
 def test_a_disk_that_fails_is_named_by_the_users_file_even_if_the_unfinished_one_cannot_be_removed(
@@ -117,5 +107,5 @@ def test_a_disk_that_fails_is_named_by_the_users_file_even_if_the_unfinished_one
     failed = OSError(errno.EROFS, "Read-only file system")
     monkeypatch.setattr(Path, "unlink", Mock(side_effect=failed))
     with pytest.raises(DiskError, match=r"x\.txt: cannot be written") as caught:
-        write_text(tmp_path / "x.txt", "a")
+        files.write_text(tmp_path / "x.txt", "a")
     assert ".x" not in str(caught.value).removeprefix(str(tmp_path))

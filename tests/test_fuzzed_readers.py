@@ -49,10 +49,8 @@ from completesplat.export.reading import read_gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.weights import CONFIG_FILE, SUMS_FILE
 
-pytestmark = [
-    pytest.mark.processes,
-    pytest.mark.skipif(not CLEAR.exists(), reason="memory is measured as Linux reports it"),
-]
+measured = pytest.mark.skipif(not CLEAR.exists(), reason="memory is measured as Linux reports it")
+pytestmark = [pytest.mark.processes, measured]
 PIXELS = np.random.default_rng(0).integers(0, 256, (12, 16, 4), dtype=np.uint8)
 COMPRESSIONS = (None, "tiff_lzw", "tiff_adobe_deflate", "jpeg", "packbits")
 MOST_MEMORY_OF_A_PHOTO = 2**31  # for the largest allowed photo, of 64 million pixels

@@ -208,9 +208,7 @@ def calls_of(model, **settings) -> dict[str, list[int]]:
 
 
 @pytest.mark.parametrize(("guidance_weight", "passes"), [(0.0, 1), (0.5, 2)])
-def test_an_image_is_encoded_once_for_all_samples_and_steps_and_only_as_far_as_skips_reach(
-    model, guidance_weight, passes
-):
+def test_an_image_is_encoded_once_for_all_samples_and_steps_and_as_far_as_skips_reach(model, guidance_weight, passes):
     actual = calls_of(model, samples=2, steps=1, skip_weight=0.0)
     assert actual == {"conditioning": [1], "denoiser": [2], "reconstructor": [2]}
     actual = calls_of(model, samples=20, batch=20, steps=4, guidance_weight=guidance_weight)
@@ -268,8 +266,7 @@ def test_what_is_visible_needs_the_images_shape_and_values_from_0_to_1(model, ph
 
 
 @pytest.mark.parametrize(
-    ("kind", "ending"),
-    [(torch.complex64, ".bias"), (torch.bool, "latent_std"), (torch.int64, ".bias")],
+    ("kind", "ending"), [(torch.complex64, ".bias"), (torch.bool, "latent_std"), (torch.int64, ".bias")]
 )
 def test_weights_of_another_kind_than_floats_are_refused_and_not_cast(folder, kind, ending):
     tensors = load_file(folder / WEIGHTS_FILE)

@@ -62,14 +62,7 @@ def address(tiny_weights: Path) -> Iterator[str]:
 @pytest.mark.processes
 def test_weights_are_downloaded_once_with_a_word_and_no_lines_of_requests(address, pipeline, tmp_path):
     def predict(name: str, **environment: str) -> subprocess.CompletedProcess:
-        given = [
-            f"image={pipeline.photograph()}",
-            f"weights={MODEL}",
-            "samples=1",
-            "video=[]",
-            "steps=1",
-            f"out={name}",
-        ]
+        given = [f"image={pipeline.photograph()}", f"weights={MODEL}", "samples=1", "video=[]", "steps=1"]
         known = os.environ | {"HF_HOME": str(tmp_path / "cache"), "HF_ENDPOINT": address, "no_proxy": "127.0.0.1"}
         program = [sys.executable, "-m", "completesplat", "predict", *given, f"out={name}"]
         return subprocess.run(program, cwd=tmp_path, env=known | environment, capture_output=True, text=True)

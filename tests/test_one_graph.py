@@ -12,9 +12,7 @@ import pytest
 @pytest.mark.parametrize("size", one_graph.PARTS)
 def test_each_network_is_one_graph_forward_and_backward(size):
     """In a process of its own, because the tests' checks of shapes are no part of a graph."""
-    done = subprocess.run(
-        [sys.executable, one_graph.__file__, size], capture_output=True, text=True, cwd=Path(__file__).parent
-    )
-    assert done.stdout.split() == ["autoreconstructor", "encoder", "reconstructor", "regressor", "denoiser"], (
-        done.stderr
-    )
+    program = [sys.executable, one_graph.__file__, size]
+    done = subprocess.run(program, capture_output=True, text=True, cwd=Path(__file__).parent)
+    networks = ["autoreconstructor", "encoder", "reconstructor", "regressor", "denoiser"]
+    assert done.stdout.split() == networks, done.stderr

@@ -94,9 +94,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("place", "value", "reason"), REFUSED)
-def test_a_configuration_is_refused_in_one_line_and_nothing_that_it_names_is_imported(
-    folder, trap, place, value, reason
-):
+def test_a_configuration_is_refused_in_one_line_and_nothing_it_names_is_imported(folder, trap, place, value, reason):
     change(folder, place, value)
     message = refusal(folder)
     assert not trap()

@@ -11,13 +11,11 @@ import co3d_trees
 import meshes
 import numpy as np
 import pytest
+from meshes import need_blender
 from PIL import Image
 from support import LIMIT, SMALL, write_capture
 from turntables import write_turn
 from written_commands import CARDS, DOCUMENTS, arguments_of, block_commands
-
-from completesplat.data.rendered.blender import find_blender
-from completesplat.errors import CompleteSplatError
 
 # Appended to make them short; everything else is as printed.
 BRIEF = {
@@ -143,9 +141,6 @@ def test_the_command_does_what_it_is_printed_for(command, folder):
     if "hydra/sweeper=optuna" in command:
         pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="hydra-optuna-sweeper is not installed")
     if any(word in command for word in NEED_BLENDER):
-        try:
-            find_blender()
-        except CompleteSplatError as reason:
-            pytest.skip(str(reason))
+        need_blender()
     finished = run(command, folder)
     assert finished.returncode == 0, finished.stderr[-3000:]

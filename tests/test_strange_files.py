@@ -45,9 +45,8 @@ def test_other_axes_are_refused_and_lost_harmonics_named(tmp_path, caplog):
         read_gaussians(tmp_path / "a.spz")
     (tmp_path / "b.spz").write_bytes(FILES["harmonics.spz"])
     assert read_gaussians(tmp_path / "b.spz").count == 3
-    assert caplog.messages == [
-        f"{tmp_path / 'b.spz'}: harmonics of degree 1 are left out: one colour for all directions"
-    ]
+    message = "harmonics of degree 1 are left out: one colour for all directions"
+    assert caplog.messages == [f"{tmp_path / 'b.spz'}: {message}"]
 
 
 COMPRESSED = b"ply\nformat binary_little_endian 1.0\nelement chunk 0\nproperty float min_x\nelement vertex 0\n"

@@ -40,11 +40,8 @@ def test_links_lead_to_pages_to_the_reference_or_to_the_repository(document, lin
 
 
 def test_the_contents_have_every_document_and_notebook_once(tree):
-    pages = {
-        path.relative_to(tree).with_suffix("").as_posix()
-        for path in tree.rglob("*")
-        if path.suffix in (".md", ".ipynb")
-    }
+    files = [path.relative_to(tree) for path in tree.rglob("*") if path.suffix in (".md", ".ipynb")]
+    pages = {file.with_suffix("").as_posix() for file in files}
     listed = [page for part in WEBSITE.CONTENTS.values() for page in part]
     listed += [WEBSITE.page_of(card).with_suffix("").as_posix() for card in CARDS]
     assert sorted(listed) == sorted(pages - {"index"})

@@ -88,13 +88,8 @@ def initial_gaussians(
     cameras = views.cameras[scene, view]  # one camera for each Gaussian
     centers = pixel_centers(height, width, device).flatten(0, 1)[pixel]
     footprint = depth / cameras.intrinsics[..., 0, 0]
-    return RawGaussians(
-        means=unproject(cameras, centers[:, :, None], depth[..., None]).squeeze(-2),
-        log_scales=footprint.log()[..., None].repeat(1, 1, 3),
-        quaternions=torch.tensor([1.0, 0, 0, 0], device=device).repeat(batch, count, 1),
-        logits=torch.full_like(depth, opacity).logit(),
-        harmonics=(views.images.flatten(-2)[scene, view, :, pixel] - 0.5) / SH_C0,
-    )
+    means = unproject(cameras, centers[:, :, None], depth[..., None]).squeeze(-2)
+    return _isotropic(means, footprint, views.images.flatten(-2)[scene, view, :, pixel], opacity)
 
 
 def gaussians_at_points(points: Float[Tensor, "gaussian 3"], views: Views, opacity: float) -> RawGaussians:
@@ -111,12 +106,22 @@ def gaussians_at_points(points: Float[Tensor, "gaussian 3"], views: Views, opaci
     inside = ((depth > 0) & (grid.abs() < 1).all(-1))[..., None]
     sampled = torch.nn.functional.grid_sample(views.images, grid[:, None], align_corners=False)[:, :, 0].mT
     colors = (sampled.where(inside, 0).sum(0) + 1e-3 * 0.5) / (inside.sum(0) + 1e-3)
+    return _isotropic(points[None], torch.cat(nearest).mean(-1).clamp(min=1e-6)[None], colors[None], opacity)
+
+
+def _isotropic(
+    means: Float[Tensor, "batch gaussian 3"],
+    sizes: Float[Tensor, "batch gaussian"],
+    colors: Float[Tensor, "batch gaussian 3"],
+    opacity: float,
+) -> RawGaussians:
+    """Return Gaussians whose standard deviation is `sizes` in all directions, with one opacity for all."""
     return RawGaussians(
-        means=points[None],
-        log_scales=torch.cat(nearest).mean(-1).clamp(min=1e-6).log()[None, :, None].repeat(1, 1, 3),
-        quaternions=torch.tensor([1.0, 0, 0, 0], device=points.device).repeat(1, len(points), 1),
-        logits=torch.full_like(points[None, :, 0], opacity).logit(),
-        harmonics=(colors[None] - 0.5) / SH_C0,
+        means=means,
+        log_scales=sizes.log()[..., None].repeat(1, 1, 3),
+        quaternions=torch.tensor([1.0, 0, 0, 0], device=means.device).repeat(*sizes.shape, 1),
+        logits=torch.full_like(sizes, opacity).logit(),
+        harmonics=(colors - 0.5) / SH_C0,
     )
 
 

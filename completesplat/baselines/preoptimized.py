@@ -178,9 +178,7 @@ class SparseVAE(nn.Module):
         mask = occupied(truth)[:, :, None]
         squared = torch.where(mask, self.normalize(predicted.raw) - self.normalize(truth.raw), 0.0).square()
         places = mask.sum().clamp(min=1)
-        errors = {
-            name: group.sum() / (places * group.shape[2])
-            for name, group in SplatterImage(squared, truth.parameterization).split().items()
-        }
+        groups = SplatterImage(squared, truth.parameterization).split()
+        errors = {name: group.sum() / (places * group.shape[2]) for name, group in groups.items()}
         logits, opacities = predicted.split()["opacity"], truth.split()["opacity"].sigmoid()
         return errors | {"opacity": nn.functional.binary_cross_entropy_with_logits(logits, opacities)}

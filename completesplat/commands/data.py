@@ -56,9 +56,8 @@ def show(data: Any, split: SplitName, scenes: Annotated[int, Range(1, 8)], image
     sequences = list(_readable(source, chosen))
     if not sequences:
         raise DataError(f"no {split} sequences that can be used", str(data.root))
-    write_contact_sheet(
-        sequences, out / "show.png", images, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences"
-    )
+    title = f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences"
+    write_contact_sheet(sequences, out / "show.png", images, title)
 
 
 def prepare(

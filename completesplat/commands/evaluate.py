@@ -2,10 +2,9 @@
 
 import re
 import shlex
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypedDict, Unpack
+from typing import Annotated, TypedDict, Unpack
 
 import torch
 from hydra.utils import instantiate
@@ -17,7 +16,7 @@ from rich.progress import track
 
 from completesplat.commands import quieten
 from completesplat.commands.jobs import CONFIG, METRICS
-from completesplat.commands.protocol import protocol, provenance, sampler_settings
+from completesplat.commands.protocol import Config, protocol, provenance, sampler_settings
 from completesplat.commands.trained import TrainedModel
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
@@ -26,13 +25,10 @@ from completesplat.files import counted, printable, write_json
 from completesplat.results.measured import MODE_COLUMNS, evaluation_table
 from completesplat.results.runs import MODEL, read_record
 from completesplat.results.tables import records_table, show
-from completesplat.settings.checks import EvaluationSettings, TestSettings
-from completesplat.settings.schema import Natural, Positive, Range
+from completesplat.settings.schema import EvaluationSettings, Natural, Positive, Range, TestSettings
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.scoring import Scorer
 from completesplat.training.stopping import stopped_together
-
-Config = Mapping[str, Any]
 
 METRIC = re.compile(r"\+*evaluation\.metrics\.(\w+)")
 

@@ -105,16 +105,14 @@ def _parts(config: DictConfig, group: str) -> list[Any]:
     return [part for part in parts.values() if part is not None]
 
 
-def _train(
-    trainer: Trainer, module: Stage, data: SceneDataModule, checkpoint: str | None, out: Path
-) -> dict[str, float]:
+def _train(trainer: Trainer, module: Stage, data: SceneDataModule, resumed: str | None, out: Path) -> dict[str, float]:
     """Train, save the weights, and return all logged figures; refuse a checkpoint of another model."""
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+        trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
     except RuntimeError as error:
-        if checkpoint is None or "loading state_dict" not in str(error):
+        if resumed is None or "loading state_dict" not in str(error):
             raise
-        raise WeightsError(f"{checkpoint}: of another model; give the settings of its run") from error
+        raise WeightsError(f"{resumed}: of another model; give the settings of its run") from error
     metrics = _logged(trainer)
     if trainer.is_global_zero:
         module.save_weights(out / RUN_WEIGHTS)

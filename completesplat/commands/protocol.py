@@ -30,6 +30,8 @@ def git_commit() -> str | None:
         return None
 
 
+Config = Mapping[str, Any]
+
 METRICS: dict[str, dict[str, object]] = {
     "completesplat.metrics.images.psnr": {"range": [0, 1], "limit_db": 100},
     "completesplat.metrics.images.ssim": {"window": 11, "sigma": 1.5, "border": "mirrored, counted", "range": [0, 1]},
@@ -38,9 +40,7 @@ METRICS: dict[str, dict[str, object]] = {
 """How the package's image metrics measure, by the `_target_` of their config."""
 
 
-def protocol(
-    evaluation: Mapping[str, Any], module: Any, data: Any, results: dict[str, Any], out: Path
-) -> dict[str, Any]:
+def protocol(evaluation: Config, module: Any, data: Any, results: dict[str, Any], out: Path) -> dict[str, Any]:
     """Describe what was measured and how, in a test by a config of `conf/evaluation/` with results in `out`."""
     from completesplat.metrics.scoring import BEST_RULES
 

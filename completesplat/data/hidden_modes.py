@@ -16,8 +16,8 @@ from torch import Tensor
 from completesplat.data.co3d.source import CO3DSource
 from completesplat.data.loading.scenes import SceneStore, with_true_depths
 from completesplat.data.loading.view_selection import evaluation_views
-from completesplat.data.validation import BadAnnotation, field, finite_array, read_json
-from completesplat.errors import DataError, errors_at
+from completesplat.data.validation import field, finite_array, read_json
+from completesplat.errors import BadAnnotation, DataError, errors_at
 from completesplat.geometry.surfaces import hidden_from
 from completesplat.scene import SceneBatch
 from completesplat.tensors import TensorDataclass, stack

@@ -6,11 +6,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
 from torch import Tensor
 
-from completesplat.data.images.crop import Square, principal_square
+from completesplat.data.images.crop import Square, cut_square, principal_square
 from completesplat.data.sequences import MaskedImage, PosedSequence
-from completesplat.data.validation import BadCamera, BadPlacement
+from completesplat.errors import BadCamera, BadPlacement
 from completesplat.geometry.cameras import Cameras, crop_resize, nearest_to_axes, transform_points
 from completesplat.tensors import stack
 
@@ -30,6 +31,11 @@ class ObjectFraming(NamedTuple):
     image_size: int
     depth_before: float
     depth_after: float
+
+    def cut(self, camera: Cameras, image: Image.Image, mask: Image.Image) -> MaskedImage:
+        """Return the squares of an image and its mask around the principal point of the camera."""
+        square = square_of(camera)
+        return MaskedImage(cut_square(image, square, self.image_size), cut_square(mask, square, self.image_size))
 
 
 class Placement(NamedTuple):
@@ -122,4 +128,4 @@ def placed_sequence(
     near = (depths - framing.depth_before).clamp(min=SMALLEST_NEAR)
     # If a broken pose puts the object behind the camera, the depth range still has a positive length.
     ranges = torch.stack([near, torch.maximum(depths, near) + framing.depth_after], dim=-1).to(torch.float32)
-    return PosedSequence(name, tuple(frames), squares, ranges, read)
+    return PosedSequence(name, tuple(frames), squares, ranges, read, scale=factor)

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from completesplat.data.images.files import image_bytes
 from completesplat.files import write_bytes
-from completesplat.rasterizers import Rendering
 
 Maps = Float[Tensor, "*batch 1 height width"]
 Colors = Float[Tensor, "*batch 3 height width"]
@@ -21,7 +20,7 @@ Colors = Float[Tensor, "*batch 3 height width"]
 READABLE_SIDE = 144
 GAP, LINE, MARGIN = 6, 20, 12
 INK, PAPER = "black", "white"
-NOTHING, OPAQUE = 0.5, 0.5
+NOTHING = 0.5
 # From far to near. Lightness rises steadily, so that a greyscale copy shows the same order.
 STOPS = [
     [0.05, 0.03, 0.20],
@@ -105,11 +104,6 @@ def image_sheet(headings: Sequence[str] | None, rows: Sheet, title: str | None =
                 pixels = to_pixels(enlarge(cell.image, factor))
                 sheet.paste(Image.fromarray(np.ascontiguousarray(pixels)), (left, top))
     return sheet
-
-
-def surface_depth(rendering: Rendering) -> Maps:
-    """Return the expected depth of pixels that are more than half opaque, and 0 elsewhere (no surface)."""
-    return torch.where(rendering.alpha > OPAQUE, rendering.expected_depth(), 0)
 
 
 def color_depth(depth: Maps) -> tuple[Colors, tuple[float, float]]:

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.images import surface_depth
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pixel_centers, project, unproject
 from completesplat.rasterizers import Rasterizer
@@ -61,7 +60,7 @@ def mesh_of(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras, pivot:
     scene = scene[(scene.means - center).norm(dim=-1) < radius]
     cameras = cameras_around(center, radius, tangent)
     views = [rasterizer(scene[None], cameras[i : i + 1][None])[0, 0] for i in range(VIEWS)]
-    maps = torch.stack([torch.cat([surface_depth(view), view.color / view.alpha.clamp(min=1e-10)]) for view in views])
+    maps = torch.stack([torch.cat([view.surface_depth(), view.color / view.alpha.clamp(min=1e-10)]) for view in views])
     depths = maps[:, 0].flatten(1)
     if not (depths > 0).any():
         raise CompleteSplatError("mesh: no surface in the middle of the photo")

@@ -17,16 +17,7 @@ from torch import Tensor
 from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
 from completesplat.export.formats import FORMATS, write_format
 from completesplat.export.formats import suffix as format_suffix
-from completesplat.export.images import (
-    SheetCell,
-    color_depth,
-    color_normals,
-    image_sheet,
-    strip,
-    surface_depth,
-    to_pixels,
-    write_png,
-)
+from completesplat.export.images import SheetCell, color_depth, color_normals, image_sheet, strip, to_pixels, write_png
 from completesplat.export.mesh import check_available
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView
@@ -319,15 +310,12 @@ def write_maps(
         File names by purpose, and the depths at the ends of the scale.
     """
     views = [rasterizer(scene[None], camera[None][None])[0, 0] for scene in scenes]
-    depth = torch.stack([surface_depth(view) for view in views])
+    depth = torch.stack([view.surface_depth() for view in views])
     colored, ends = color_depth(depth)
     files = {}
     for index, view in enumerate(views):
-        maps = {
-            "depth": colored[index],
-            "normals": color_normals(normals_from_depth(depth[index], camera)),
-            "opacity": view.alpha.expand(3, -1, -1),
-        }
+        normals = color_normals(normals_from_depth(depth[index], camera))
+        maps = {"depth": colored[index], "normals": normals, "opacity": view.alpha.expand(3, -1, -1)}
         for kind, image in maps.items():
             name = f"{kind}_{index:02}"
             files[name] = f"{name}.png"

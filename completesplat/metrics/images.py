@@ -109,14 +109,6 @@ def sharpness(predicted: Images, true: Images, counted: Counted) -> float | None
     return gradient_energy(predicted, counted) / truth if truth >= FLATTEST else None
 
 
-def object_only(images: Images, masks: Float[Tensor, "image 1 height width"]) -> Images:
-    """Make the background of images black, by the true mask binarised at 0.5 (supplement, "Objects only").
-
-    The paper does not say whether its masks are soft; CO3D's own challenge binarises at 0.5.
-    """
-    return torch.where(masks > 0.5, images, torch.zeros_like(images))
-
-
 def perceptual_metric(vgg_weights: str | None, vgg_sha256: str | None = None) -> PerceptualDistance | MissingMetrics:
     """Return LPIPS with VGG16 as in the paper (Tables 2 to 5), or why it is missing; see `load_vgg16`."""
     load = lambda weights: PerceptualDistance(load_vgg16(weights, vgg_sha256), load_heads())  # noqa: E731

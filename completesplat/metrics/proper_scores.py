@@ -12,8 +12,11 @@ from torch import Tensor
 
 from completesplat.tensors import as_float64
 
+SampledValues = Float[Tensor, "sample value"]
+TrueValues = Float[Tensor, " value"]
 
-def energy_score(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " value"]) -> float:
+
+def energy_score(samples: SampledValues, truth: TrueValues) -> float:
     """Return E |x - y| - E |x - x'| / 2 for samples x, x' and truth y; distances are root mean squares of values."""
     samples, truth = as_float64(samples), as_float64(truth)
     count, size = samples.shape
@@ -22,7 +25,7 @@ def energy_score(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " 
     return float((error - spread / 2) / size**0.5)
 
 
-def crps(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " value"]) -> float:
+def crps(samples: SampledValues, truth: TrueValues) -> float:
     """Return the continuous ranked probability score of each single value, averaged over the values."""
     samples, truth = as_float64(samples), as_float64(truth)
     count = len(samples)
@@ -32,7 +35,7 @@ def crps(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " value"])
     return float(((samples - truth).abs().mean(0) - pairs).mean())
 
 
-def rank_histogram(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " value"]) -> Float[Tensor, " rank"]:
+def rank_histogram(samples: SampledValues, truth: TrueValues) -> Float[Tensor, " rank"]:
     """Return the shares of values whose truth exceeds 0, 1, ... samples; flat if both have one distribution.
 
     A truth that equals some samples counts in equal parts for all ranks that it could have.

@@ -15,17 +15,8 @@ from completesplat.data.loading.distributed import gather_values
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.surfaces import hidden_from
 from completesplat.metrics.image_sets import ImageSets, SetMetric
-from completesplat.metrics.images import (
-    ImageMetric,
-    MissingMetrics,
-    object_only,
-    psnr,
-    sharpness,
-    ssim,
-    style_of,
-    values_of,
-)
-from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
+from completesplat.metrics.images import ImageMetric, Images, MissingMetrics, psnr, sharpness, ssim, style_of, values_of
+from completesplat.metrics.proper_scores import SampledValues, TrueValues, crps, energy_score, rank_histogram
 from completesplat.scene import SceneBatch, Views
 
 Scores = dict[tuple[str, str, str], float]
@@ -73,9 +64,7 @@ class Evaluation:
         self.first_novel = 1
         """Views before the novel ones: 1, the reference that the model is given, or 0, if it is given none."""
         self._check_settings()
-        self.set_metrics = [
-            metric for metric in candidates if metric is not None and not isinstance(metric, MissingMetrics)
-        ]
+        self.set_metrics = [metric for metric in candidates if not isinstance(metric, MissingMetrics | None)]
         self.reset()
 
     def _check_settings(self) -> None:
@@ -253,9 +242,7 @@ def proper_scores(images: SampledViews, truth: Views) -> tuple[Scores, dict[str,
     return scores, ranks
 
 
-def novel_values(
-    images: SampledViews, truth: Views
-) -> dict[str, tuple[Float[Tensor, "sample n"], Float[Tensor, " n"]]]:
+def novel_values(images: SampledViews, truth: Views) -> dict[str, tuple[SampledValues, TrueValues]]:
     """Return the values of the samples and the true values by region; the first view of `truth` is the reference.
 
     Regions are all pixels (`full`) and, if true depth is known, those that the reference view does not show (`hidden`).
@@ -266,6 +253,14 @@ def novel_values(
         masks |= {"hidden": hidden} if hidden.any() else {}
     values = images.movedim(2, -1).float(), novel.images.movedim(1, -1).float()
     return {name: (values[0][:, mask].flatten(1), values[1][mask].flatten()) for name, mask in masks.items()}
+
+
+def object_only(images: Images, masks: Float[Tensor, "image 1 height width"]) -> Images:
+    """Make the background of images black, by the true mask binarised at 0.5 (supplement, "Objects only").
+
+    The paper does not say whether its masks are soft; CO3D's own challenge binarises at 0.5.
+    """
+    return torch.where(masks > 0.5, images, torch.zeros_like(images))
 
 
 def _region(images: Tensor, truth: Views, region: str) -> Tensor:

@@ -62,6 +62,10 @@ class Rendering(TensorDataclass):
         """Return the mean depth of what a pixel shows; 0 where it shows nothing."""
         return self.depth / self.alpha.clamp(min=1e-10)
 
+    def surface_depth(self) -> Float[Tensor, "*batch 1 height width"]:
+        """Return the expected depth of pixels that are more than half opaque, and 0 elsewhere (no surface)."""
+        return torch.where(self.alpha > 0.5, self.expected_depth(), 0)
+
 
 @runtime_checkable
 class Rasterizer(Protocol):

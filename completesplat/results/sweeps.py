@@ -156,12 +156,9 @@ def _program_remarks(records: Sequence[Record]) -> list[str]:
     gpu = f", {here['gpu']}" if "gpu" in here else ""
     hardware = f"{here['processor']}, {here['cores']} cores{gpu}"
     software = f"{here['system']}, Python {here['python']}, torch {here['torch']}"
-    commands = dict.fromkeys(shell_command(record["command"]) for record in records)
-    return [
-        *source,
-        f"Summary of {here['date']}, made on {hardware}, {software}.",
-        *(f"Command: {command}" for command in commands),
-    ]
+    written = dict.fromkeys(shell_command(record["command"]) for record in records)
+    commands = [f"Command: {command}" for command in written]
+    return [*source, f"Summary of {here['date']}, made on {hardware}, {software}.", *commands]
 
 
 def write_summary(folder: Path, *parts: Path) -> tables.Table:

@@ -2,9 +2,9 @@
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Any
 
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, ListConfig, Node, OmegaConf, open_dict
@@ -12,146 +12,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.options import did_you_mean
-from completesplat.settings.schema import (
-    CameraPath,
-    Format,
-    Positive,
-    Range,
-    Seed,
-    Share,
-    arguments_of,
-    check_settings,
-    check_value,
-    start_weights,
-)
+from completesplat.settings.schema import VERBS, arguments_of, check_settings, check_value, start_weights
 
 Container = DictConfig | ListConfig
 
 REFERENCE = re.compile(r"\$\{(\w[\w.]*)\}")
 REMOVE = "remove"
 HYDRA_KEYS = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
-
-Precision = Literal["32-true", "bf16-mixed", "16-mixed", 32, "bf16", 16]
-"""Lightning's precisions with weights in float32, which Gaussians and cameras need."""
-
-
-class TrainerSettings(TypedDict):
-    """Settings whose ranges Lightning does not check."""
-
-    precision: Precision
-    accumulate_grad_batches: Positive
-    val_check_interval: Annotated[float, Range(1e-6)] | str | Mapping[str, int] | None
-    check_val_every_n_epoch: Positive | None
-    gradient_clip_val: Annotated[float, Range(0)] | None
-
-
-class EvaluationSettings(TypedDict):
-    """Settings of a protocol."""
-
-    precision: Precision
-
-
-class FitSettings(TypedDict):
-    """Settings of `completesplat fit`."""
-
-    trainer: TrainerSettings
-    evaluation: EvaluationSettings
-    seed: Annotated[int, Range(0, 2**32 - 1)]
-    ckpt_path: str | None
-    test: bool
-    optimized_metric: str | None
-
-
-class PlanSettings(FitSettings):
-    """Settings of `completesplat plan`."""
-
-    gpu: str
-    devices: Positive
-    share: Annotated[float, Range(0.01, 1)]
-    price: Annotated[float, Range(0)]
-    sequences: Positive
-    frames: Positive
-    pixel_bytes: Annotated[float, Range(0)]
-    loading_rate: Annotated[float, Range(1e-3)]
-    bandwidth_share: Annotated[float, Range(0.01, 1)]
-    checkpoint_rate: Annotated[float, Range(1e-3)]
-    gaussian_ns: Annotated[float, Range(0)]
-    operation_us: Annotated[float, Range(0)]
-    usable: Annotated[float, Range(0.01, 1)]
-    gpus: Mapping[str, Mapping[str, Annotated[float, Range(1e-3)]]]
-
-
-class SceneSettings(TypedDict):
-    """Settings that `completesplat predict` and `view` share."""
-
-    weights: str
-    trust: bool
-    guidance_weight: Share
-    color_fits: Annotated[int, Range(0, 100)]
-    steps: Annotated[int, Range(1, 1000)] | None
-    fov: float | None
-    frames: Annotated[int, Range(1, 1000)]
-    background: Share | Literal["remove"] | None
-
-
-class PredictSettings(SceneSettings):
-    """Settings of `completesplat predict`. All samples of an image, or frames of a video, are in memory at once."""
-
-    shard: Annotated[int, Range(0)]
-    shards: Positive
-    devices: Positive
-    samples: Annotated[int, Range(1, 1000)]
-    skip_weight: Share | None
-    seed: Seed
-    batch: Positive | None
-    mask: str | None
-    box: Sequence[float] | None
-    cameras: str | None
-    screen_space_dilation: bool
-    maps: bool
-    formats: Format | Sequence[Format] | Literal[False] | None
-    video: CameraPath | Sequence[CameraPath] | Literal[False] | None
-
-
-class ViewSettings(SceneSettings):
-    """Settings of `completesplat view`."""
-
-    samples: Annotated[int, Range(1, 8)]
-    skip_weight: Share
-    seed: Annotated[int, Range(0, 2**31)]
-    port: Annotated[int, Range(1, 65535)]
-
-
-class ModelSettings(TypedDict):
-    """Settings of `completesplat test` and of reports on samples that choose the model."""
-
-    ckpt: str | None
-    weights: str | None
-    overrides: Sequence[str]
-    seed: Annotated[int, Range(0, 2**32 - 1)]
-    trust: bool
-
-
-class TestSettings(ModelSettings, total=False):
-    """Settings of `completesplat test`, all of which `TrainedModel` takes."""
-
-    scenes: str | None
-    frame: Literal["opencv", "opengl"]
-    align: Literal["none", "scale"]
-    method: str | None
-    data: Mapping[str, object]
-    rasterizer: Mapping[str, object]
-    sampler: Mapping[str, object]
-
-
-VERBS: dict[str, type] = {
-    "fit": FitSettings,
-    "plan": PlanSettings,
-    "predict": PredictSettings,
-    "view": ViewSettings,
-    "test": TestSettings,
-}
-"""Settings of verbs; the settings of a task are the arguments of its function."""
 
 
 def check_values(verb: str, config: DictConfig) -> None:

@@ -10,24 +10,8 @@ from importlib import import_module
 from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.checks import VERBS
-from completesplat.settings.options import (
-    REFERRING,
-    TASKS,
-    GroupDefault,
-    Setting,
-    about_groups,
-    choices_of_verb,
-    conf_folder,
-    did_you_mean,
-    options,
-    read_conf_file,
-    search_settings,
-    settings_of_option,
-    settings_of_verb,
-    with_bases,
-)
-from completesplat.settings.schema import arguments_of, described, hints_of
+from completesplat.settings import options as conf
+from completesplat.settings.schema import VERBS, arguments_of, described, hints_of
 
 WIDTH, COLUMN = 120, 24
 REMARK = "the paper"
@@ -45,31 +29,31 @@ def help_page(verb: str, arguments: Sequence[str]) -> str:
     """
     words = [argument for argument in arguments if not argument.startswith("-")]
     task = None
-    if verb in TASKS:
-        default = next(choice.option for choice in read_conf_file(verb).choices if choice.group == f"{verb}_task")
-        task = words.pop(0) if words and words[0] in options(f"{verb}_task") else default
-    groups = {choice.place: choice for choice in choices_of_verb(verb, task)}
+    if verb in conf.TASKS:
+        default = next(choice.option for choice in conf.read_conf_file(verb).choices if choice.group == f"{verb}_task")
+        task = words.pop(0) if words and words[0] in conf.options(f"{verb}_task") else default
+    groups = {choice.place: choice for choice in conf.choices_of_verb(verb, task)}
     for word in words:
         group, _, option = word.partition("=")
         if group in groups and group != "hydra":
             return part_page(verb, groups[group], option or groups[group].option)
     if wanted := [word for word in words if "=" not in word]:
         return search_page(verb, task, wanted)
-    header = str(OmegaConf.load(conf_folder() / f"{verb}.yaml").hydra.help.header).strip()
+    header = str(OmegaConf.load(conf.conf_folder() / f"{verb}.yaml").hydra.help.header).strip()
     return "\n\n".join([header, *_body(verb, task)])
 
 
 def _body(verb: str, task: str | None) -> Iterator[str]:
     command = verb if task is None else f"{verb} {task}"
     if task is not None:
-        files = {name: read_conf_file(f"{verb}_task/{name}") for name in options(f"{verb}_task")}
+        files = {name: conf.read_conf_file(f"{verb}_task/{name}") for name in conf.options(f"{verb}_task")}
         rows = [(name, _first_sentence(file.about)) for name, file in files.items()]
         yield _table(f"Tasks (completesplat {verb} TASK --help shows one):", rows)
     hints = _hints(verb, task)
-    rows = [_line(setting, hints.get(setting.key), {}, verb) for setting in settings_of_verb(verb, task)]
+    rows = [_line(setting, hints.get(setting.key), {}, verb) for setting in conf.settings_of_verb(verb, task)]
     yield _table(f"Settings{'' if task is None else f' of {command}'} (key=value):", rows)
-    about = about_groups()
-    if choices := [choice for choice in choices_of_verb(verb, task) if choice.place != "_global_"]:
+    about = conf.about_groups()
+    if choices := [choice for choice in conf.choices_of_verb(verb, task) if choice.place != "_global_"]:
         keys = [entry.place if entry.option == "null" else f"{entry.place}={entry.option}" for entry in choices]
         rows = [(key, _about(choice, about)) for key, choice in zip(keys, choices, strict=True)]
         yield _table(f"Parts (group=option chooses; completesplat {command} --help GROUP shows one):", rows)
@@ -80,29 +64,29 @@ def _body(verb: str, task: str | None) -> Iterator[str]:
 def search_page(verb: str, task: str | None, words: Sequence[str]) -> str:
     """Return the help text of the settings that `search_settings` finds; raise CompleteSplatError if there are none."""
     hints, rows = _hints(verb, task), []
-    for setting, part, option in search_settings(verb, task, words):
+    for setting, part, option in conf.search_settings(verb, task, words):
         key, text = _part_line(setting, part) if part else _line(setting, hints.get(setting.key), {}, verb)
         rows.append((key, text + option))
     if not rows:
-        known = {setting.key.rpartition(".")[2] for setting, _, _ in search_settings(verb, task, [])}
-        known |= {choice.place for choice in choices_of_verb(verb, task)} | set(options(f"{verb}_task"))
-        raise CompleteSplatError(f"nothing to say on {' '.join(words)!r}{did_you_mean(words[0], sorted(known))}")
+        known = {setting.key.rpartition(".")[2] for setting, _, _ in conf.search_settings(verb, task, [])}
+        known |= {choice.place for choice in conf.choices_of_verb(verb, task)} | set(conf.options(f"{verb}_task"))
+        raise CompleteSplatError(f"nothing to say on {' '.join(words)!r}{conf.did_you_mean(words[0], sorted(known))}")
     return _table(f"Settings of completesplat {verb} on {' '.join(words)} (key=value):", rows)
 
 
-def part_page(verb: str, choice: GroupDefault, option: str) -> str:
+def part_page(verb: str, choice: conf.GroupDefault, option: str) -> str:
     """Return the help text of one option of a group; raise CompleteSplatError if the group has no such option."""
-    known = options(choice.group)
+    known = conf.options(choice.group)
     if option == "null":
-        message = f"{choice.place}: {_about(choice, about_groups())}"
+        message = f"{choice.place}: {_about(choice, conf.about_groups())}"
         return f"{_wrapped(message)}\nTo see one: completesplat {verb} --help {choice.place}=OPTION"
     if option not in known:
-        nearest = did_you_mean(option, known)
+        nearest = conf.did_you_mean(option, known)
         raise CompleteSplatError(f"no {choice.group} {option!r}: there are {', '.join(known)}{nearest}")
     place = None if choice.place == choice.group else choice.place
-    settings = settings_of_option(choice.group, option, place)
-    rows = [_part_line(each, settings) for each in settings if not REFERRING.search(f"{each.key}={each.value}")]
-    about = with_bases(choice.group, option).about.strip()
+    settings = conf.settings_of_option(choice.group, option, place)
+    rows = [_part_line(each, settings) for each in settings if not conf.REFERRING.search(f"{each.key}={each.value}")]
+    about = conf.with_bases(choice.group, option).about.strip()
     made = [f"Made by {value}." for key, value, _ in settings if key == f"{choice.place}._target_"]
     parts = [_table(f"{choice.place}={option}" + (f"\n{_wrapped(about)}" if about else ""), rows), *made]
     return "\n\n".join([*parts, _wrapped(f"Others: {', '.join(known)}")])
@@ -124,7 +108,7 @@ def _hints(verb: str, task: str | None) -> Mapping[str, object]:
     """Return the annotations of a verb's own settings, where the function that takes them can be imported."""
     if verb in VERBS:
         return hints_of(VERBS[verb])
-    named = {setting.key: setting.value for setting in with_bases(f"{verb}_task", task).settings} if task else {}
+    named = {setting.key: setting.value for setting in conf.with_bases(f"{verb}_task", task).settings} if task else {}
     return _of_target(named.get("task._target_", ""))[0]
 
 
@@ -144,7 +128,7 @@ def _of_target(target: str) -> tuple[Mapping[str, object], Mapping[str, str]]:
     return hints, descriptions
 
 
-def _part_line(setting: Setting, settings: Iterable[Setting]) -> tuple[str, str]:
+def _part_line(setting: conf.Setting, settings: Iterable[conf.Setting]) -> tuple[str, str]:
     """Return the line of a setting of a part, whose `settings` name the class or function that takes it."""
     above, _, name = setting.key.rpartition(".")
     target = next((value for key, value, _ in settings if key == f"{above}._target_"), "")
@@ -152,7 +136,7 @@ def _part_line(setting: Setting, settings: Iterable[Setting]) -> tuple[str, str]
     return _line(setting, hints.get(name), documented)
 
 
-def _line(setting: Setting, hint: object, documented: Mapping[str, str], verb: str = "") -> tuple[str, str]:
+def _line(setting: conf.Setting, hint: object, documented: Mapping[str, str], verb: str = "") -> tuple[str, str]:
     value = setting.value.replace("${verb}", verb).replace("${run_name:}", "TIME")
     key = setting.key if value in ("", NEEDED) or "${" in value else f"{setting.key}={value}"
     kind = described(hint) or _kind_of(value)
@@ -170,9 +154,9 @@ def _kind_of(value: str) -> str:
     return next((kind for pattern, kind in kinds.items() if re.fullmatch(pattern, value)), "")
 
 
-def _about(choice: GroupDefault, about: Mapping[str, str]) -> str:
+def _about(choice: conf.GroupDefault, about: Mapping[str, str]) -> str:
     text = (choice.comment or about.get(choice.group, "")).replace("`", "").rstrip(".")
-    return f"{text} [{', '.join(options(choice.group))}]".strip()
+    return f"{text} [{', '.join(conf.options(choice.group))}]".strip()
 
 
 def _table(heading: str, rows: Iterable[tuple[str, str]]) -> str:

@@ -1,23 +1,13 @@
-"""Checks of settings against the annotations of the function that takes them, made before any work begins."""
+"""Settings of verbs, and checks of settings against annotations, made before any work begins."""
 
 import inspect
 import math
+import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
 from types import NoneType, UnionType
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    NamedTuple,
-    Union,
-    Unpack,
-    get_args,
-    get_origin,
-    get_type_hints,
-    is_typeddict,
-)
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict
 
 from completesplat.errors import CompleteSplatError
 
@@ -76,6 +66,129 @@ Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], Entries(most=8)]
 Few = Annotated[int, Range(1, 16)]
 
 
+Precision = Literal["32-true", "bf16-mixed", "16-mixed", 32, "bf16", 16]
+"""Lightning's precisions with weights in float32, which Gaussians and cameras need."""
+
+
+class TrainerSettings(TypedDict):
+    """Settings whose ranges Lightning does not check."""
+
+    precision: Precision
+    accumulate_grad_batches: Positive
+    val_check_interval: Annotated[float, Range(1e-6)] | str | Mapping[str, int] | None
+    check_val_every_n_epoch: Positive | None
+    gradient_clip_val: Annotated[float, Range(0)] | None
+
+
+class EvaluationSettings(TypedDict):
+    """Settings of a protocol."""
+
+    precision: Precision
+
+
+class FitSettings(TypedDict):
+    """Settings of `completesplat fit`."""
+
+    trainer: TrainerSettings
+    evaluation: EvaluationSettings
+    seed: Annotated[int, Range(0, 2**32 - 1)]
+    ckpt_path: str | None
+    test: bool
+    optimized_metric: str | None
+
+
+class PlanSettings(FitSettings):
+    """Settings of `completesplat plan`."""
+
+    gpu: str
+    devices: Positive
+    share: Annotated[float, Range(0.01, 1)]
+    price: Annotated[float, Range(0)]
+    sequences: Positive
+    frames: Positive
+    pixel_bytes: Annotated[float, Range(0)]
+    loading_rate: Annotated[float, Range(1e-3)]
+    bandwidth_share: Annotated[float, Range(0.01, 1)]
+    checkpoint_rate: Annotated[float, Range(1e-3)]
+    gaussian_ns: Annotated[float, Range(0)]
+    operation_us: Annotated[float, Range(0)]
+    usable: Annotated[float, Range(0.01, 1)]
+    gpus: Mapping[str, Mapping[str, Annotated[float, Range(1e-3)]]]
+
+
+class SceneSettings(TypedDict):
+    """Settings that `completesplat predict` and `view` share."""
+
+    weights: str
+    trust: bool
+    guidance_weight: Share
+    color_fits: Annotated[int, Range(0, 100)]
+    steps: Annotated[int, Range(1, 1000)] | None
+    fov: float | None
+    frames: Annotated[int, Range(1, 1000)]
+    background: Share | Literal["remove"] | None
+
+
+class PredictSettings(SceneSettings):
+    """Settings of `completesplat predict`. All samples of an image, or frames of a video, are in memory at once."""
+
+    shard: Annotated[int, Range(0)]
+    shards: Positive
+    devices: Positive
+    samples: Annotated[int, Range(1, 1000)]
+    skip_weight: Share | None
+    seed: Seed
+    batch: Positive | None
+    mask: str | None
+    box: Sequence[float] | None
+    cameras: str | None
+    screen_space_dilation: bool
+    maps: bool
+    formats: Format | Sequence[Format] | Literal[False] | None
+    video: CameraPath | Sequence[CameraPath] | Literal[False] | None
+
+
+class ViewSettings(SceneSettings):
+    """Settings of `completesplat view`."""
+
+    samples: Annotated[int, Range(1, 8)]
+    skip_weight: Share
+    seed: Annotated[int, Range(0, 2**31)]
+    port: Annotated[int, Range(1, 65535)]
+
+
+class ModelSettings(TypedDict):
+    """Settings of `completesplat test` and of reports on samples that choose the model."""
+
+    ckpt: str | None
+    weights: str | None
+    overrides: Sequence[str]
+    seed: Annotated[int, Range(0, 2**32 - 1)]
+    trust: bool
+
+
+class TestSettings(ModelSettings, total=False):
+    """Settings of `completesplat test`, all of which `TrainedModel` takes."""
+
+    scenes: str | None
+    frame: Literal["opencv", "opengl"]
+    align: Literal["none", "scale"]
+    method: str | None
+    data: Mapping[str, object]
+    rasterizer: Mapping[str, object]
+    sampler: Mapping[str, object]
+
+
+VERBS: dict[str, type] = {
+    "fit": FitSettings,
+    "plan": PlanSettings,
+    "predict": PredictSettings,
+    "view": ViewSettings,
+    "test": TestSettings,
+}
+"""Settings of verbs; the settings of a task are the arguments of its function."""
+
+
 class Violation(NamedTuple):
     """A refused value: its place inside the setting (`.key`, empty for the setting itself) and the reason."""
 
@@ -107,9 +220,9 @@ def check_value(key: str, annotation: object, value: object) -> None:
 
 def hints_of(function: object) -> dict[str, object]:
     """Return annotations by name, of a function's arguments or a `TypedDict`; expand `**name: Unpack[...]`."""
-    hints = get_type_hints(function, include_extras=True)
-    for shared in [get_args(hint)[0] for hint in hints.values() if get_origin(hint) is Unpack]:
-        hints |= get_type_hints(shared, include_extras=True)
+    hints = typing.get_type_hints(function, include_extras=True)
+    for shared in [typing.get_args(hint)[0] for hint in hints.values() if typing.get_origin(hint) is typing.Unpack]:
+        hints |= typing.get_type_hints(shared, include_extras=True)
     return hints
 
 
@@ -139,7 +252,7 @@ def _named_arguments(function: Callable[..., object]) -> tuple[dict[str, object]
     unpacked = hints.keys() - {param.name for param in parameters} - {"return"}
     others = [hints.get(param.name) for param in parameters if param.kind is param.VAR_KEYWORD]
     annotations = {name: hints.get(name, object) for name in (named | unpacked) - {"self"}}
-    return annotations, any(get_origin(hint) is not Unpack for hint in others)
+    return annotations, any(typing.get_origin(hint) is not typing.Unpack for hint in others)
 
 
 def start_weights(kind: object) -> Mapping[str, str]:
@@ -149,17 +262,17 @@ def start_weights(kind: object) -> Mapping[str, str]:
 
 def violations(annotation: object, value: object) -> list[Violation]:
     """Return the parts of a value that do not fit an annotation, with the reasons."""
-    origin, arguments = get_origin(annotation), get_args(annotation)
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
         return violations(kind, value) or [Violation("", value, x) for rule in rules if (x := rule.refusal(value))]
     if origin is Literal:
         return _in_choice(arguments, value)
-    if origin in (Union, UnionType):
+    if origin in (typing.Union, UnionType):
         return _in_union(arguments, value)
     if origin is Sequence:
         return _in_list(arguments[0], value)
-    if origin is Mapping or is_typeddict(annotation):
+    if origin is Mapping or typing.is_typeddict(annotation):
         return _in_mapping(annotation, value)
     if isinstance(annotation, type) and annotation in KINDS:
         return [] if _is_a(annotation, value) else [Violation("", value, f"must be {KINDS[annotation]}")]
@@ -175,13 +288,13 @@ def _in_choice(choices: Sequence[object], value: object) -> list[Violation]:
 
 
 def _in_union(members: Sequence[object], value: object) -> list[Violation]:
-    if all(get_origin(member) is Literal or member is NoneType for member in members):
-        return _in_choice([choice for member in members for choice in get_args(member) or (None,)], value)
+    if all(typing.get_origin(member) is Literal or member is NoneType for member in members):
+        return _in_choice([choice for member in members for choice in typing.get_args(member) or (None,)], value)
     # Of `float | Tensor` only float counts, because no setting is a tensor. Classes without numbers accept everything.
     if {int, float} & set(members) and isinstance(value, str | int | float | Sequence):
         members = [member for member in members if not isinstance(member, type) or member in KINDS]
     if isinstance(value, Sequence) and not isinstance(value, str):  # for the reason that its entries do not fit
-        members = [*(member for member in members if get_origin(member) is Sequence), *members]
+        members = [*(member for member in members if typing.get_origin(member) is Sequence), *members]
     attempts = [violations(member, value) for member in members]
     return [] if [] in attempts else attempts[0]
 
@@ -196,28 +309,28 @@ def _in_list(kind: object, value: object) -> list[Violation]:
 def _in_mapping(annotation: object, value: object) -> list[Violation]:
     if not isinstance(value, Mapping):
         return [Violation("", value, "must be a mapping")]
-    hints = get_type_hints(annotation, include_extras=True) if is_typeddict(annotation) else None
+    hints = typing.get_type_hints(annotation, include_extras=True) if typing.is_typeddict(annotation) else None
     result = []
     for key, part in value.items():
-        kind = get_args(annotation)[1] if hints is None else hints.get(key, object)
+        kind = typing.get_args(annotation)[1] if hints is None else hints.get(key, object)
         result += [unfit._replace(place=f".{key}{unfit.place}") for unfit in violations(kind, part)]
     return result
 
 
 def described(annotation: object) -> str:
     """Describe the values that an annotation allows in a few words; return an empty text if unknown."""
-    origin, arguments = get_origin(annotation), get_args(annotation)
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
         ranges = [rule.words() for rule in rules if isinstance(rule, Range)]
         return ", ".join(filter(None, [described(kind), *ranges]))
-    if origin in (Union, UnionType):
+    if origin in (typing.Union, UnionType):
         return " or ".join(dict.fromkeys(filter(None, map(described, arguments))))
     if origin is Literal:
         return ", ".join(map(str, arguments))
     if origin is Sequence:
         return "list"
-    if origin is Mapping or is_typeddict(annotation):
+    if origin is Mapping or typing.is_typeddict(annotation):
         return "mapping"
     return KINDS.get(annotation, "").removeprefix("a ") if isinstance(annotation, type) else ""
 

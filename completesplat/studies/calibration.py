@@ -13,20 +13,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
+from completesplat.metrics.proper_scores import SampledValues, TrueValues, crps, energy_score, rank_histogram
 from completesplat.metrics.scoring import novel_values
 from completesplat.studies.controls import OnProgress, Scenes
 from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import SampleRenderer, mean_over_scenes
 
-SampledValues = Float[Tensor, "sample value"]
-TrueValues = Float[Tensor, " value"]
 BINS = 10
 
+Row = dict[str, Any]
 
-def calibration_rows(
-    renderer: SampleRenderer, scenes: Scenes, tick: OnProgress, **settings: float
-) -> list[dict[str, Any]]:
+
+def calibration_rows(renderer: SampleRenderer, scenes: Scenes, tick: OnProgress, **settings: float) -> list[Row]:
     """Return a row for each region of novel views (`novel_values`), with means over the scenes.
 
     `energy_N` is the energy score of N samples, `below_all` and `above_all` are the ends of the rank histogram `ranks`.
@@ -80,7 +78,7 @@ def binned(order: TrueValues, spreads: TrueValues, errors: TrueValues) -> list[l
     return [part.mean(1).sqrt().tolist() for part in values.tensor_split(min(BINS, len(order)), 1)]
 
 
-def plot_calibration(rows: Sequence[dict[str, Any]], path: Path, title: str) -> None:
+def plot_calibration(rows: Sequence[Row], path: Path, title: str) -> None:
     """Write a PNG with three panels for each region: ranks, spread against error, and energy by number of samples."""
     with written_figure(path, title, (13, 0.5 + 3.7 * len(rows))) as figure:
         for (ranks, bins, energy), row in zip(figure.subplots(len(rows), 3, squeeze=False), rows, strict=True):

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.export.images import NOTHING, Sheet, color_depth, color_normals, ramp, strip, surface_depth
+from completesplat.export.images import NOTHING, Sheet, color_depth, color_normals, ramp, strip
 from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.scene import SceneBatch
 from completesplat.studies.controls import OnProgress, Row, Scenes, WeightPairs, over_settings
@@ -36,7 +36,7 @@ def depth_rows(
 
     def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> Row:
         rendering = renderer.render(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
-        return deviations(surface_depth(rendering), scene, far_degrees)
+        return deviations(rendering.surface_depth(), scene, far_degrees)
 
     return over_settings(settings, scenes, measure, tick)
 
@@ -72,7 +72,7 @@ def depth_strips(
     for scene in scenes:
         rendering = renderer.render(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
         far, true = farthest(scene), scene.all_views()
-        depth, images = surface_depth(rendering), renderer.over_background(rendering)[:, far]
+        depth, images = rendering.surface_depth(), renderer.over_background(rendering)[:, far]
         depths, (nearest, deepest) = color_depth(depth[:shown, far])
         normals = color_normals(normals_from_depth(depth[:shown, far], true.cameras[0, far]))
         row = strip(true.images[0, [0, far]], f"{scene.names[0]}: input, far view")

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import mean
+from typing import Any
 
 import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
-from lightning.pytorch.utilities.types import STEP_OUTPUT
 from rich import get_console
 from rich.progress import TaskID
 from torch import Tensor
@@ -158,9 +158,7 @@ class ExponentialMovingAverage(WeightAveraging):
             self._swap_models(module)
 
     @torch.no_grad()
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: STEP_OUTPUT, batch: object, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
         """Update the average after an optimizer step; torch's own way waits for the GPU twice."""
         if (step := trainer.global_step) == self._latest_update_step:
             return
@@ -209,9 +207,7 @@ class Progress(RichProgressBar):
             self.updated_at = now
             super()._update_metrics(trainer, pl_module)
 
-    def get_metrics(
-        self, trainer: Trainer, pl_module: LightningModule
-    ) -> dict[str, int | str | float | dict[str, float]]:
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         logged = {name: x.item() for name, x in trainer.callback_metrics.items() if name in IN_PROGRESS_BAR}
         hidden = {"v_num"} if logged.get(BAD_STEPS) else {"v_num", BAD_STEPS}
         metrics = super().get_metrics(trainer, pl_module) | logged

@@ -15,18 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 from torch.optim import Adam
 
-from completesplat.baselines.fitting import (
-    NEIGHBOURS,
-    POSITION_DECAY,
-    Count,
-    RawGaussians,
-    Translucent,
-    adam,
-    gaussians_at_points,
-    initial_gaussians,
-    position_noise,
-    relocate,
-)
+from completesplat.baselines import fitting
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.sequences import PosedSequence, first_names
 from completesplat.errors import CompleteSplatError
@@ -59,9 +48,9 @@ class CaptureSettings:
         opacity_rate: factor on the opacities' learning rate; with 4, captures of flat floors and walls collapse.
     """
 
-    initial: Count = 20_000
-    most: Count = 50_000
-    opacity: Translucent = 0.1
+    initial: fitting.Count = 20_000
+    most: fitting.Count = 50_000
+    opacity: fitting.Translucent = 0.1
     refine_every: Positive = 50
     growth: Share = 0.05
     opacity_weight: Annotated[float, Range(0)] = 0.01
@@ -108,7 +97,7 @@ class CaptureFit(Stage):
 
     def gaussians(self) -> Gaussians:
         used = {name: tensor[None, : int(self.count)] for name, tensor in self.raw.items()}
-        return RawGaussians(**used).gaussians()[0]
+        return fitting.RawGaussians(**used).gaussians()[0]
 
     def sequence(self, split: str) -> PosedSequence:
         """Return the frames of a split of the capture; raise CompleteSplatError unless there is exactly one capture."""
@@ -142,11 +131,11 @@ class CaptureFit(Stage):
         generator, settings = torch.Generator().manual_seed(0), self.fitting
         scene = stack([self.data.store("train").scene(sequence, 0, range(1, len(sequence.frames)))]).to(self.device)
         views, most = self.in_world(scene, "train"), min(settings.initial, settings.most)
-        if sequence.points is None or len(sequence.points) <= NEIGHBOURS:
-            points = initial_gaussians(views, scene.depth_range, most, settings.opacity, generator).means[0]
+        if sequence.points is None or len(sequence.points) <= fitting.NEIGHBOURS:
+            points = fitting.initial_gaussians(views, scene.depth_range, most, settings.opacity, generator).means[0]
         else:
             points = sequence.points[torch.randperm(len(sequence.points), generator=generator)[:most]].to(self.device)
-        for name, tensor in vars(gaussians_at_points(points, views[0], settings.opacity)).items():
+        for name, tensor in vars(fitting.gaussians_at_points(points, views[0], settings.opacity)).items():
             self.raw[name][: len(points)] = tensor[0]
         self.count.fill_(len(points))
 
@@ -159,10 +148,10 @@ class CaptureFit(Stage):
             return
         (optimizer,) = self.trainer.optimizers
         count, rate = int(self.count), optimizer.param_groups[0]["lr"] / settings.position_rate
-        self.raw["means"][:count] += position_noise(self.gaussians(), rate)
+        self.raw["means"][:count] += fitting.position_noise(self.gaussians(), rate)
         if step % settings.refine_every == 0 and step < REFINED_SHARE * total:
             grown = max(count, min(settings.most, int(count * (1 + settings.growth))))
-            changed = relocate(dict(self.raw.items()), count, grown)
+            changed = fitting.relocate(dict(self.raw.items()), count, grown)
             for state in optimizer.state.values():
                 for key in ("exp_avg", "exp_avg_sq"):
                     state[key][changed] = 0
@@ -183,9 +172,9 @@ class CaptureFit(Stage):
         """Build Adam with 3DGS's rates and epsilon; the rate of the positions decays to a hundredth."""
         depth_ranges, settings = self.sequence("train").depth_ranges, self.fitting
         rates = settings.position_rate, settings.opacity_rate, settings.other_rates
-        optimizer = adam(dict(self.raw.items()), depth_ranges, *rates)
+        optimizer = fitting.adam(dict(self.raw.items()), depth_ranges, *rates)
         steps = max(1, self.trainer.estimated_stepping_batches)
-        decays = [lambda step: POSITION_DECAY ** (step / steps), *[lambda step: 1.0] * (len(self.raw) - 1)]
+        decays = [lambda step: fitting.POSITION_DECAY ** (step / steps), *[lambda step: 1.0] * (len(self.raw) - 1)]
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": Schedule(optimizer, decays), "interval": "step"}}
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:

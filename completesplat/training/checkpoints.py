@@ -100,9 +100,7 @@ class Checkpoints(Checkpoint):
                 link(begun, last)  # replace a damaged file, which must not become `previous.ckpt`
         keep_signals(True)
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
         # Several batches share an optimizer step if gradients are accumulated; checkpoints lack accumulated gradients.
         stepped, self.step = trainer.global_step != self.step, trainer.global_step
         if stepped:

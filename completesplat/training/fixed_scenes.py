@@ -61,9 +61,7 @@ class DrawsFixedScenes(Callback):
         if trainer.is_global_zero:
             make_folder(self.folder)
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
         if trainer.global_step % self.every_n_steps == 0:
             self._draw_once(trainer, pl_module)
 

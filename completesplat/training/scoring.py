@@ -22,7 +22,6 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import gather_values
 from completesplat.data.loading.loader import SceneLoader
 from completesplat.errors import CompleteSplatError, PlyError
-from completesplat.export.images import surface_depth
 from completesplat.export.reading import read_gaussians
 from completesplat.files import by_numbers, safe_name
 from completesplat.gaussians import Gaussians
@@ -272,7 +271,7 @@ class SceneFiles(Scorer):
 
     def _scale(self, gaussians: Gaussians, reference: Views) -> float | None:
         """Return the factor that fits rendered depth to true depth best (least squares); None without common pixels."""
-        depth = surface_depth(self.render_from(gaussians[None], reference.cameras[None])[0, 0])
+        depth = self.render_from(gaussians[None], reference.cameras[None])[0, 0].surface_depth()
         true = torch.zeros_like(depth) if reference.depths is None else reference.depths
         products = (depth * true)[mask := true.isfinite() & (true > 0) & (depth > 0)]
         return (products.sum() / depth[mask].square().sum()).item() if mask.any() else None

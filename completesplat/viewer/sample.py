@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.data.images.files import MOST_PIXELS
-from completesplat.data.validation import BadAnnotation, BadCamera, field, finite_array, read_json, require_rotation
-from completesplat.errors import CompleteSplatError, errors_at
+from completesplat.data.validation import field, finite_array, read_json, require_rotation
+from completesplat.errors import BadAnnotation, BadCamera, CompleteSplatError, errors_at
 from completesplat.export.cleaning import LARGEST, with_screen_space_dilation
 from completesplat.export.reading import read_gaussians
 from completesplat.files import by_numbers

@@ -208,10 +208,8 @@ class SplatView:
         for i, sample in enumerate(samples):
             reference = sample.reference
             up = reference.intrinsics.new_tensor(self.up.tolist())
-            groups = {
-                "reference": (reference[None], REFERENCE_COLOR),
-                "orbit": (orbit(reference, arrangement.pivots[i], up, 12), ORBIT_COLOR),
-            }
+            around = orbit(reference, arrangement.pivots[i], up, 12)
+            groups = {"reference": (reference[None], REFERENCE_COLOR), "orbit": (around, ORBIT_COLOR)}
             look: Any = {"scale": 0.08 * arrangement.distance, "thickness": 1.5, "thickness_units": "screen"}
             for name in self.cameras & groups.keys():
                 cameras, color = groups[name]
@@ -234,11 +232,9 @@ def to_splats(gaussians: Gaussians) -> tuple[dict[str, Any], float]:
     largest = finite.scales.max().item() if finite.count else 1.0
     scale = max(largest, 1e-12) / math.sqrt(LARGEST_COVARIANCE)
     unit = replace(finite, means=finite.means / scale, scales=finite.scales / scale)
+    colors, opacities = round_to_uint8(finite.colors * 255), round_to_uint8(finite.opacities[:, None] * 255)
     arrays = {"centers": unit.means.float().numpy(), "covariances": unit.covariances().float().numpy()}
-    return arrays | {
-        "rgbs": round_to_uint8(finite.colors * 255),
-        "opacities": round_to_uint8(finite.opacities[:, None] * 255),
-    }, scale
+    return arrays | {"rgbs": colors, "opacities": opacities}, scale
 
 
 def depth_colored(scenes: Sequence[Gaussians], cameras: Sequence[Cameras]) -> list[Gaussians]:

@@ -73,6 +73,12 @@ def imported(runs, monkeypatch):
     return imported
 
 
+def must_be_refused(weights, imported) -> None:
+    with pytest.raises(WeightsError, match=REFUSAL):
+        CompleteSplat.from_pretrained(weights)
+    assert not imported()
+
+
 @pytest.mark.parametrize("run", ["STAGE1", "STAGE2"])
 def test_weights_with_a_part_of_the_users_own_draw_scenes_in_the_working_folder(command, runs, pipeline, run):
     written = strict_json(runs / run / "weights" / CONFIG_FILE)
@@ -92,9 +98,7 @@ def test_from_elsewhere_a_part_of_the_users_own_needs_trust(command, runs, impor
         refused = command.refuses(*predict, f"weights={weights}")
         assert "names myenc.Enc, which is no part" in refused
         assert "trust=true" in refused
-        with pytest.raises(WeightsError, match=REFUSAL):
-            CompleteSplat.from_pretrained(weights)
-        assert not imported()
+        must_be_refused(weights, imported)
         command.succeeds(*predict, f"weights={weights}", "trust=true")
         assert imported()
 
@@ -103,9 +107,7 @@ def test_a_run_that_somebody_works_in_is_not_the_users_own(runs, imported, monke
     """Beside weights that were unpacked may lie modules that came with them."""
     for folder, weights in (("STAGE2", "weights"), ("STAGE2", "."), ("STAGE2/weights", ".")):
         monkeypatch.chdir(runs / folder)
-        with pytest.raises(WeightsError, match=REFUSAL):
-            CompleteSplat.from_pretrained(weights)
-        assert not imported()
+        must_be_refused(weights, imported)
 
 
 def test_what_the_hub_has_sent_is_not_the_users_own_even_below_the_working_folder(runs, imported, monkeypatch):
@@ -118,9 +120,7 @@ def test_what_the_hub_has_sent_is_not_the_users_own_even_below_the_working_folde
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(runs / "cache/hub"))
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     for weights in ("some/splats", snapshot):
-        with pytest.raises(WeightsError, match=REFUSAL):
-            CompleteSplat.from_pretrained(weights)
-        assert not imported()
+        must_be_refused(weights, imported)
     assert CompleteSplat.from_pretrained("some/splats", trust=True).image_size == 32
 
 

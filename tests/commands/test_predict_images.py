@@ -99,7 +99,7 @@ def test_images_of_any_name_are_written_below_out(predict, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("terminal", ["0", "1"])
-def test_each_scene_file_and_video_is_announced_in_a_line_or_on_the_bar_of_a_terminal(
+def test_each_scene_file_and_video_is_announced_in_a_line_or_on_a_terminals_bar(
     predict, tmp_path, monkeypatch, terminal
 ):
     monkeypatch.setenv("TTY_COMPATIBLE", terminal)
@@ -265,9 +265,7 @@ def test_one_warning_says_that_the_weights_were_not_trained_with_hidden_parts(
     assert (finished.status, finished.out.count(warning)) == (0, times)
 
 
-def test_a_photo_unlike_the_training_images_gets_a_warning_that_names_nearer_weights(
-    tiny_weights, tmp_path, monkeypatch
-):
+def test_a_photo_unlike_the_training_images_gets_a_warning_with_nearer_weights(tiny_weights, tmp_path, monkeypatch):
     model = model_with(tiny_weights, picture_mean=[1.0, 0, 0, 0, 0, 0, 0, 0], picture_std=[0.1] * 8)
     red, blue = (model.read(save(tmp_path / f"{color}.png", color), 15) for color in ("red", "blue"))
     fov, unlike, elsewhere = photo_warnings(blue, model, whole=True)

@@ -55,13 +55,8 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
     assert "one answer for each image and draws no samples" in finished.out
     assert "give images that are transparent or white around one, or background=remove" in finished.out
     folder = tmp_path / "out/a"
-    assert {path.name for path in folder.iterdir()} == {
-        "sample_00.ply",
-        "orbit_00.mp4",
-        "sheet.png",
-        "scene.json",
-        "photo.png",
-    }
+    files = {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json", "photo.png"}
+    assert {path.name for path in folder.iterdir()} == files
     settings = strict_json(folder / "scene.json")["settings"]
     assert settings["depth_range"] == pytest.approx([0.8, 3.2])
     assert not {"sampler", "steps"} & settings.keys()

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 from omegaconf import OmegaConf
-from support import SMALL, strict_json
+from support import SMALL, interrupted_at, strict_json
 
 from completesplat.commands import jobs
 from completesplat.commands.jobs import hold_job_lock
@@ -182,15 +182,7 @@ def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tm
     write_objects(root, scenes=4, frames=4, size=32, seed=0, workers=1, progress=False)
     given = ["fit", *FIT, "data=co3d_category", "data.category=toy_objects", "data.subset=null", "data.workers=0"]
     given += ["data.val_fraction=0.25", "data.test_fraction=0.25", f"data.root={root}", f"out={run}"]
-    step = ReconstructionModule.training_step
-
-    def interrupted(self, *inputs):
-        if self.global_step == 1:
-            raise KeyboardInterrupt
-        return step(self, *inputs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(ReconstructionModule, "training_step", interrupted)
+    with interrupted_at(1, ReconstructionModule):
         assert command(*given).status == 1
     more = tmp_path / "more"
     write_objects(more, scenes=8, frames=4, size=32, seed=0, workers=1, progress=False)

@@ -126,9 +126,7 @@ def test_the_best_of_several_samples_stands_beside_one_and_the_mean(scored):
     assert rules.keys() == {row for row in metrics if row.startswith("best_of_k")}
 
 
-def test_a_larger_size_is_reached_by_upsampling_renders_from_images_of_the_trained_size(
-    scored, pipeline, tmp_path, monkeypatch
-):
+def test_a_larger_size_is_reached_by_upsampling_renders_of_the_trained_size(scored, pipeline, tmp_path, monkeypatch):
     shown = []
     draw = Scorer.draw
 

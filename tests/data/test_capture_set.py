@@ -10,8 +10,7 @@ from support import write_capture
 from completesplat.data.captures.capture_set import CaptureSetDataModule
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.packed.writing import prepare
-from completesplat.data.validation import BadAnnotation, MissingFile, SharedSequences
-from completesplat.errors import DataError
+from completesplat.errors import BadAnnotation, DataError, MissingFile, SharedSequences
 
 OBJECTS, RINGS = ("apple", "cherry", "pear", "plum"), ("r0", "r1")
 NAMES = [f"{fruit}/{ring}" for fruit in OBJECTS for ring in RINGS]

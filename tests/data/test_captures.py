@@ -19,14 +19,15 @@ from completesplat.data.captures.colmap import read_colmap
 from completesplat.data.captures.module import CaptureDataModule, members
 from completesplat.data.captures.transforms_json import read_photographs, read_transforms
 from completesplat.data.sequences import PosedSequence
-from completesplat.data.validation import (
+from completesplat.errors import (
     BadAnnotation,
     BadCamera,
     BadImage,
+    CompleteSplatError,
+    DataError,
     MissingFile,
     OutsidePath,
 )
-from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import look_at, project
 
 pycolmap = pytest.importorskip("pycolmap")

@@ -8,9 +8,9 @@ from packed_sequences import ListedSource
 from support import strict_json
 from torch import Tensor
 
-from completesplat.data.validation import BadAnnotation, ChangedFile, MissingFile
 from completesplat.data.validation.audit import AuditReport, check, show_findings
 from completesplat.data.validation.processes import map_in_processes
+from completesplat.errors import BadAnnotation, ChangedFile, MissingFile
 from completesplat.files import write_json
 
 

@@ -7,19 +7,8 @@ import numpy as np
 import pytest
 
 from completesplat.data import validation
-from completesplat.data.validation import (
-    BadAnnotation,
-    BadCamera,
-    MissingFile,
-    OutsidePath,
-    UnreadableFile,
-    field,
-    finite_array,
-    path_below,
-    read_json,
-    read_text,
-    require_rotation,
-)
+from completesplat.data.validation import field, finite_array, path_below, read_json, read_text, require_rotation
+from completesplat.errors import BadAnnotation, BadCamera, MissingFile, OutsidePath, UnreadableFile
 
 CONTENT = [{"name": "Bär", "numbers": [1, 2.5, None]}] * 50
 TEXT = json.dumps(CONTENT, ensure_ascii=False).encode()

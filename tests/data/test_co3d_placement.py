@@ -9,7 +9,8 @@ from PIL import Image
 from completesplat.data.co3d.annotations import CO3DFrame, DepthMap, camera_from_viewpoint
 from completesplat.data.co3d.source import from_depth_maps, object_placement
 from completesplat.data.placement import Axes, Placement, from_cameras, from_points, upright_axes
-from completesplat.data.validation import BadImage, BadPlacement, MissingFile, read_points
+from completesplat.data.validation import read_points
+from completesplat.errors import BadImage, BadPlacement, MissingFile
 
 CENTER = np.array([3.0, -2.0, 5.0])
 AXES = np.eye(3)

@@ -11,8 +11,7 @@ import pytest
 from completesplat.commands.data import prepare
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.splits import Category, Filters, SeededSplit, read_category
-from completesplat.data.validation import BadCamera, OutsidePath
-from completesplat.errors import DataError
+from completesplat.errors import BadCamera, DataError, OutsidePath
 
 SPLITS = ("train", "val", "test")
 

@@ -18,8 +18,7 @@ from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModu
 from completesplat.data.toy.object_scene import PATCH_COLORS, render_frame
 from completesplat.data.toy.raytracing import trace
 from completesplat.data.toy.writing import draw_category
-from completesplat.data.validation import BadAnnotation
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import BadAnnotation, CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
 
 
@@ -140,9 +139,7 @@ def renders(toy_root: Path, tmp_path: Path) -> Path:
     return category.parent
 
 
-def test_modes_of_renders_are_the_images_of_every_paint_and_the_true_one_is_what_the_data_module_yields(
-    renders: Path,
-) -> None:
+def test_modes_of_renders_are_the_images_of_every_paint_and_the_true_one_is_the_data_modules(renders: Path) -> None:
     data = RenderedDataModule(str(renders), image_size=32, test_fraction=1.0)
     data.setup("test")
     painted = next(renders.glob("rendered/*/red")).parent.name  # the toys' test scene

@@ -14,8 +14,7 @@ from PIL import Image, ImageCms, ImageFile
 from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.exif import ORIENTATION
 from completesplat.data.images.files import decode_image, read_depth
-from completesplat.data.validation import BadImage, MissingFile
-from completesplat.errors import DataError
+from completesplat.errors import BadImage, DataError, MissingFile
 
 
 def grey_rgb(grey: np.ndarray) -> np.ndarray:

@@ -234,9 +234,7 @@ class HeifOfTests(PpmImagePlugin.PpmImageFile):
 
 
 @pytest.mark.parametrize("installed", [False, True])
-def test_heic_photos_are_read_with_pillow_heif_and_otherwise_counted_and_named(
-    tmp_path, caplog, monkeypatch, installed
-):
+def test_heic_photos_are_read_with_pillow_heif_or_else_counted_and_named(tmp_path, caplog, monkeypatch, installed):
     write_photos(tmp_path / "photos", [f"IMG_{number}.{suffix}" for number in range(7) for suffix in ("jpg", "HEIC")])
     Image.init()
     for name in ("ID", "OPEN", "EXTENSION"):

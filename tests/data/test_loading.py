@@ -11,8 +11,7 @@ from realestate10k_trees import epoch, equal, make_clip, module, same, write_tre
 
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.loader import EpochSampler, SceneLoader
-from completesplat.data.validation import BadCamera, BadImage
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import BadCamera, BadImage, CompleteSplatError, DataError
 from completesplat.scene import SceneBatch
 from completesplat.settings.schema import check_value, hints_of
 
@@ -165,11 +164,7 @@ def train(root: Path, out: Path, steps: int, workers: int, resume: Path | None =
 
 @pytest.mark.parametrize(
     ("workers", "options"),
-    [
-        (0, {"limit_train_batches": 3}),
-        (0, {"val_check_interval": 2}),
-        pytest.param(2, {}, marks=pytest.mark.processes),
-    ],
+    [(0, {"limit_train_batches": 3}), (0, {"val_check_interval": 2}), pytest.param(2, {}, marks=pytest.mark.processes)],
 )
 def test_a_resumed_run_sees_the_rest_and_worker_processes_end_with_it(clips, tmp_path, workers, options):
     before = set(multiprocessing.active_children())

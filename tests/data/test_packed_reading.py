@@ -19,8 +19,15 @@ from completesplat.data.packed.manifest import is_packed, read_manifest, setting
 from completesplat.data.packed.rows import EncodedImage, decode_square, encode, from_row, to_row
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
-from completesplat.data.validation import BadAnnotation, BadImage, ChangedFile, MissingFile, OutsidePath, UnreadableFile
-from completesplat.errors import DataError
+from completesplat.errors import (
+    BadAnnotation,
+    BadImage,
+    ChangedFile,
+    DataError,
+    MissingFile,
+    OutsidePath,
+    UnreadableFile,
+)
 
 NAMES = ["s3", "s1", "s4", "s0", "s5", "s9", "s2"]
 SHARD = "train-00000-of-00003.arrow"

@@ -15,8 +15,7 @@ from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.packed.source import PackedSource, local_root
 from completesplat.data.packed.writing import prepare
 from completesplat.data.toy.writing import SUBSET
-from completesplat.data.validation import ChangedFile, MissingFile
-from completesplat.errors import DataError
+from completesplat.errors import ChangedFile, DataError, MissingFile
 
 pytestmark = pytest.mark.processes
 

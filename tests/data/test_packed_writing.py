@@ -10,8 +10,7 @@ from packed_sequences import SIZE, ListedSource, contents, pack
 
 from completesplat.data.packed.manifest import read_manifest
 from completesplat.data.packed.source import PackedSource
-from completesplat.data.validation import BadImage, TooFewFrames
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import BadImage, CompleteSplatError, DataError, TooFewFrames
 
 SETTINGS = {"image_size": SIZE, "category": "chair", "crop": None}
 NAMES = [f"s{number}" for number in range(8)]

@@ -7,24 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from realestate10k_trees import (
-    FORMS,
-    HEIGHT,
-    encode,
-    epoch,
-    equal,
-    make_clip,
-    module,
-    same,
-    write_chunk_form,
-    write_tree,
-)
+from realestate10k_trees import FORMS, HEIGHT, encode, epoch, equal, make_clip, module, same, write_tree
 from support import compose_config
 
 from completesplat.data.realestate10k import clips
-from completesplat.data.validation import BadAnnotation, BadCamera, OutsidePath, UnreadableFile
 from completesplat.data.validation.audit import check
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import BadAnnotation, BadCamera, CompleteSplatError, DataError, OutsidePath, UnreadableFile
 from completesplat.geometry.cameras import project
 
 TRAIN = [make_clip(f"train{i}", frames=5 + i % 3) for i in range(7)]
@@ -246,14 +234,14 @@ def loads(monkeypatch):
 
 def test_two_chunks_in_memory_and_each_read_once_an_epoch(tmp_path, loads):
     names, counts = loads
-    write_chunk_form(tmp_path / "few", TEST[:3], clips_per_chunk=1)
+    FORMS["chunks"](tmp_path / "few", TEST[:3], clips_per_chunk=1)
     result = clips.ChunkedClips(tmp_path / "few")
     for number in (0, 1, 0, 2, 0, 1):
         result.clip(f"test{number}")
     assert names == [f"{number:06}.torch" for number in (0, 1, 2, 1)]  # The chunk of the longest ago went.
     del result
     for split in ("train", "test"):
-        write_chunk_form(tmp_path / split, [make_clip(f"{i:02}", frames=3) for i in range(18)], clips_per_chunk=3)
+        FORMS["chunks"](tmp_path / split, [make_clip(f"{i:02}", frames=3) for i in range(18)], clips_per_chunk=3)
     data = module(tmp_path, image_size=8, batch_size=4, references_per_sequence=2, val_fraction=0.0)
     loader = data.train_dataloader()
     names.clear()

@@ -10,14 +10,8 @@ import torch
 from PIL import Image
 from support import round_gaussians
 
+from completesplat.export import splat_transform
 from completesplat.export.images import to_pixels
-from completesplat.export.splat_transform import (
-    LARGEST_FOV,
-    PageView,
-    upright_rotation,
-    viewer_settings,
-    write_turning_page,
-)
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -46,9 +40,9 @@ def scene() -> Gaussians:
     return round_gaussians(means, 0.15, 0.99, colors)
 
 
-def our_image(view: PageView) -> torch.Tensor:
-    fov = viewer_settings(view, upright_rotation(UP))["cameras"][0]["initial"]["fov"]
-    assert fov < LARGEST_FOV
+def our_image(view: splat_transform.PageView) -> torch.Tensor:
+    fov = splat_transform.viewer_settings(view, splat_transform.upright_rotation(UP))["cameras"][0]["initial"]["fov"]
+    assert fov < splat_transform.LARGEST_FOV
     focal = WIDTH / 2 / math.tan(math.radians(fov) / 2)
     intrinsics = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
     camera = Cameras(look_at(torch.zeros(3), PIVOT, UP), intrinsics, (HEIGHT, WIDTH))
@@ -98,8 +92,8 @@ def test_a_phone_shows_all_that_the_photo_shows_and_controls_that_stay(tmp_path,
     """Balls at the photo's left and right edges."""
     means = torch.tensor([[1.2, 0.0, 3.0], [-1.2, 0.0, 3.0], [0.0, 0.0, 3.0]])
     edges = round_gaussians(means, 0.15, 0.99, torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]))
-    view = PageView(REFERENCE, means[2], torch.tensor([0.0, -1.0, 0.0]), 0.25)
-    write_turning_page(tmp_path / "scene.html", edges, view)
+    view = splat_transform.PageView(REFERENCE, means[2], torch.tensor([0.0, -1.0, 0.0]), 0.25)
+    splat_transform.write_turning_page(tmp_path / "scene.html", edges, view)
     with opened(tmp_path / "scene.html", [], "", 390, 844) as page:
         seen = at_rest(page)
         page.wait_for_timeout(6000)  # after four seconds the viewer would hide them
@@ -110,8 +104,8 @@ def test_a_phone_shows_all_that_the_photo_shows_and_controls_that_stay(tmp_path,
 
 
 def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path, converter):
-    view = PageView(REFERENCE, PIVOT, UP, 0.25)
-    write_turning_page(tmp_path / "scene.html", scene(), view)
+    view = splat_transform.PageView(REFERENCE, PIVOT, UP, 0.25)
+    splat_transform.write_turning_page(tmp_path / "scene.html", scene(), view)
     requests: list[str] = []
     theirs, ours = screenshot(tmp_path / "scene.html", requests), our_image(view)
     assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
@@ -122,7 +116,9 @@ def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path, converter):
 
 
 def test_dragging_turns_the_page_s_camera_about_the_object_also_within_walls(tmp_path, converter):
-    write_turning_page(tmp_path / "scene.html", room(), PageView(REFERENCE, PIVOT, UP, 0.25))
+    splat_transform.write_turning_page(
+        tmp_path / "scene.html", room(), splat_transform.PageView(REFERENCE, PIVOT, UP, 0.25)
+    )
     before, after = (screenshot(tmp_path / "scene.html", [], drag) for drag in (0, 150))
     for color in torch.eye(3):  # the balls around the pivot
         assert abs(place(before, color) - place(after, color)) < 0.1

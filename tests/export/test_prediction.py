@@ -11,18 +11,9 @@ from image_sheets import cells
 from PIL import Image
 from support import some_gaussians, strict_json
 
-from completesplat.export.images import color_depth, surface_depth
+from completesplat.export import prediction
+from completesplat.export.images import color_depth
 from completesplat.export.ply import read_ply
-from completesplat.export.prediction import (
-    FileUnits,
-    OutputFiles,
-    Shot,
-    contact_sheet,
-    write_fitted_scene,
-    write_maps,
-    write_prediction,
-    write_scene_json,
-)
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -31,7 +22,7 @@ GREY, KINDS = 128, ("depth", "normals", "opacity")
 
 def test_every_image_stands_upright_in_its_row_and_column_below_the_title(tmp_path):
     reference, images, depths = torch.rand(3, 36, 48), torch.rand(3, 8, 3, 36, 48), torch.rand(3, 1, 36, 48)
-    contact_sheet(tmp_path / "a.png", "a title", reference, images, depths)
+    prediction.contact_sheet(tmp_path / "a.png", "a title", reference, images, depths)
     sheet = Image.open(tmp_path / "a.png")
     assert np.asarray(sheet)[:30].std() > 0
     above = torch.ones(3, 1, 3, 36, 48)
@@ -52,15 +43,16 @@ def scene_at(depth: float, opacity: float):
 
 def test_depth_is_the_surfaces_where_it_is_opaque_and_nothing_elsewhere():
     rendering, faint = (ReferenceRasterizer()(scene_at(2, a)[None], CAMERA[None][None]) for a in (0.9, 0.2))
-    depth, opaque = surface_depth(rendering), rendering.alpha > 0.5
+    depth, opaque = rendering.surface_depth(), rendering.alpha > 0.5
     assert 0 < opaque.sum() < opaque.numel()
     torch.testing.assert_close(depth, torch.where(opaque, 2.0, 0.0))
     assert faint.alpha.max() > 0.2
-    assert (surface_depth(faint) == 0).all()
+    assert (faint.surface_depth() == 0).all()
 
 
 def test_maps_share_one_scale_of_depth_and_agree_on_what_is_there(tmp_path):
-    files, (near, far) = write_maps(tmp_path, [scene_at(1, 0.9), scene_at(4, 0.9)], CAMERA, ReferenceRasterizer())
+    scenes = [scene_at(1, 0.9), scene_at(4, 0.9)]
+    files, (near, far) = prediction.write_maps(tmp_path, scenes, CAMERA, ReferenceRasterizer())
     assert (round(near, 3), round(far, 3)) == (1, 4)
     assert sorted(files.values()) == sorted(path.name for path in tmp_path.iterdir())
     assert set(files) == {f"{kind}_{index:02}" for kind in KINDS for index in (0, 1)}
@@ -78,9 +70,9 @@ def test_maps_share_one_scale_of_depth_and_agree_on_what_is_there(tmp_path):
 
 def test_the_camera_comes_back_exactly_and_numbers_that_are_not_finite_leave_the_old_file(tmp_path):
     oblong, path, settings = Cameras(torch.eye(4), pinhole(50.0, 64), (64, 48)), tmp_path / "s.json", {"steps": 50}
-    write_scene_json(path, oblong, settings, 7, {"splat": "größe.ply"})
+    prediction.write_scene_json(path, oblong, settings, 7, {"splat": "größe.ply"})
     with pytest.raises(ValueError, match="JSON"):
-        write_scene_json(path, oblong, {"weight": torch.inf}, 0, {})
+        prediction.write_scene_json(path, oblong, {"weight": torch.inf}, 0, {})
     scene = strict_json(path)
     stored = scene["reference_camera"]
     assert torch.equal(torch.tensor(stored["world_to_camera"]), oblong.world_to_camera)
@@ -96,9 +88,9 @@ def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path, 
     monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
     bright = dataclasses.replace(scene_at(2, 0.9), colors=torch.tensor([[0.2, 0.4, 1.5], [0.0, 0.5, 1.0]]))
     faint = dataclasses.replace(scene_at(2, 0.9), opacities=torch.tensor([0.9, 1e-4]))
-    wanted = OutputFiles(formats=("ply", "spz"), videos=())
-    shots, settings = [Shot(bright, CAMERA), Shot(faint, CAMERA)], {"seed": 0, "image": "a.png"}
-    write_prediction(tmp_path / "a", torch.zeros(3, 16, 16), shots, ReferenceRasterizer(), wanted, settings)
+    wanted = prediction.OutputFiles(formats=("ply", "spz"), videos=())
+    shots, settings = [prediction.Shot(bright, CAMERA), prediction.Shot(faint, CAMERA)], {"seed": 0, "image": "a.png"}
+    prediction.write_prediction(tmp_path / "a", torch.zeros(3, 16, 16), shots, ReferenceRasterizer(), wanted, settings)
     recorded = strict_json(tmp_path / "a/scene.json")["settings"]
     counted = [recorded[name] for name in ("gaussians", "colors_clipped", "left_out_of_spz")]
     assert counted == [[2, 2], [1, 0], [0, 1]]
@@ -109,8 +101,9 @@ def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path, 
 def test_files_have_the_users_coordinates_or_those_less_an_offset_that_scene_json_has(tmp_path, caplog, far, offset):
     places = torch.tensor([[0.25, 0.5, 2.0], [-0.25, 0, 2.0]])
     scene = dataclasses.replace(scene_at(2, 0.9), means=places)
-    images, shot = torch.zeros(1, 3, 16, 16), Shot(scene, CAMERA, units=FileUnits(0.5, far))  # exact in float32
-    write_fitted_scene(tmp_path, "a", "a", shot, images, images, 0)
+    images = torch.zeros(1, 3, 16, 16)
+    shot = prediction.Shot(scene, CAMERA, units=prediction.FileUnits(0.5, far))  # exact in float32
+    prediction.write_fitted_scene(tmp_path, "a", "a", shot, images, images, 0)
     recorded = strict_json(tmp_path / "scene.json")
     assert recorded["settings"].get("offset", [0, 0, 0]) == offset
     assert caplog.text.count("a: too far from its origin for float32: add offset (400000, 5e+06, 300)") == any(offset)

@@ -5,7 +5,8 @@ from scipy.ndimage import gaussian_filter
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from completesplat.commands.protocol import METRICS
-from completesplat.metrics.images import PSNR_LIMIT, object_only, psnr, sharpness, ssim
+from completesplat.metrics.images import PSNR_LIMIT, psnr, sharpness, ssim
+from completesplat.metrics.scoring import object_only
 from completesplat.results.tables import SSIM_NOTE
 
 

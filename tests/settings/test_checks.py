@@ -7,13 +7,7 @@ from support import compose_config, refused
 
 from completesplat.cli import VERBS
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.checks import (
-    check_image_size,
-    check_parts,
-    check_parts_of_verb,
-    check_values,
-    complete_task,
-)
+from completesplat.settings import checks
 
 ONE = "give one of ckpt=FILE, weights=DIR and scenes=DIR; all but ckpt need data=NAME"
 NO_DATA = "weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR"
@@ -116,15 +110,15 @@ def test_a_wrong_value_is_refused_with_the_allowed_values(verb, setting, message
 def test_the_defaults_of_each_verb_pass_the_checks(chosen):
     verb = chosen.partition("_")[0]
     config = compose_config(verb, *([chosen] if "=" in chosen else []))
-    check_values(verb, config)
-    check_parts_of_verb(verb, config)
+    checks.check_values(verb, config)
+    checks.check_parts_of_verb(verb, config)
 
 
 def test_a_task_takes_the_settings_that_its_function_names_unless_it_states_another_value():
     report, prepare = compose_config("report", "report_task=depth"), compose_config("data", "data_task=prepare")
     report.far_degrees, prepare.data.on_bad, prepare.codec = 60, "raise", "png"
     for config in (report, prepare):
-        complete_task(config)
+        checks.complete_task(config)
         assert not {"out", "verb", "description"} & config.task.keys()
     assert (report.task.far_degrees, report.task.scenes) == (60, report.scenes)
     assert (prepare.task.codec, prepare.task.on_bad) == ("png", "raise")
@@ -132,14 +126,14 @@ def test_a_task_takes_the_settings_that_its_function_names_unless_it_states_anot
 
 def test_stage_2_needs_image_sizes_that_are_multiples_of_32():
     stage2 = ["model=latent_diffusion", "model.autoreconstructor_checkpoint=null"]
-    check_image_size(compose_config("fit", "data.image_size=72"))
+    checks.check_image_size(compose_config("fit", "data.image_size=72"))
     with pytest.raises(CompleteSplatError, match=r"data\.image_size=72: must be a multiple of 32 .* such as 64$"):
-        check_image_size(compose_config("fit", *stage2, "data.image_size=72"))
+        checks.check_image_size(compose_config("fit", *stage2, "data.image_size=72"))
 
 
 def test_a_wrong_value_is_reported_under_the_setting_that_the_user_gave():
     with pytest.raises(CompleteSplatError, match=r"^seed=x: "):
-        check_parts(compose_config("fit", "seed=x").callbacks, "callbacks")
+        checks.check_parts(compose_config("fit", "seed=x").callbacks, "callbacks")
 
 
 @pytest.mark.parametrize(

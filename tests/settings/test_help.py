@@ -6,26 +6,19 @@ import pytest
 
 from completesplat.cli import VERBS
 from completesplat.errors import CompleteSplatError
+from completesplat.settings import options as conf
 from completesplat.settings.help import WIDTH, help_page
-from completesplat.settings.options import (
-    TASKS,
-    about_groups,
-    choices_of_verb,
-    groups,
-    options,
-    parse,
-    settings_of_option,
-    settings_of_verb,
-)
 
 SOME_TASKS = (None, "check", "summary", "controls")
-WITH_TASKS = [(verb, task) for verb in VERBS for task in (options(f"{verb}_task") if verb in TASKS else [None])]
+WITH_TASKS = [
+    (verb, task) for verb in VERBS for task in (conf.options(f"{verb}_task") if verb in conf.TASKS else [None])
+]
 
 
 @pytest.mark.parametrize(("verb", "task"), WITH_TASKS)
 def test_each_own_setting_is_explained_in_conf(verb, task):
-    places = {choice.place.partition(".")[0] for choice in choices_of_verb(verb, task)} | {"stage1", "stage2"}
-    settings = [setting for setting in settings_of_verb(verb, task) if setting.key.partition(".")[0] not in places]
+    places = {choice.place.partition(".")[0] for choice in conf.choices_of_verb(verb, task)} | {"stage1", "stage2"}
+    settings = [setting for setting in conf.settings_of_verb(verb, task) if setting.key.partition(".")[0] not in places]
     assert settings[0].key == ("kind" if verb == "new" else "out")  # `new` writes into the working folder
     unexplained = [setting.key for setting in settings if not setting.comment and "." not in setting.key]
     assert unexplained == []
@@ -37,9 +30,9 @@ def test_a_page_has_examples_settings_and_parts_and_fits(verb, task):
     assert text.startswith(f"completesplat {verb}: ")
     assert max(map(len, text.splitlines())) <= WIDTH
     assert "Examples:\n  completesplat " in text
-    for setting in settings_of_verb(verb, task):
+    for setting in conf.settings_of_verb(verb, task):
         assert re.search(rf"^  {re.escape(setting.key)}(=| |$)", text, re.MULTILINE), setting.key
-    for choice in choices_of_verb(verb, task):
+    for choice in conf.choices_of_verb(verb, task):
         assert re.search(rf"^  {re.escape(choice.place)}(=| |$)", text, re.MULTILINE), choice
     assert "_target_" not in text
 
@@ -93,14 +86,14 @@ def test_a_word_is_searched_for_in_the_names_and_comments_of_all_options():
 
 
 def test_every_group_is_explained_and_every_option_is_read():
-    assert set(groups()) <= about_groups().keys()
-    for group in groups():
-        for option in options(group):
-            assert settings_of_option(group, option) is not None
+    assert set(conf.groups()) <= conf.about_groups().keys()
+    for group in conf.groups():
+        for option in conf.options(group):
+            assert conf.settings_of_option(group, option) is not None
 
 
 def test_a_files_lines_are_read_as_they_explain_themselves():
-    written = parse(
+    written = conf.parse(
         "# @package _global_\n# About it.\n\n# Of the first.\na: 1\nb: [1, 2] # of the second\n"
         "e: # With entries.\n  - 1\n# Of all.\npart:\n"
         "  # Of the inner\n  # one.\n  c: x\n  d: null\n"

@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 
 from completesplat.data.sequences import MaskedImage
-from completesplat.data.validation import BadImage, OutsidePath
+from completesplat.errors import BadImage, OutsidePath
 from completesplat.export.images import GAP, MARGIN
 from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.studies.contact_sheet import (

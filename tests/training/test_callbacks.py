@@ -14,14 +14,7 @@ from scenes_for_training import quiet_trainer, scene_batch
 from torch.utils.data import DataLoader
 
 from completesplat.training import callbacks
-from completesplat.training.callbacks import (
-    ExponentialMovingAverage,
-    Progress,
-    StepSeeds,
-    Throughput,
-    memory,
-    step_seed,
-)
+from completesplat.training.callbacks import ExponentialMovingAverage, Progress, StepSeeds, Throughput, memory
 
 
 class Clock:
@@ -134,7 +127,7 @@ def test_every_batch_draws_its_own_numbers_whatever_else_is_drawn():
     first, again, other_seed = drawn(0), drawn(0, others=5), drawn(1)
     assert first == again
     assert len({*first, *other_seed}) == 2 * 12
-    seeds = {step_seed(*place) for place in itertools.product(range(3), repeat=4)}
+    seeds = {callbacks.step_seed(*place) for place in itertools.product(range(3), repeat=4)}
     assert len(seeds) == 3**4
     assert all(0 <= seed < 2**64 for seed in seeds)
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from PIL import Image
-from support import compose_config, strict_json, write_capture
+from support import compose_config, interrupted_at, strict_json, write_capture
 
 from completesplat.commands.fit import refuse_without_effect
 from completesplat.data.captures.capture import CapturedFrame
@@ -36,18 +36,12 @@ def no_converter() -> None:
 
 def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, capture, tmp_path, monkeypatch):
     monkeypatch.setattr("completesplat.export.formats.find_splat_transform", no_converter)
-    read, original, step = [], CapturedFrame.read, CaptureFit.training_step
+    read, original = [], CapturedFrame.read
     columns, sheet = [], prediction.image_sheet
     monkeypatch.setattr(prediction, "image_sheet", lambda names, *rest: columns.append(names) or sheet(names, *rest))
     monkeypatch.setattr(CapturedFrame, "read", lambda self: read.append(self.number) or original(self))
 
-    def interrupted_step(self, *inputs):
-        if self.global_step == 6:
-            raise KeyboardInterrupt
-        return step(self, *inputs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(CaptureFit, "training_step", interrupted_step)
+    with interrupted_at(6, CaptureFit):
         assert command("fit", *QUICK, "out=parts").status != 0
     assert set(read) == set(range(FRAMES)) - {0, 4, 8}  # At least three of nine are held out, so every fourth is.
     assert command("fit", *QUICK, "ckpt_path=last", "out=parts").status == 0

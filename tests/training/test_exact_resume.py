@@ -5,7 +5,7 @@ from functools import cache
 import pandas
 import pytest
 import torch
-from support import SMALL, call, strict_json
+from support import SMALL, call, interrupted_at, strict_json
 from torch import Tensor
 
 from completesplat.training.latent_diffusion import LatentDiffusion
@@ -74,15 +74,7 @@ def rows(run) -> pandas.DataFrame:
 def test_a_run_that_is_continued_is_bit_equal(settings, whole, tmp_path, monkeypatch, stage, module, saved):
     monkeypatch.chdir(tmp_path)
     arguments = [*settings[stage], f"callbacks.checkpoint.every_n_train_steps={saved}", f"out={tmp_path}/run"]
-    step = module.training_step
-
-    def interrupted_step(self, *inputs):
-        if self.global_step == saved + 1:
-            raise KeyboardInterrupt
-        return step(self, *inputs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "training_step", interrupted_step)
+    with interrupted_at(saved + 1, module):
         assert call(monkeypatch, *arguments) != 0
     assert rows(tmp_path / "run")["step"].max() == saved  # So it did more than it saved.
     assert call(monkeypatch, *arguments, "ckpt_path=last") == 0

@@ -19,15 +19,7 @@ from completesplat.metrics.images import PSNR_LIMIT
 from completesplat.metrics.scoring import diversity
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch
-from completesplat.training.fixed_scenes import (
-    SceneDrawings,
-    fixed_scenes,
-    gaussian_figures,
-    layer_figures,
-    samples_sheet,
-    scene_panels,
-    write_newest,
-)
+from completesplat.training import fixed_scenes
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.viewer.sample import read_newest
 
@@ -44,7 +36,7 @@ def two_layers(scenes: SceneBatch) -> Gaussians:
 
 
 def panels(gaussians: Gaussians, scenes: SceneBatch, background: float = 0.5) -> dict[str, torch.Tensor]:
-    return scene_panels(ReferenceRasterizer(), gaussians, scenes, background)
+    return fixed_scenes.scene_panels(ReferenceRasterizer(), gaussians, scenes, background)
 
 
 def test_panels_are_input_target_error_and_layers():
@@ -85,7 +77,7 @@ def test_percentiles_are_of_all_gaussians():
     scenes = scene_batch()
     gaussians = layer(scenes, 1.0, 0.9, scenes.reference.images)
     ranks = torch.linspace(0, 1, gaussians.opacities.numel())[torch.randperm(gaussians.opacities.numel())]
-    figures = gaussian_figures(replace(gaussians, opacities=ranks.view_as(gaussians.opacities)))
+    figures = fixed_scenes.gaussian_figures(replace(gaussians, opacities=ranks.view_as(gaussians.opacities)))
     for p in (10, 50, 90):
         assert figures[f"gaussians/opacity_p{p}"] == pytest.approx(p / 100, abs=1e-5)
         assert figures[f"gaussians/log10_scale_p{p}"] == pytest.approx(-3, abs=1e-5)
@@ -100,7 +92,7 @@ def test_figures_of_the_layers_are_those_of_the_reference_s_pixels():
     gaussians = two_layers(scenes)
     opacities = torch.rand(2, 2, SIZE, SIZE)
     gaussians = replace(gaussians, opacities=opacities.flatten(1) * 0.9)
-    figures = layer_figures(gaussians, scenes)
+    figures = fixed_scenes.layer_figures(gaussians, scenes)
     assert figures["layers/behind_2"] == pytest.approx(2)  # depths of 1 and 3
     for layer in (0, 1):
         mean = 0.9 * opacities[:, layer][masks[:, 0] > 0].mean()
@@ -124,7 +116,7 @@ def test_the_newest_scenes_take_the_place_of_older_ones_and_read_back_with_their
     scenes = scene_batch(batch=2)
     gaussians = two_layers(scenes)
     for step in (500, 1000):
-        write_newest(tmp_path / "newest", step, gaussians, scenes, up)
+        fixed_scenes.write_newest(tmp_path / "newest", step, gaussians, scenes, up)
         step_of_files, samples, direction = read_newest(tmp_path / "newest")
         assert (step_of_files, direction) == (step, pytest.approx(up.tolist()))
     assert [sample.settings for sample in samples] == [{"scene": name, "step": 1000} for name in scenes.names]
@@ -135,7 +127,7 @@ def test_the_newest_scenes_take_the_place_of_older_ones_and_read_back_with_their
         assert (sample.gaussians.scales > gaussians.scales[index]).all()  # as wide as the rasterizer's blur
         assert torch.equal(sample.reference.intrinsics, scenes.reference.cameras.intrinsics[index])
     broken = replace(gaussians, means=gaussians.means * torch.tensor([1.0, torch.nan])[:, None, None])
-    write_newest(tmp_path / "newest", 1500, broken, scenes, up)  # training goes on
+    fixed_scenes.write_newest(tmp_path / "newest", 1500, broken, scenes, up)  # training goes on
     assert len(read_newest(tmp_path / "newest")[1]) == 1
 
 
@@ -149,16 +141,16 @@ def test_newest_scenes_that_are_not_there_are_refused(tmp_path):
 
 def test_scenes_are_the_first_of_validation():
     several = [scene_batch(2, targets=1, seed=0), scene_batch(1, targets=3, seed=1), scene_batch(2, targets=2, seed=2)]
-    scenes = fixed_scenes(several, 4)
+    scenes = fixed_scenes.fixed_scenes(several, 4)
     assert [scene.names for scene in scenes] == ["scene 0 0", "scene 0 1", "scene 1 0", "scene 2 0"]
     assert torch.equal(scenes[2].targets.images, several[1].targets.images[0, :1])
-    assert len(fixed_scenes(several, 10)) == 5
+    assert len(fixed_scenes.fixed_scenes(several, 10)) == 5
 
 
 @pytest.mark.parametrize(("views", "chosen"), [(1, [0]), (3, [0, 2, 4]), (9, range(6))])
 def test_targets_are_spread_over_all_that_a_scene_has(views, chosen):
     (whole,) = batch = [scene_batch(1, targets=6)]
-    (scene,) = fixed_scenes(batch, 1, views)
+    (scene,) = fixed_scenes.fixed_scenes(batch, 1, views)
     assert torch.equal(scene.targets.images, whole.targets.images[0, list(chosen)])
 
 
@@ -181,9 +173,9 @@ def test_a_run_writes_images_and_rows(pipeline, stage):
 SIDE = 32
 
 
-def some_drawings(samples: int = 2, views: int = 3) -> SceneDrawings:
+def some_drawings(samples: int = 2, views: int = 3) -> fixed_scenes.SceneDrawings:
     images = torch.rand(1 + samples, views, 3, SIDE, SIDE)
-    return SceneDrawings(images[0], images[1:], torch.ones(1, views, 1, SIDE, SIDE))
+    return fixed_scenes.SceneDrawings(images[0], images[1:], torch.ones(1, views, 1, SIDE, SIDE))
 
 
 def assert_shows(result: torch.Tensor, expected: torch.Tensor) -> None:
@@ -192,7 +184,7 @@ def assert_shows(result: torch.Tensor, expected: torch.Tensor) -> None:
 
 def test_rows_are_true_images_samples_and_depths_scene_by_scene():
     drawn = [some_drawings(), some_drawings(views=2)]
-    result = cells(samples_sheet(drawn), SIDE, SIDE)
+    result = cells(fixed_scenes.samples_sheet(drawn), SIDE, SIDE)
     assert result.shape[:2] == (8, 3)
     for top, scene in zip((0, 4), drawn, strict=True):
         views = len(scene.true)
@@ -220,7 +212,7 @@ def test_a_run_writes_samples_and_their_scores(pipeline):
     data = instantiate(compose_config("fit", f"data.root={pipeline.toy}", *SMALL).data, _convert_="all")
     data.setup("fit")
     # One validation scene with two targets, four samples.
-    (scene,) = fixed_scenes(data.val_dataloader(), 2, 8)
+    (scene,) = fixed_scenes.fixed_scenes(data.val_dataloader(), 2, 8)
     result = cells(Image.open(run / "samples/step_000002.png"), SIDE, SIDE)
     assert result.shape[:2] == (1 + 4 + 1, 3)
     assert_shows(result[0, 0], scene.reference.images)

@@ -9,16 +9,10 @@ from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from completesplat.commands.plan import count_work, without_weights
+from completesplat.training import step_counts
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.optimization import constant
 from completesplat.training.stage import Stage
-from completesplat.training.step_counts import (
-    LiveMemory,
-    MemoryOnlyRasterizer,
-    WithoutInitialWeights,
-    count_step,
-    fake_tensors,
-)
 from completesplat.training.steps import Training, synthetic_batch
 
 SIZE, BATCH = 16, 3
@@ -30,7 +24,7 @@ class TwoLayers(Stage):
     """3 -> 8 channels by 3 x 3, 8 -> 4 by 1 x 1."""
 
     def __init__(self) -> None:
-        super().__init__(MemoryOnlyRasterizer(gpu=True), torch.optim.Adam, constant)
+        super().__init__(step_counts.MemoryOnlyRasterizer(gpu=True), torch.optim.Adam, constant)
         self.layers = nn.Sequential(nn.Conv2d(3, 8, 3, padding=1), nn.Conv2d(8, 4, 1))
         self.frozen = nn.Linear(5, 1).requires_grad_(False)
 
@@ -44,7 +38,7 @@ class TwoLayers(Stage):
 def test_counts_are_those_by_hand() -> None:
     pixels = BATCH * SIZE**2
     first, second = 2 * 3 * 8 * 9 * pixels, 2 * 8 * 4 * pixels  # images have no gradient, the first layer's output has
-    counts = count_step(TwoLayers, SIZE, BATCH, 0, "32-true", accumulated=2)
+    counts = step_counts.count_step(TwoLayers, SIZE, BATCH, 0, "32-true", accumulated=2)
     assert counts.flops == 2 * (2 * first + 3 * second)
     assert (counts.trained, counts.frozen) == (8 * 27 + 8 + 4 * 8 + 4, 6)
     weights, images, between, last = 8 * 27 + 8 + 4 * 8 + 4, 3 * pixels, 8 * pixels, 4 * pixels
@@ -59,14 +53,14 @@ def test_counts_are_those_by_hand() -> None:
 
 
 def test_fake_tensors_free_what_real_ones_do() -> None:
-    live = LiveMemory()
+    live = step_counts.LiveMemory()
     training, scenes = Training(TwoLayers(), "32-true"), synthetic_batch(SIZE, BATCH, 0)
     training.step(scenes)
     training.optimizer.zero_grad()
     with live:
         loss = training.loss(scenes)
         forward = live.peak_since()
-    counts = count_step(TwoLayers, SIZE, BATCH, 0, "32-true")
+    counts = step_counts.count_step(TwoLayers, SIZE, BATCH, 0, "32-true")
     assert live.bytes == counts.memory["activations"]
     del loss
     assert live.bytes == 0
@@ -84,7 +78,7 @@ def test_a_step_of_the_papers_size_runs_and_takes_no_memory(experiment: str) -> 
 
 
 def on_gpu(config: DictConfig) -> Training:
-    with WithoutInitialWeights(), torch.device("cuda"):
+    with step_counts.WithoutInitialWeights(), torch.device("cuda"):
         return Training(instantiate(config.model, _convert_="all"), "bf16-mixed")
 
 
@@ -93,17 +87,16 @@ LARGE = [pytest.param((experiment,), marks=pytest.mark.slow) for experiment in P
 
 
 @pytest.mark.parametrize("settings", [("toy_var", *SMALL), ("toy_diffusion", *SMALL), *LARGE])
-def test_a_forward_pass_on_a_gpu_finds_all_tensors_there_and_keeps_what_is_counted(
-    settings: tuple[str, ...], pretended_gpu: None
-) -> None:
+@pytest.mark.usefixtures("pretended_gpu")
+def test_a_forward_pass_on_a_gpu_finds_all_tensors_there_and_keeps_what_is_counted(settings: tuple[str, ...]) -> None:
     experiment, *sizes = settings
     config = compose_config("plan", f"experiment={experiment}", *sizes)
     copied = without_weights(config)
     copied.rasterizer = {"_target_": "completesplat.training.step_counts.MemoryOnlyRasterizer", "gpu": True}
-    batch, live = 4, LiveMemory()
+    batch, live = 4, step_counts.LiveMemory()
     with sdpa_kernel(SDPBackend.MATH):
         expected = count_work(config, batch)
-        with fake_tensors(), live:
+        with step_counts.fake_tensors(), live:
             training = on_gpu(copied)
             scenes = synthetic_batch(config.data.image_size, batch, config.data.targets).to("cuda")
             before = live.bytes

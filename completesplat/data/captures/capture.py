@@ -18,8 +18,16 @@ from PIL import Image
 from completesplat.data.images import files
 from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, read_exif
 from completesplat.data.sequences import first_names
-from completesplat.data.validation import LARGEST, BadAnnotation, BadCamera, BadImage, TooFewFrames, require_file
-from completesplat.errors import CompleteSplatError, ImageError, errors_at
+from completesplat.data.validation import LARGEST, require_file
+from completesplat.errors import (
+    BadAnnotation,
+    BadCamera,
+    BadImage,
+    CompleteSplatError,
+    ImageError,
+    TooFewFrames,
+    errors_at,
+)
 from completesplat.files import by_numbers
 from completesplat.geometry.cameras import Cameras
 

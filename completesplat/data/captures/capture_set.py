@@ -10,8 +10,8 @@ from completesplat.data.co3d.splits import SeededSplit, split_by_seed
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.sequences import SPLITS
-from completesplat.data.validation import BadAnnotation, MissingFile, SharedSequences, field, read_json, require_file
-from completesplat.errors import errors_at
+from completesplat.data.validation import field, read_json, require_file
+from completesplat.errors import BadAnnotation, MissingFile, SharedSequences, errors_at
 from completesplat.settings.schema import Natural, Share
 
 SPLITS_FILE = "splits.json"
@@ -83,12 +83,8 @@ class CaptureSetDataModule(ObjectDataModule):
 
     def describe(self) -> dict[str, str | None]:
         val, test, seed = self.seeded
-        seeded = f"by seed {seed}: {val:g} of the objects for validation, {test:g} for the test"
-        return {
-            "data_set": "captures",
-            "split": f"of a list, or {seeded}",
-            **self.described_views("a capture's first frame"),
-        }
+        split = f"of a list, or by seed {seed}: {val:g} of the objects for validation, {test:g} for the test"
+        return {"data_set": "captures", "split": split, **self.described_views("a capture's first frame")}
 
     def packed_settings(self) -> dict[str, Scalar]:
         return {"splits": self.splits, **self.seeded._asdict(), **self.framing._asdict()}

@@ -12,17 +12,8 @@ import numpy as np
 import torch
 
 from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fit_lens, in_order, warn_of_missing
-from completesplat.data.validation import (
-    BadAnnotation,
-    BadCamera,
-    MissingFile,
-    UnreadableFile,
-    finite_array,
-    path_below,
-    read_text,
-    require_file,
-)
-from completesplat.errors import DataError, errors_at
+from completesplat.data.validation import finite_array, path_below, read_text, require_file
+from completesplat.errors import BadAnnotation, BadCamera, DataError, MissingFile, UnreadableFile, errors_at
 from completesplat.geometry.rotations import quaternion_to_matrix
 
 # Names and numbers of parameters by model id (colmap, `src/colmap/sensor/models.h`); other models are refused.

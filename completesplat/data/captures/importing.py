@@ -18,9 +18,8 @@ from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.turntable import TurntableSettings, import_turntables
 from completesplat.data.images import files
 from completesplat.data.sequences import first_names
-from completesplat.data.validation import refused_to
 from completesplat.data.validation.processes import usable_cores
-from completesplat.errors import DataError
+from completesplat.errors import DataError, refused_to
 from completesplat.files import atomic_folder, by_numbers, counted, folder_names
 from completesplat.settings.schema import Positive
 

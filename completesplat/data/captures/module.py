@@ -15,21 +15,11 @@ import torch
 from completesplat.data.captures.capture import Capture, CapturedFrame
 from completesplat.data.captures.colmap import image_count, is_model, read_colmap
 from completesplat.data.captures.transforms_json import read_polycam, read_transforms
-from completesplat.data.images.crop import cut_square
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
-from completesplat.data.placement import (
-    OBJECT_HALF_SIZE,
-    ObjectFraming,
-    from_cameras,
-    from_points,
-    placed_sequence,
-    square_of,
-    upright_axes,
-)
+from completesplat.data.placement import ObjectFraming, from_cameras, from_points, placed_sequence, upright_axes
 from completesplat.data.sequences import SPLITS, MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import MissingFile, refused_to
-from completesplat.errors import DataError, errors_at
+from completesplat.errors import DataError, MissingFile, errors_at, refused_to
 from completesplat.settings.schema import Range
 
 logger = logging.getLogger(__name__)
@@ -92,7 +82,7 @@ def read_captures(folders: Mapping[str, Path]) -> tuple[dict[str, Capture], list
     """Read the captures in some of the folders, by name; return also the errors of those that cannot be read."""
     captures, refused = dict[str, Capture](), list[DataError]()
     for name, folder in folders.items():
-        with refused_to(refused.append), errors_at(sequence=name):
+        with refused_to(refused.append, sequence=name):
             capture = read_capture(folder)
             if capture is not None:
                 captures[name] = capture
@@ -160,23 +150,21 @@ class CaptureSource(SequenceSource):
                 logger.warning("%s: %d of %d points are %s", name, lost, len(points), beyond)
             points = points[distance <= FARTHEST_USED]
         numbers = self._members(len(capture.frames))
-        read = partial(_read, name, [capture.frames[number] for number in numbers], self.framing.image_size)
-        scale = OBJECT_HALF_SIZE / placement.half_size
+        read = partial(_read, name, [capture.frames[number] for number in numbers], self.framing)
         center, moved = placement.center, torch.eye(4, dtype=torch.float64)
         moved[:3, 3] = center
         selected = [replace(cameras[i], world_to_camera=cameras[i].world_to_camera @ moved) for i in numbers]
         placement = placement._replace(center=torch.zeros_like(center))
         sequence = placed_sequence(name, numbers, selected, placement, self.framing, read)
-        seeds = None if points is None else (scale * (torch.from_numpy(points) - center)).float()
+        seeds = None if points is None else (sequence.scale * (torch.from_numpy(points) - center)).float()
         photos = tuple(capture.frames[number].image.name for number in numbers)
-        return replace(sequence, points=seeds, scale=scale, origin=tuple(center.tolist()), photos=photos)
+        return replace(sequence, points=seeds, origin=tuple(center.tolist()), photos=photos)
 
 
-def _read(name: str, frames: list[CapturedFrame], size: int, index: int) -> MaskedImage:
+def _read(name: str, frames: list[CapturedFrame], framing: ObjectFraming, index: int) -> MaskedImage:
     with errors_at(sequence=name):
         image, mask = frames[index].read()
-        square = square_of(frames[index].camera())
-        return MaskedImage(cut_square(image, square, size), cut_square(mask, square, size))
+        return framing.cut(frames[index].camera(), image, mask)
 
 
 class CaptureDataModule(ObjectDataModule):

@@ -17,9 +17,6 @@ from completesplat.data.images.exif import ORIENTATION, read_exif
 from completesplat.data.images.files import stored_size
 from completesplat.data.images.photograph import read_photograph
 from completesplat.data.validation import (
-    BadAnnotation,
-    BadCamera,
-    TooFewFrames,
     field,
     finite_array,
     path_below,
@@ -28,7 +25,7 @@ from completesplat.data.validation import (
     require_file,
     require_rotation,
 )
-from completesplat.errors import CompleteSplatError, errors_at
+from completesplat.errors import BadAnnotation, BadCamera, CompleteSplatError, TooFewFrames, errors_at
 from completesplat.geometry.cameras import Cameras, crop_resize
 from completesplat.scene import Views
 from completesplat.tensors import stack

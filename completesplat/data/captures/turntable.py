@@ -24,16 +24,8 @@ from completesplat.data.captures.turn_checks import Turn, examine, write_sheet
 from completesplat.data.images import files
 from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.photograph import without_background
-from completesplat.data.validation import (
-    BadAnnotation,
-    BadImage,
-    MissingFile,
-    TooFewFrames,
-    field,
-    read_json,
-    refused_to,
-)
-from completesplat.errors import DataError, ImageError, errors_at
+from completesplat.data.validation import field, read_json
+from completesplat.errors import BadAnnotation, BadImage, DataError, ImageError, MissingFile, TooFewFrames, refused_to
 from completesplat.files import counted, writing
 from completesplat.geometry.cameras import Cameras, invert_rigid, look_at, mirror
 from completesplat.settings.schema import Range
@@ -102,7 +94,7 @@ def _write_turns(folders: Mapping[str, Path], out: Path, settings: TurntableSett
     counts = read_json(Path(count)) if isinstance(count, str) else dict.fromkeys(folders, count)
     turns, refused = dict[str, Turn](), list[DataError]()
     for name, photos in track(folders.items(), "turns"):
-        with refused_to(refused.append), errors_at(sequence=name):
+        with refused_to(refused.append, sequence=name):
             known = None if count is None else field(counts, name, int)
             if known is not None and known < FEWEST_PHOTOS:
                 raise BadAnnotation(f"photos_of_a_turn: {known}; a turn needs at least {FEWEST_PHOTOS}")

@@ -10,18 +10,8 @@ import torch
 from jaxtyping import Float
 
 from completesplat.data.images.files import MOST_PIXELS
-from completesplat.data.validation import (
-    BadAnnotation,
-    BadCamera,
-    Refuse,
-    field,
-    finite_array,
-    path_below,
-    read_json,
-    refused_to,
-    require_rotation,
-)
-from completesplat.errors import errors_at
+from completesplat.data.validation import field, finite_array, path_below, read_json, require_rotation
+from completesplat.errors import BadAnnotation, BadCamera, Refuse, errors_at, refused_to
 from completesplat.geometry.cameras import Cameras
 
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up), and back.
@@ -67,7 +57,7 @@ def read_videos(root: Path, path: Path, refuse: Refuse) -> dict[str, CO3DVideo]:
     """
     videos: dict[str, CO3DVideo] = {}
     for name, entry in _entries(path, refuse):
-        with refused_to(refuse), errors_at(path, name):
+        with refused_to(refuse, path, name):
             if name in videos:
                 raise BadAnnotation("the sequence is annotated twice")
             quality = _optional_number(entry, "viewpoint_quality_score")
@@ -92,7 +82,7 @@ def read_frames(root: Path, path: Path, wanted: Callable[[str, int], bool], refu
     """Read those frames in `frame_annotations.jgz` that are `wanted`, by sequence and number; see `read_videos`."""
     frames: Frames = {}
     for name, entry in _entries(path, refuse):
-        with refused_to(refuse), errors_at(path, name):
+        with refused_to(refuse, path, name):
             number = field(entry, "frame_number", int)
             if wanted(name, number):
                 with errors_at(frame=number):

@@ -9,8 +9,7 @@ from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
 from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
-from completesplat.data.validation import MissingFile
-from completesplat.errors import DataError
+from completesplat.errors import DataError, MissingFile
 from completesplat.settings.schema import Natural, Positive, Range, Share
 
 

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from completesplat.data.co3d.annotations import CO3DFrame
 from completesplat.data.co3d.splits import SplitMembers
-from completesplat.data.images.crop import Square, cut_square
+from completesplat.data.images.crop import Square
 from completesplat.data.images.files import decode_image, read_depth
 from completesplat.data.placement import (
-    OBJECT_HALF_SIZE,
     Axes,
     ObjectFraming,
     Placement,
@@ -27,8 +26,8 @@ from completesplat.data.placement import (
     upright_axes,
 )
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
-from completesplat.data.validation import BadImage, read_points
-from completesplat.errors import DataError, errors_at
+from completesplat.data.validation import read_points
+from completesplat.errors import BadImage, DataError, errors_at
 from completesplat.geometry.cameras import pixel_centers, unproject
 
 DEPTH_MAPS = 8
@@ -133,17 +132,15 @@ class CO3DSource(SequenceSource):
         placement = object_placement(members.point_clouds[name], frames, members.captured[name])
         numbers, cameras = [frame.number for frame in frames], [frame.camera for frame in frames]
         with errors_at(self._files[0]):
-            read = partial(_read, name, frames, size)
+            read = partial(_read, name, frames, self.framing)
             sequence = placed_sequence(name, numbers, cameras, placement, self.framing, read)
         if not any(frame.depth for frame in frames):
             return sequence
-        factor = OBJECT_HALF_SIZE / placement.half_size
-        return replace(sequence, read_depth=partial(_read_depth, name, frames, size, factor))
+        return replace(sequence, read_depth=partial(_read_depth, name, frames, size, sequence.scale))
 
 
-def _read(name: str, frames: list[CO3DFrame], size: int, index: int) -> MaskedImage:
-    frame = frames[index]
-    square, image_size = square_of(frame.camera), frame.camera.image_size
+def _read(name: str, frames: list[CO3DFrame], framing: ObjectFraming, index: int) -> MaskedImage:
+    frame, image_size = frames[index], frames[index].camera.image_size
     with errors_at(sequence=name, frame=frame.number):
         image = decode_image(frame.image, str(frame.image), "RGB", image_size)
         mask = decode_image(frame.mask, str(frame.mask), "L", image_size)
@@ -151,7 +148,7 @@ def _read(name: str, frames: list[CO3DFrame], size: int, index: int) -> MaskedIm
         for path, part, fault in ((frame.image, image, "is black everywhere"), (frame.mask, mask, "shows no object")):
             if part.getbbox() is None:
                 raise BadImage(fault, str(path))
-        return MaskedImage(cut_square(image, square, size), cut_square(mask, square, size))
+        return framing.cut(frame.camera, image, mask)
 
 
 def _read_depth(name: str, frames: list[CO3DFrame], size: int, factor: float, index: int) -> Float[Tensor, "1 _ _"]:

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from completesplat.data.co3d.annotations import CO3DFrame, CO3DVideo, Frames, read_frames, read_videos
 from completesplat.data.sequences import SPLITS, overlaps, shared_names, split_by_hash
-from completesplat.data.validation import BadAnnotation, SharedSequences, field, path_below, read_json, refused_to
-from completesplat.errors import DataError, errors_at
+from completesplat.data.validation import field, path_below, read_json
+from completesplat.errors import BadAnnotation, DataError, SharedSequences, errors_at, refused_to
 
 Listed = dict[str, set[tuple[str, int]]]
 """(sequence name, frame number) of each split."""
@@ -55,7 +55,7 @@ def read_set_list(path: Path, refused: list[DataError]) -> Listed:
             members = field(content, split, list)
         splits[split] = set()
         for member in members:
-            with refused_to(refused.append), errors_at(path):
+            with refused_to(refused.append, path):
                 if type(member) is not list or [type(part) for part in member[:2]] != [str, int]:
                     raise BadAnnotation(f"{split} has {str(member)[:80]}, [sequence name, number, path] is expected")
                 splits[split].add((member[0], member[1]))

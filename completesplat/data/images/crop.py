@@ -8,7 +8,7 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from completesplat.data.validation import BadCamera
+from completesplat.errors import BadCamera
 
 
 class Square(NamedTuple):

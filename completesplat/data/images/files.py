@@ -14,8 +14,8 @@ from PIL import Image, ImageFile, UnidentifiedImageError
 from torch import Tensor
 
 from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, Tags, read_exif
-from completesplat.data.validation import BadImage, require_file
-from completesplat.errors import ImageError
+from completesplat.data.validation import require_file
+from completesplat.errors import BadImage, ImageError
 from completesplat.files import by_numbers
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")

@@ -102,13 +102,13 @@ def _square(
     file, exif = _loaded(source)
     seen = files.turn_upright(file, exif.get(ORIENTATION))
     if object_share is None:
-        seen = seen.crop(_central_square(*seen.size))
+        seen = _central_square(seen, min(seen.size))
     if remove_background:
         if seen.mode not in files.EIGHT_BIT_MODES:
             raise ImageError(f"colour mode {seen.mode} goes without background=remove")
         seen = without_background(_to_srgb(seen, background))
     if object_share is not None:
-        seen = _around_object(seen, object_share) or seen.crop(_central_square(*seen.size))
+        seen = _around_object(seen, object_share) or _central_square(seen, min(seen.size))
     return _to_tensor(seen, file, size, background), crop_fov(exif, file.size)
 
 
@@ -154,16 +154,13 @@ def _around_object(image: Image.Image, share: float) -> Image.Image | None:
         raise ImageError("nothing but transparency")
     cut_out = cut_out.crop(box)
     cut_out = cut_out.reduce(-(-max(cut_out.size) // LARGEST_OBJECT))
-    side = round(max(cut_out.size) / share)
-    left, top = (cut_out.width - side) // 2, (cut_out.height - side) // 2
-    return cut_out.crop((left, top, left + side, top + side))
+    return _central_square(cut_out, round(max(cut_out.size) / share))
 
 
-def _central_square(width: int, height: int) -> tuple[int, int, int, int]:
-    """Return left, upper, right and lower edge."""
-    side = min(width, height)
-    left, top = (width - side) // 2, (height - side) // 2
-    return left, top, left + side, top + side
+def _central_square(image: Image.Image, side: int) -> Image.Image:
+    """Crop the square in the middle, which may extend beyond the image."""
+    left, top = (image.width - side) // 2, (image.height - side) // 2
+    return image.crop((left, top, left + side, top + side))
 
 
 def _pixels(image: np.ndarray | Tensor) -> Image.Image:

@@ -25,9 +25,8 @@ from completesplat.data.packed.manifest import Scalar, is_packed, settings_must_
 from completesplat.data.packed.source import PackedSource, local_root
 from completesplat.data.placement import ObjectFraming
 from completesplat.data.sequences import PosedSequence, SequenceSource
-from completesplat.data.validation import TooFewFrames
 from completesplat.data.validation.processes import usable_cores
-from completesplat.errors import CompleteSplatError, DataError, errors_at
+from completesplat.errors import CompleteSplatError, DataError, TooFewFrames, errors_at
 from completesplat.files import counted
 from completesplat.settings.schema import Natural, Positive, Range, Share, Side, check_value, hints_of
 

@@ -18,8 +18,16 @@ from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, re
 from completesplat.data.packed.source import OpenShard
 from completesplat.data.packed.writing import UNFINISHED
 from completesplat.data.sequences import SequenceSource
-from completesplat.data.validation import BadAnnotation, ChangedFile, MissingFile, UnreadableFile, require_file
-from completesplat.errors import CompleteSplatError, DataError, errors_at
+from completesplat.data.validation import require_file
+from completesplat.errors import (
+    BadAnnotation,
+    ChangedFile,
+    CompleteSplatError,
+    DataError,
+    MissingFile,
+    UnreadableFile,
+    errors_at,
+)
 from completesplat.files import atomic_path, write_text
 from completesplat.scene import CachedScene
 from completesplat.version import __version__

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from completesplat.data.validation import BadAnnotation, UnreadableFile, field, parsed, read_json
-from completesplat.errors import DataError, errors_at
+from completesplat.data.validation import field, parsed, read_json
+from completesplat.errors import BadAnnotation, DataError, UnreadableFile, errors_at
 
 MANIFEST = "manifest.json"
 HEADER = {"format": 2}

@@ -15,8 +15,7 @@ from torch import Tensor
 from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.files import image_bytes
 from completesplat.data.sequences import MaskedImage, PosedSequence
-from completesplat.data.validation import BadAnnotation, BadImage, ChangedFile, UnreadableFile
-from completesplat.errors import errors_at
+from completesplat.errors import BadAnnotation, BadImage, ChangedFile, UnreadableFile, errors_at
 from completesplat.geometry.cameras import Cameras, crop_resize
 
 # Pillow's arguments by codec. BMP is uncompressed: more than twice the bytes of PNG, decoded in a ninth of the time.

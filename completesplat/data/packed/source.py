@@ -15,15 +15,8 @@ from filelock import FileLock
 from completesplat.data.packed.manifest import MANIFEST, Shard, read_manifest
 from completesplat.data.packed.rows import SCHEMA, from_row
 from completesplat.data.sequences import PosedSequence, SequenceSource
-from completesplat.data.validation import (
-    BadAnnotation,
-    ChangedFile,
-    MissingFile,
-    UnreadableFile,
-    path_below,
-    require_file,
-)
-from completesplat.errors import DataError, errors_at
+from completesplat.data.validation import path_below, require_file
+from completesplat.errors import BadAnnotation, ChangedFile, DataError, MissingFile, UnreadableFile, errors_at
 from completesplat.files import atomic_path, write_bytes
 from completesplat.weights import sha256_of
 

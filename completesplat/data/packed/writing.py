@@ -28,9 +28,9 @@ from completesplat.data.packed.manifest import (
 )
 from completesplat.data.packed.rows import CODECS, SCHEMA, encode_image, to_row
 from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource
-from completesplat.data.validation import TooFewFrames, field, parsed, read_json, refused_to
+from completesplat.data.validation import field, parsed, read_json
 from completesplat.data.validation.processes import map_in_processes
-from completesplat.errors import CompleteSplatError, DataError, errors_at
+from completesplat.errors import CompleteSplatError, DataError, TooFewFrames, refused_to
 from completesplat.files import atomic_path, counted, write_json
 from completesplat.weights import sha256_of
 
@@ -84,7 +84,7 @@ class ShardWriter:
         with atomic_path(path, f"{path.name}{UNFINISHED}") as unfinished:
             with unfinished.open("wb") as stream, pa.ipc.new_stream(stream, SCHEMA) as writer:
                 for name in plan.names:
-                    with refused_to(partial(self._refuse, refused)), errors_at(sequence=name):
+                    with refused_to(partial(self._refuse, refused), sequence=name):
                         row = self._encode(self.sources[plan.split].read(name), refused)
                         writer.write_table(row)
                         names.append(name)
@@ -98,7 +98,7 @@ class ShardWriter:
     def _encode(self, sequence: PosedSequence, refused: list[Refusal]) -> pa.Table:
         usable, images = [], []
         for index, number in enumerate(sequence.frames):
-            with refused_to(partial(self._refuse, refused)), errors_at(frame=number, sequence=sequence.name):
+            with refused_to(partial(self._refuse, refused), frame=number, sequence=sequence.name):
                 images.append(encode_image(sequence, index, self.codec))
                 usable.append(index)
         if len(usable) < FEWEST_FRAMES:

@@ -20,21 +20,18 @@ from torch import Tensor
 
 from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.images.files import decode_image, stored_size
-from completesplat.data.validation import (
-    LARGEST,
-    ROTATION_TOLERANCE,
+from completesplat.data.validation import LARGEST, ROTATION_TOLERANCE, path_below, read_json, read_text, require_file
+from completesplat.errors import (
     BadAnnotation,
     BadCamera,
+    DataError,
     MissingFile,
+    TensorFileError,
     TooFewFrames,
     UnreadableFile,
-    path_below,
-    read_json,
-    read_text,
+    errors_at,
     refused_to,
-    require_file,
 )
-from completesplat.errors import DataError, TensorFileError, errors_at
 from completesplat.geometry.cameras import Cameras
 from completesplat.weights.checkpoint_reading import read_tensor_file
 
@@ -194,7 +191,7 @@ class ChunkedClips:
         self.refused: list[DataError] = []
         paths: dict[str, Path] = {}
         for key, name in index.items():
-            with refused_to(self.refused.append), errors_at(path, key):
+            with refused_to(self.refused.append, path, key):
                 paths[key] = path_below(folder, name)
         # `Path.is_file` raises if a name is too long.
         existing = {path for path in set(paths.values()) if isfile(path)}

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from completesplat.data.loading.view_selection import Choice
 from completesplat.data.sequences import PosedSequence, SequenceSource, first_names
-from completesplat.data.validation import BadAnnotation, read_json, read_text
-from completesplat.errors import DataError, errors_at
+from completesplat.data.validation import read_json, read_text
+from completesplat.errors import BadAnnotation, DataError, errors_at
 
 CONTEXT, TARGET, SCORED = "context", "target", "target_quantify"
 LINE = "KEY source target target target"

@@ -16,8 +16,8 @@ from completesplat.data.packed.manifest import Scalar
 from completesplat.data.realestate10k.clips import ChunkedClips, Clip, TextClips
 from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource, split_by_hash
-from completesplat.data.validation import refused_to, require_file
-from completesplat.errors import CompleteSplatError, DataError, errors_at
+from completesplat.data.validation import require_file
+from completesplat.errors import CompleteSplatError, DataError, errors_at, refused_to
 from completesplat.geometry.cameras import crop_resize
 from completesplat.settings.schema import Natural, Positive, Share
 from completesplat.tensors import stack
@@ -187,7 +187,7 @@ class RE10KDataModule(SceneDataModule):
         if self.index is not None:
             store, refused = self.store("test"), list[DataError]()
             for name in store.names:
-                with refused_to(refused.append), errors_at(sequence=name):
+                with refused_to(refused.append, sequence=name):
                     store.source.read(name)
             self.test_dataloader().account(refused, empty=len(refused) == len(store.names))
 

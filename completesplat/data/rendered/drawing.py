@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 
 from completesplat.data.captures.transforms_json import read_cameras
-from completesplat.data.validation import MissingFile, require_file
-from completesplat.errors import CompleteSplatError
+from completesplat.data.validation import require_file
+from completesplat.errors import CompleteSplatError, MissingFile
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
 
@@ -182,12 +182,8 @@ def draw_back(rng: np.random.Generator, first: Cameras, hidden: str) -> dict[str
     drawn = str(rng.choice(list(PAINTS), p=[paint.chance for paint in PAINTS.values()]))
     names = [drawn, *(name for name in PAINTS if name != drawn and hidden == "modes")]
     distance = first.centers.norm().item()
-    return {
-        "toward": (first.centers / distance).tolist(),
-        "least": 1 / distance,
-        "modes": names,
-        "colors": [PAINTS[name].color for name in names],
-    }
+    toward, colors = (first.centers / distance).tolist(), [PAINTS[name].color for name in names]
+    return {"toward": toward, "least": 1 / distance, "modes": names, "colors": colors}
 
 
 def textures_of(folder: Path) -> list[str]:

@@ -29,9 +29,9 @@ from completesplat.data.hidden_modes import in_mode
 from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
 from completesplat.data.rendered.drawing import PAINTS, RenderSettings, check_surroundings, draw_rendered_scene
-from completesplat.data.validation import MissingFile, UnreadableFile, read_points
+from completesplat.data.validation import read_points
 from completesplat.data.validation.processes import share_of, usable_cores
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import CompleteSplatError, DataError, MissingFile, UnreadableFile
 from completesplat.files import atomic_folder, counted, folder_names, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
 from completesplat.settings.schema import Natural, Positive, Range

@@ -8,7 +8,7 @@ from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS
 from completesplat.data.toy.writing import DESCRIPTION, ROOMS, SUBSET, DataSetSize, write
-from completesplat.data.validation import MissingFile
+from completesplat.errors import MissingFile
 from completesplat.settings.schema import Natural, Positive, Side
 
 OWN_PLACE = Path("outputs/data")

@@ -1,10 +1,8 @@
-"""Errors about bad input, one subclass of `DataError` for each kind, and the checks that raise them."""
+"""Checks of the files, names and numbers of a data set, which raise the subclasses of `DataError`."""
 
 import json
 import os
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import is_dataclass
 from gzip import GzipFile
 from pathlib import Path, PurePath, PureWindowsPath
@@ -14,7 +12,7 @@ from typing import Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 from jaxtyping import Float
 
-from completesplat.errors import DataError, PlyError
+from completesplat.errors import BadAnnotation, BadCamera, MissingFile, OutsidePath, PlyError, UnreadableFile
 from completesplat.files import SHORT, printable
 from completesplat.ply_files import read_vertices
 
@@ -27,56 +25,6 @@ ROTATION_TOLERANCE = 1e-3
 LARGEST = 2.0**60  # numbers whose squares float32 holds, too
 
 T = TypeVar("T")
-Refuse = Callable[[DataError], None]
-
-
-class MissingFile(DataError, kind="missing file"):
-    """File that an annotation or a layout requires, and that does not exist."""
-
-
-class OutsidePath(DataError, kind="path outside of the data"):
-    """Path in an annotation that leads out of the data's folder, or nowhere."""
-
-
-class UnreadableFile(DataError, kind="unreadable file"):
-    """File other than an image that is damaged, too large, unsafe to read or of another format."""
-
-
-class BadAnnotation(DataError, kind="malformed annotation"):
-    """Annotation without a required key, or with a value of another type or shape."""
-
-
-class BadCamera(DataError, kind="impossible camera"):
-    """Pose or intrinsics that no camera can have."""
-
-
-class BadImage(DataError, kind="unusable image"):
-    """Image, mask or depth map that is damaged, too large, of another size or ambiguous."""
-
-
-class BadPlacement(DataError, kind="object without a place"):
-    """Sequence whose object has an unknown position or size."""
-
-
-class TooFewFrames(DataError, kind="too few frames"):
-    """Sequence with too few (usable) frames."""
-
-
-class SharedSequences(DataError, kind="shared sequence"):
-    """List of training or validation sequences that contains test sequences."""
-
-
-class ChangedFile(DataError, kind="changed file"):
-    """File that has changed since its checksum was computed."""
-
-
-@contextmanager
-def refused_to(refuse: Refuse) -> Iterator[None]:
-    """Pass a DataError raised within the context to `refuse`, which may collect it or raise it."""
-    try:
-        yield
-    except DataError as error:
-        refuse(error)
 
 
 def require_file(path: Path) -> Path:

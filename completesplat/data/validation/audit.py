@@ -10,9 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from completesplat.data.sequences import SequenceSource, overlaps, shared_names
-from completesplat.data.validation import TooFewFrames, refused_to
 from completesplat.data.validation.processes import map_in_processes
-from completesplat.errors import DataError, errors_at
+from completesplat.errors import DataError, TooFewFrames, refused_to
 from completesplat.files import printable
 
 FEWEST_FRAMES = 2
@@ -163,13 +162,13 @@ def _read_batch(sources: Sources, batch: _Batch) -> list[_Sequence]:
 def _read(sources: Sources, name: str, splits: list[str]) -> _Sequence:
     sequence, seen = _Sequence(name), set[int]()
     for split in splits:
-        with refused_to(sequence.refused.append), errors_at(sequence=name):
+        with refused_to(sequence.refused.append, sequence=name):
             posed = sources[split].read(name)
             sequence.frames[split] = set(posed.frames)
             for index, frame in enumerate(posed.frames):
                 if frame not in seen:
                     seen.add(frame)
-                    with refused_to(sequence.refused.append), errors_at(sequence=name, frame=frame):
+                    with refused_to(sequence.refused.append, sequence=name, frame=frame):
                         posed.read(index)
                         sequence.usable.add(frame)
     return sequence

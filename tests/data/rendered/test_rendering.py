@@ -19,7 +19,6 @@ from support import SMALL, strict_json, waited_for
 
 from completesplat.data.co3d.annotations import read_frames
 from completesplat.data.images.files import read_depth
-from completesplat.data.rendered.blender import find_blender
 from completesplat.data.rendered.drawing import PAINTS
 from completesplat.data.rendered.rendering import RenderedDataModule, render
 from completesplat.errors import CompleteSplatError
@@ -33,10 +32,7 @@ HALF = 1 / np.sqrt(3)
 
 @pytest.fixture(scope="module", autouse=True)
 def blender() -> None:
-    try:
-        find_blender()
-    except CompleteSplatError as reason:
-        pytest.skip(str(reason))
+    meshes.need_blender()
 
 
 def off_center(width: int, height: int) -> list[Cameras]:

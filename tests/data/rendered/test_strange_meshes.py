@@ -9,10 +9,9 @@ import pytest
 from PIL import Image
 from support import strict_json
 
-from completesplat.data.rendered.blender import find_blender
 from completesplat.data.rendered.drawing import textures_of
 from completesplat.data.rendered.rendering import render
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import DataError
 from completesplat.ply_files import read_vertices
 
 QUICK = meshes.SETTINGS | {"views": 2, "size": 16, "samples": 1, "workers": 1}
@@ -20,10 +19,7 @@ QUICK = meshes.SETTINGS | {"views": 2, "size": 16, "samples": 1, "workers": 1}
 
 @pytest.fixture(scope="module")
 def blender() -> None:
-    try:
-        find_blender()
-    except CompleteSplatError as reason:
-        pytest.skip(str(reason))
+    meshes.need_blender()
 
 
 @pytest.fixture

@@ -119,11 +119,8 @@ def test_rays_end_at_the_first_thing_they_meet(index):
 def test_bare_white_walls_follow_lamberts_law():
     full, frame = scene(2), 59
     room, height, width = full.room, 32, 58
-    bare = room._replace(
-        textures=np.zeros_like(room.textures),
-        colors=np.ones_like(room.colors),
-        decals=np.full_like(room.decals, -1),
-    )
+    white, none = np.ones_like(room.colors), np.full_like(room.decals, -1)
+    bare = room._replace(textures=np.zeros_like(room.textures), colors=white, decals=none)
     empty = full._replace(room=bare, shapes=moved_away(full.shapes))
     points = seen_points(empty, frame, height, width)
     middle = points - [0, room.size[1] / 2, 0]
