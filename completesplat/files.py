@@ -138,7 +138,9 @@ def file_refusal(error: BaseException) -> CompleteSplatError | None:
     if not isinstance(error, OSError) or not isinstance(name := error.filename2 or error.filename, str):
         return None
     if error.errno in BAD_NAME:
-        return CompleteSplatError(f"{printable(name)}: cannot be used: {error.strerror}; choose another name")
+        return CompleteSplatError(
+            f"{printable(name)}: cannot be used: {error.strerror}; choose another name or out=DIR"
+        )
     return _disk_error(error, Path(name)) if error.errno in {*NO_SPACE, errno.EROFS} else None
 
 

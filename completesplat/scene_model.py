@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -221,7 +222,8 @@ class SceneModel(nn.Module):
         if self.background is None:
             return read_photograph(image, self.image_size, fov_degrees, typical, remove_background)
         known = typical if fov_degrees is None else fov_degrees
-        return read_photograph(image, self.image_size, known, known, remove_background, self.background, OBJECT_SHARE)
+        photo = read_photograph(image, self.image_size, known, known, remove_background, self.background, OBJECT_SHARE)
+        return photo if fov_degrees is not None else replace(photo, fov_source="default")
 
     def camera(self, photograph: Photograph) -> Cameras:
         """Return the camera that took a photo, at the origin of the world."""

@@ -1,11 +1,11 @@
 """The weights that come with the package: whole, small, and better than guessing on scenes never seen."""
 
-import os
 from pathlib import Path
 
 import pytest
 import skimage
 import torch
+from PIL import Image
 from support import strict_json
 
 from completesplat.data.toy.module import ToyObjectsDataModule
@@ -55,9 +55,18 @@ def test_a_photo_of_anything_keeps_its_front_and_gets_depth():
     assert depth[48:80, 48:80].mean() < depth[:12].mean() - 0.3
 
 
+def test_weights_of_objects_take_a_photo_as_of_their_own_field_of_view(tmp_path):
+    model, exif = CompleteSplat.from_pretrained(FRUITS), Image.Exif()
+    exif.get_ifd(0x8769)[41989] = 26  # focal length in 35 mm film
+    Image.new("RGB", (40, 40), "white").save(tmp_path / "a.jpg", exif=exif)
+    photo = model.read(tmp_path / "a.jpg")
+    assert (photo.fov_degrees, photo.fov_source) == (model.fov_degrees.item(), "default")
+    assert model.read(tmp_path / "a.jpg", 30).fov_source == "given"
+
+
 def test_samples_fit_the_image_they_are_drawn_for(tmp_path, monkeypatch):
     """Two scenes of another seed than training's: the reference view is met, the naive answers are beaten."""
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # so that no process has to be started
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0}, raising=False)  # so that no process has to be started
     size = {"scenes": 20, "frames": 4, "image_size": 64}
     data = ToyObjectsDataModule(str(tmp_path), make=True, **size, data_seed=77, evaluation_batch_size=2)
     data.prepare_data()

@@ -64,7 +64,9 @@ def _images_of(path: Path) -> list[Path]:
         return [path]
     try:
         files = path.iterdir() if folder else map(Path, glob(str(path), recursive=True))
-        images = sorted(file for file in files if file.suffix.lower() in SUFFIXES and file.is_file())
+        # Archives of macOS have a file `._NAME` for each file.
+        named = (file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith("._"))
+        images = sorted(file for file in named if file.is_file())
     except OSError as error:
         raise CompleteSplatError(f"{path}: {error.strerror}") from error
     if not images:

@@ -38,8 +38,7 @@ def run(config: DictConfig, out: Path) -> None:
     from completesplat.viewer.access import start_server, stop_server
 
     config.update(setting_of_path(Path(config.path)) if config.path is not None else {})
-    if (shown := config.scene or config.watch) is not None and (config.image is not None or config.weights != AUTO):
-        raise CompleteSplatError(f"{shown}: is shown as it is; image= and weights= are for new scenes")
+    _check_asked(config)
     own_files = (config.image, config.scene) != (None, None) or config.weights not in (AUTO, *shipped())
     server = start_server(0 if config.export is not None else config.port)
     address, page, step = f"{server.address} (Ctrl-C ends it)", None, None
@@ -60,6 +59,14 @@ def run(config: DictConfig, out: Path) -> None:
             raise
     finally:
         stop_server(server) if page is None else page.close()
+
+
+def _check_asked(config: DictConfig) -> None:
+    if config.export is not None and Path(config.export).suffix.lower() != ".html":
+        raise CompleteSplatError(f"export={config.export}: a page is written, so give a name such as export=page.html")
+    shown = config.watch if config.scene is None else config.scene
+    if shown is not None and (config.image is not None or config.weights != AUTO):
+        raise CompleteSplatError(f"{shown}: is shown as it is; image= and weights= are for new scenes")
 
 
 def setting_of_path(path: Path) -> dict[str, str]:

@@ -110,13 +110,13 @@ def spread_places(count: int, most: int | None) -> list[int]:
     return [(2 * part + 1) * count // (2 * most) for part in range(most)]
 
 
-def split_by_hash(names: Sequence[str], fraction: float, seed: int) -> tuple[list[str], list[str]]:
+def split_by_hash(names: Sequence[str], fraction: float, seed: int, kept: int = 0) -> tuple[list[str], list[str]]:
     """Return training and held-out sequences in the order of `names`.
 
     A sequence's side depends only on its name and the seed, so it does not change when sequences are added. If no
-    sequence would be held out, the one with the smallest hash is.
+    sequence would be held out, the one with the smallest hash is; `kept` ones with the largest hashes never are.
     """
     position = {name: int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8]) / 2**64 for name in names}
-    held_out = {name for name in names if position[name] < fraction}
-    held_out = held_out or set(sorted(names, key=position.__getitem__)[:1])
+    count = max(1, sum(position[name] < fraction for name in names))
+    held_out = set(sorted(names, key=position.__getitem__)[: min(count, max(0, len(names) - kept))])
     return [name for name in names if name not in held_out], [name for name in names if name in held_out]

@@ -62,6 +62,7 @@ def test_a_folder_is_its_images_sorted(tmp_path):
     (folder / "same.png").symlink_to("a.PNG")
     (folder / "notes.txt").write_text("no image")
     images = [folder / name for name in ("a.PNG", "b.jpg", "same.png")]
+    (folder / "._a.png").touch()  # as in archives of macOS
     assert find_images(str(folder)) == images
     assert find_images([str(single), str(folder)]) == [single, *images]
     assert find_images(f"{folder}/*") == find_images(f"{tmp_path}/**/[ab]*.*") + images[2:] == images

@@ -198,3 +198,11 @@ def test_an_offline_page_is_written_from_a_scene_and_of_what_is_drawn(command, p
     refused = command("view", pipeline.weights, "export=other.html", out)
     assert (refused.status, "there is nothing to export" in refused.err) == (2, True)
     assert not (tmp_path / "other.html").exists()
+
+
+@pytest.mark.parametrize("name", ["photo.png", "scene.ply", "page", ""])
+def test_a_page_is_not_written_over_a_file_that_is_none(command, tmp_path, name):
+    (tmp_path / "scene.ply").touch()
+    refused = command.refuses("view", "scene.ply", f"export={name}")
+    assert refused == f"export={name}: a page is written, so give a name such as export=page.html"
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["scene.ply"]

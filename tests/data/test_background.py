@@ -1,6 +1,7 @@
 """Objects cut out of their background by a stand-in for rembg, hidden parts, and what tells images of a kind apart."""
 
 import sys
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -159,6 +160,13 @@ def test_boxes_and_masks_that_are_none_are_refused(photos, tmp_path):
         with pytest.raises(CompleteSplatError, match="box="):
             outside_of_box(first, box, 32)
     Image.new("L", (32, 32)).save(tmp_path / "black.png")
+    Image.new("L", (32, 32), 255).save(tmp_path / "white.png")
+    Image.new("L", (32, 64), 255).save(tmp_path / "tall.png")
+    for hide in (partial(outside_of_mask, mask=tmp_path / "white.png"), partial(outside_of_box, box=(0, 0, 1, 1))):
+        with pytest.raises(CompleteSplatError, match="the whole photo is hidden"):
+            hide(first, size=32)
+    with pytest.raises(CompleteSplatError, match=r"tall.png: 32 x 64 pixels, another shape than the photo's"):
+        outside_of_mask(first, tmp_path / "tall.png", 32)
     with pytest.raises(CompleteSplatError, match=r"black.png: hides nothing"):
         outside_of_mask(first, tmp_path / "black.png", 32)
     with pytest.raises(ImageError, match=r"nowhere.png: no such file"):

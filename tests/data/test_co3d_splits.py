@@ -73,6 +73,9 @@ def test_sequences_stay_in_their_split_when_others_come(tmp_path):
 def test_three_sequences_are_one_for_each_split_and_fewer_are_refused(tmp_path):
     annotate(tmp_path / "3", many(3))
     assert [len(taken) for taken in names(read(tmp_path / "3", None, SeededSplit(0, 0, 0))).values()] == [1, 1, 1]
+    for seed in range(30):  # none is empty, whatever the hashes are
+        parts = read(tmp_path / "3", None, SeededSplit(0.05, 0.3, seed))
+        assert [len(taken) for taken in names(parts).values()] == [1, 1, 1]
     annotate(tmp_path / "2", many(2))
     with pytest.raises(DataError, match="2 objects cannot be split"):
         read(tmp_path / "2", subset=None)

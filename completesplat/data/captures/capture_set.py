@@ -64,7 +64,7 @@ class CaptureSetDataModule(ObjectDataModule):
         root: folder of the captures, or prepared captures.
         splits: file with the captures of each split (`read_splits`); None: `splits.json` in `root`, or, if it does not
             exist, a seeded split of the objects.
-        val_fraction, test_fraction, split_seed: see `SeededSplit`.
+        val_fraction, test_fraction, split_seed: shares of the objects by seed, at least one in each split.
         **settings: of `ObjectDataModule`.
     """
 

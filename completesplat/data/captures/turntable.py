@@ -202,7 +202,7 @@ def _read_photo(path: Path, background: str | None) -> Photo:
         mask = image.getchannel("A")
         share = np.mean(np.asarray(mask) > 127)
         if not 0 < share <= FULL:
-            fault = "fills the photo; background=white or remove finds the object" if share else "is empty"
+            fault = "fills the photo; another background (white, remove) may find the object" if share else "is empty"
             raise ImageError(f"background={'null' if background is None else background}: its mask {fault}")
         return files.over_grey(image, 1.0), mask
 

@@ -22,7 +22,7 @@ class CO3DDataModule(ObjectDataModule):
         subset: name of the set list that splits the frames (Splatter Image: `fewview_dev`); None: split by seed.
         allow_shared_sequences: accept a set list that tests on sequences of training or validation. CO3D's
             `fewview_train` does, and so do all lists that divide the frames of a sequence (`manyview_...`).
-        val_fraction, test_fraction, split_seed: see `SeededSplit`.
+        val_fraction, test_fraction, split_seed: shares of the sequences by seed, at least one in each split.
         min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences: see `Filters`.
         depth_before, depth_after: see `ObjectDataModule` (Splatter Image: 2 and 2, for masked objects; not stated by
             the paper for full images).

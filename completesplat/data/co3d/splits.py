@@ -10,6 +10,7 @@ from completesplat.data.co3d.annotations import CO3DFrame, CO3DVideo, Frames, re
 from completesplat.data.sequences import SPLITS, overlaps, shared_names, split_by_hash
 from completesplat.data.validation import field, path_below, read_json
 from completesplat.errors import BadAnnotation, DataError, SharedSequences, errors_at, refused_to
+from completesplat.files import counted
 
 Listed = dict[str, set[tuple[str, int]]]
 """(sequence name, frame number) of each split."""
@@ -93,10 +94,12 @@ def remove_test_sequences(path: Path, listed: Listed, rule: SeededSplit) -> tupl
 def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Listed:
     """Split at least three sequences by seed, each as a whole; a `test_fraction` of 1 tests all, however many."""
     if len(frames) < 3 and rule.test_fraction < 1:
-        raise DataError(f"{len(frames)} objects cannot be split into train, val and test; write a list of splits")
-    rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.split_seed)
+        objects = counted(len(frames), "object")
+        raise DataError(f"{objects} cannot be split into train, val and test; write a list (data.splits=FILE)")
+    kept = 1 if rule.test_fraction < 1 else 0  # at least, in training and in validation
+    rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.split_seed, 2 * kept)
     # The hashes of the remaining names lie above the test fraction; validation gets the next interval.
-    train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.split_seed)
+    train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.split_seed, kept)
     names = {"train": train, "val": val, "test": test}
     return {split: {(name, number) for name in names[split] for number in frames[name]} for split in SPLITS}
 

@@ -30,6 +30,7 @@ SMALLEST_SIDE = 8
 FOVS = 0.1, 179  # degrees; float32 holds neither the focal lengths nor the depths of others
 DEEP_GREY_MODES = (*files.SIXTEEN_BIT_MODES, "I", "F")
 LARGEST_OBJECT = 4096  # pixels; larger ones are reduced before they are padded to a square of unbounded size
+SAME_SHAPE = 0.02  # largest difference between the side ratios of a photo and its mask
 LANCZOS_REACH = 3  # radius of the filter, in pixels of the coarser image
 # Networks of rembg under Apache 2.0, the best first (DIS, U2-Net, its small form); its default forbids commercial use.
 CUTTERS = ("isnet-general-use", "u2net", "u2netp")
@@ -308,6 +309,10 @@ def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[T
 def outside_of_mask(photograph: Path, mask: Path, size: int) -> Float[Tensor, "1 size size"]:
     """Return the same for a mask image, which is white where the photo is hidden, and is cropped like the photo."""
     hidden = read_photograph(mask, square_side(photograph), background=0.0).image.mean(0).numpy() > 0.5
+    with Image.open(photograph) as image, Image.open(mask) as given:
+        ratios = [max(size) / min(size) for size in (image.size, given.size)]  # EXIF may turn one of them
+        if abs(ratios[0] / ratios[1] - 1) > SAME_SHAPE:
+            raise CompleteSplatError(f"{mask}: {given.width} x {given.height} pixels, another shape than the photo's")
     if not hidden.any():
         raise CompleteSplatError(f"{mask}: hides nothing; a mask is white where the photograph is hidden")
     return visible_pixels(hidden, size)
@@ -326,6 +331,8 @@ def visible_pixels(hidden: Bool[np.ndarray, "side side"], size: int) -> Float[Te
     """
     for _ in range(2):
         hidden = _touched(hidden, size).T
+    if hidden.all():
+        raise CompleteSplatError("the whole photo is hidden; a mask is white in the hidden part and black elsewhere")
     return torch.from_numpy(~hidden).float()[None]
 
 

@@ -65,7 +65,10 @@ def _start(contents: bytes) -> None:
     global _function
     end_with_parent()
     torch.set_num_threads(1)  # There is one process for each core.
-    _function = pickle.loads(contents)  # written by the parent process
+    try:
+        _function = pickle.loads(contents)  # written by the parent process
+    except Interrupted as stop:
+        os._exit(128 + stop.signal)  # else the pool would print where it was interrupted
 
 
 def _call(item: object) -> object:

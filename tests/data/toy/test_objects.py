@@ -1,6 +1,5 @@
 import gzip
 import json
-import os
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -141,7 +140,7 @@ def test_colours_of_marked_minis_come_as_often_as_the_nose_says(mark, marked):
 
 
 def test_hidden_modes_of_written_minis_are_known_with_their_probabilities(tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # so that no process has to be started
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0}, raising=False)  # so that no process has to be started
     data = ToyObjectsDataModule(str(tmp_path), 6, 12, category="toy_marked_minis", make=True, image_size=32)
     data.prepare_data()
     scenes = data.hidden_modes(views=2, spread_views=2)
