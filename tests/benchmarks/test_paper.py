@@ -23,9 +23,8 @@ QUICK = [
 
 @pytest.mark.slow
 def test_both_stages_are_measured_written_and_printed(command, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "os.sched_getaffinity", lambda _: {0}, raising=False
-    )  # starting workers costs more than writing a few images
+    # Starting workers costs more than writing a few images.
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0}, raising=False)
     monkeypatch.setattr(paper, "WARM_UP", 0)
     finished = command.succeeds(*QUICK, f"out={tmp_path / 'out'}")
     results = strict_json(tmp_path / "out/paper.json")
