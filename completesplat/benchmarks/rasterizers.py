@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,9 +20,11 @@ from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unpr
 from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.selection import FASTER, failure
-from completesplat.settings.schema import Positive
+from completesplat.settings.schema import Entries, Positive
 from completesplat.training.scoring import synchronized_time
 from completesplat.training.steps import DISTANCE, FOV_DEGREES, cameras_on_orbit, peak_megabytes
+
+Sizes = Annotated[Sequence[Positive], Entries(1)]
 
 BACKENDS = {"reference": ReferenceRasterizer, **FASTER}
 LONGEST_SECONDS = 4.0  # a backend that has run this long on a workload does not repeat it
@@ -46,7 +48,7 @@ class Backend(NamedTuple):
 
 
 def run(
-    backends: Sequence[str], sizes: Sequence[Positive], views: Sequence[Positive], repeats: Positive,
+    backends: Annotated[Sequence[str], Entries(1)], sizes: Sizes, views: Sizes, repeats: Positive,
     constants: Mapping[str, object], out: Path,
 ) -> None:  # fmt: skip
     """Time the rasterizers, write `rasterizers.json`, and print tables.
@@ -59,6 +61,8 @@ def run(
     with Console(stderr=True).status("compiling") as status:
         shared = instantiate(constants)
         working, absent = working_backends(backends, shared)
+        if not working:
+            raise CompleteSplatError("; ".join(f"{name}: not measured, because {why}" for name, why in absent.items()))
         quieten()
         tick = lambda text: status.update(f"timing {text}")  # noqa: E731
         rows = speed_rows(working, sizes, views, repeats, tick)

@@ -126,6 +126,7 @@ def refusal(error: BaseException) -> str | None:
     elif isinstance(error, MissingMandatoryValue | InterpolationToMissingValueError):
         named = str(error).partition("Missing mandatory value: ")[2].split()  # OmegaConf has it nowhere else
         key = error.full_key if isinstance(error, MissingMandatoryValue) else named[0]
+        key = (key or "").removeprefix("task.")  # whose settings are given without
         message = f"{key} is needed: give {key}=VALUE"
     elif isinstance(error, InstantiationException):
         message = _of_a_part(error)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import write_json
 from completesplat.settings.schema import Entries, Positive, Range
+from completesplat.weights import RUN_CHECKPOINT
 
 logger = logging.getLogger(__name__)
 
@@ -105,7 +106,8 @@ def latents(
     from completesplat.training.stopping import stopped_together
     from completesplat.weights.checkpoint_reading import load_part
 
-    run_config = config_of_run(Path(ckpt), list(overrides), trust)
+    ckpt = Path(ckpt, RUN_CHECKPOINT) if Path(ckpt).is_dir() else Path(ckpt)
+    run_config = config_of_run(ckpt, list(overrides), trust)
     autoreconstructor = instantiate(run_config.model.get("model"), _convert_="all")
     if not isinstance(autoreconstructor, VariationalAutoReconstructor):
         raise WeightsError(f"{ckpt}: not of stage 1, which trains an autoreconstructor (model=var)")

@@ -145,7 +145,7 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
         with ended_by_signals(), _recorded(*recorded) if first else nullcontext():
             for key in ("checkpoint", "autoreconstructor_checkpoint"):
                 # The path may refer to the job's choices (`hydra:runtime.choices`), which `start` cannot resolve.
-                if (path := OmegaConf.select(config, f"model.{key}")) is not None:
+                if path := OmegaConf.select(config, f"model.{key}"):
                     config.model[key] = str(Path(path, LAST)) if Path(path).is_dir() else path
             with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{folder}"]):
                 result = start(verb, config, out)

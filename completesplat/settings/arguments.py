@@ -138,6 +138,8 @@ def _refuse_unreadable(argument: str, sweep: bool) -> None:
         override = OverridesParser.create().parse_override(argument)
     except HydraException:
         text = "['TEXT','TEXT']" if value.startswith("[") else quoted(value)
+        if key == "overrides":  # each entry is an override, too
+            text = "['" + value.strip("[]'") + "']"
         example = printable(f'"{key}={text}"', SHORT)
         message = f"cannot be read; a text with such characters wants quotes: {example}"
         raise CompleteSplatError(f"{printable(argument, SHORT)}: {message}") from None

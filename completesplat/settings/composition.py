@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.arguments import for_hydra
 from completesplat.settings.checks import part_arguments
-from completesplat.settings.options import LEAST_LIKE, conf_folder, did_you_mean, options, search_settings
+from completesplat.settings.options import LEAST_LIKE, conf_folder, did_you_mean, groups, options, search_settings
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 NOT_THERE = re.compile(r"Could not override '([^']+)'")
@@ -113,7 +113,8 @@ def _misspelt(error: Exception, verb: str, arguments: Sequence[str]) -> str | No
         config = _composed(verb, settings)
     except Exception:  # another argument is wrong, too
         config = _composed(verb)
-    nearest = _nearest(verb, key, [name for name in _keys(config) if not name.startswith("task.")])
+    names = [name for name in _keys(config) if not name.startswith("task.")]
+    nearest = _nearest(verb, key, list(dict.fromkeys([*names, *(groups() if verb == "fit" else [])])))
     above, _, last = key.rpartition(".")
     parent = OmegaConf.select(config, above, throw_on_resolution_failure=False) if above else None
     if isinstance(parent, DictConfig) and (last in part_arguments(parent)[0] or not (nearest or "_target_" in parent)):

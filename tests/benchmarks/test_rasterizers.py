@@ -29,10 +29,12 @@ class Broken(ReferenceRasterizer):
         raise RuntimeError("no kernel\n  for this [processor]")
 
 
-def test_a_failing_backend_is_absent_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_backend_is_absent_with_its_reason(command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(selection.FASTER, "tiled", Broken)
     failure.cache_clear()
     backends, absent = working_backends(["tiled", "reference"], RenderingConstants())
+    reason = "tiled: not measured, because RuntimeError: no kernel for this [processor]"
+    assert command.refuses("bench", "rasterizers", "backends=[tiled]") == reason
     failure.cache_clear()
     assert [backend.name for backend in backends] == ["reference"]
     assert absent == {"tiled": "RuntimeError: no kernel for this [processor]"}

@@ -161,6 +161,5 @@ def test_two_processes_write_what_one_writes(pipeline, packed_toys, tmp_path):
     ],
 )
 def test_what_cannot_be_encoded_is_refused(pipeline, packed_toys, stage, setting, message):
-    checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
-    given = ["data_task=latents", f"ckpt={checkpoint}", f"overrides=['data.root={packed_toys}']", setting]
+    given = ["data_task=latents", f"ckpt={getattr(pipeline, stage)}", f"overrides=['data.root={packed_toys}']", setting]
     assert message in refused("data", *given)

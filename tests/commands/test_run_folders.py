@@ -214,3 +214,15 @@ def test_a_refused_job_leaves_an_earlier_ones_record_and_a_first_one_leaves_its_
         assert content(tmp_path / "run") == before
     assert command(*given[:2], "absent.jpg", f"out={tmp_path}/first").status == 2
     assert strict_json(tmp_path / "first/run.json")["command"][2] == "absent.jpg"
+
+
+@pytest.mark.parametrize(
+    "experiment", ["toy_diffusion model.autoreconstructor_checkpoint", "toy_diffusion_masked model.checkpoint"]
+)
+def test_weights_that_must_be_given_are_not_those_of_a_run_in_the_working_folder(command, tmp_path, experiment):
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints/last.ckpt").touch()
+    name, setting = experiment.split()
+    assert command.refuses("fit", f"experiment={name}", "data.root=x").startswith(
+        f"{setting} is needed: give {setting}="
+    )

@@ -152,7 +152,9 @@ def test_what_is_no_turn_is_one_line(turns, tmp_path):
     assert "b8.png, one: the same position in the turn of 8 photos as b0.png" in reason(one, out, photos_of_a_turn=8)
     Image.new("RGB", (SIZE, 40), "white").save(one / "b8.png")
     assert "its mask is empty" in reason(one, out)
-    assert "background=null: its mask fills the photo; background=white or remove" in reason(one, out, background=None)
+    assert "background=null: its mask fills the photo; another background (white, remove)" in reason(
+        one, out, background=None
+    )
     draw(toy(), 0).crop((0, 0, SIZE, 40)).save(one / "b8.png")
     assert reason(one, out) == "one: photos of several sizes: 48 x 40, 48 x 48"
     Image.new("RGB", (SIZE, SIZE), "grey").save(one / "b0.png")

@@ -84,6 +84,16 @@ def test_words_and_flags_become_settings(verb, typed, given):
         ("data", ["import", "a", "b"], "give one folder, not a b"),
         ("data", ["toy", "rooms"], "rooms: no setting, which are given as key=value"),
         ("fit", ["out=a=b"], "out=a=b: cannot be read; a text with such characters wants quotes: \"out='a=b'\""),
+        (
+            "test",
+            ["overrides=a.b=c"],
+            "overrides=a.b=c: cannot be read; a text with such characters wants quotes: \"overrides=['a.b=c']\"",
+        ),
+        (
+            "test",
+            ["overrides=[a.b=c]"],
+            "overrides=[a.b=c]: cannot be read; a text with such characters wants quotes: \"overrides=['a.b=c']\"",
+        ),
         ("bench", ["settings=[a=b,c]"], "settings=[a=b,c]: cannot be read; a text with such characters wants quotes"),
         ("predict", ["image=a (1).png"], "image=a (1).png: cannot be read; a text with such characters wants quotes: "),
         ("predict", ["a.png", "samples", "=", "8"], "=: settings are key=value, without spaces"),
