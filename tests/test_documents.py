@@ -58,7 +58,7 @@ def test_the_readme_is_a_page_and_leads_to_every_document():
 
 def test_documents_are_short_and_a_change_is_one_line():
     words = {path: len(path.read_text().split()) for path in DOCUMENTS if path != STUDIES}
-    assert sum(words.values()) <= 11_500
+    assert sum(words.values()) <= 11_449  # 11,500 with tests/cases/README.md
     assert words[ROOT / "completesplat/training/README.md"] <= 1_420
     entries = [line for line in CHANGELOG.read_text().partition("## [")[2].splitlines()[1:] if line]
     assert [line for line in entries if not line.startswith(("- ", "## ", "### ")) or len(line) > 160] == []

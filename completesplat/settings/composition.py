@@ -105,16 +105,18 @@ def _misspelt(error: Exception, verb: str, arguments: Sequence[str]) -> str | No
     if str(error).startswith("Config group override must be"):
         empty = [text.partition("=")[0] for text in arguments if text.endswith("=null") and options(text[:-5])]
         return f"{empty[0]}=null: choose one of {', '.join(options(empty[0]))}" if empty else None
-    if not isinstance(error, HydraException) or (unknown := NOT_THERE.match(str(error))) is None:
-        return None
-    key = unknown[1]
+    unknown = NOT_THERE.match(str(error)) if isinstance(error, HydraException) else None
+    return _unknown_setting(verb, unknown[1], arguments) if unknown else None
+
+
+def _unknown_setting(verb: str, key: str, arguments: Sequence[str]) -> str:
     settings = [text for text in arguments if not text.startswith("-") and text.lstrip("+~").partition("=")[0] != key]
     try:
         config = _composed(verb, settings)
     except Exception:  # another argument is wrong, too
         config = _composed(verb)
-    names = [name for name in _keys(config) if not name.startswith("task.")]
-    nearest = _nearest(verb, key, list(dict.fromkeys([*names, *(groups() if verb == "fit" else [])])))
+    names = [name for name in _keys(config) if not name.startswith("task.")] + (groups() if verb == "fit" else [])
+    nearest = _nearest(verb, key, list(dict.fromkeys(names)))
     above, _, last = key.rpartition(".")
     parent = OmegaConf.select(config, above, throw_on_resolution_failure=False) if above else None
     if isinstance(parent, DictConfig) and (last in part_arguments(parent)[0] or not (nearest or "_target_" in parent)):

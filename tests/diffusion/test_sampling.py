@@ -228,3 +228,4 @@ def test_the_samplers_that_the_help_recommends_fit_the_weights_that_it_names(ver
     (line,) = re.findall("# Sampler that replaces .*", (conf_folder() / f"{verb}.yaml").read_text())
     name = re.search(r"(\w+) for (those|weights) in the package", line).group(1)
     model.replace_sampler(OmegaConf.to_container(config(name), resolve=True))
+    assert model.sampler.steps == config(name).steps
