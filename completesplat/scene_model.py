@@ -215,12 +215,14 @@ class SceneModel(nn.Module):
     def read(self, image: ImageLike, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
         """Read an image at the model's size (`read_photograph`); an unknown field of view is the training set's.
 
+        The square is enlarged where a cut-out or transparent object reaches beyond it.
+
         A model of objects on a background gets a cut-out or transparent object on it, as large as in training. It takes
         every image as of its training's field of view, unless another one is given.
         """
         typical = self.fov_degrees.item()
         if self.background is None:
-            return read_photograph(image, self.image_size, fov_degrees, typical, remove_background)
+            return read_photograph(image, self.image_size, fov_degrees, typical, remove_background, whole_object=True)
         known = typical if fov_degrees is None else fov_degrees
         photo = read_photograph(image, self.image_size, known, known, remove_background, self.background, OBJECT_SHARE)
         return photo if fov_degrees is not None else replace(photo, fov_source="default")
@@ -283,7 +285,7 @@ def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str
     """
     configs = shipped_configs()
     largest = max((config["image_size"] for config in configs.values()), default=1)
-    square = read_photograph(image, largest, remove_background=remove_background).image
+    square = read_photograph(image, largest, remove_background=remove_background, whole_object=True).image
     distances, logarithms = dict[str, float](), list[float]()
     for name, config in configs.items():
         if not _shows(config["training"].get("background"), square):

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from einops import rearrange
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from torch import Tensor
 
-from completesplat.data.images.files import image_bytes
+from completesplat.data.images.files import image_bytes, label_font
 from completesplat.files import write_bytes
 
 Maps = Float[Tensor, "*batch 1 height width"]
@@ -92,9 +92,9 @@ def image_sheet(headings: Sequence[str] | None, rows: Sheet, title: str | None =
     lefts = [MARGIN + column * (width + GAP) for column in range(len(headings) + 1)]
     tops = [int(heading_top) + 2 * LINE + row * (height + LINE + GAP) for row in range(len(rows) + 1)]
     sheet = Image.new("RGB", (lefts[-1] - GAP + MARGIN, tops[-1] - LINE - GAP + MARGIN), PAPER)
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=13)
+    draw, font = ImageDraw.Draw(sheet), label_font(12)
     if title is not None:
-        draw.text((MARGIN, MARGIN), title, INK, ImageFont.load_default(size=16))
+        draw.text((MARGIN, MARGIN), title, INK, label_font(15))
     for heading, left in zip(headings, lefts, strict=False):
         draw.text((left, heading_top), heading, INK, font)
     for row, top in zip(rows, tops, strict=False):

@@ -296,7 +296,11 @@ def _in_union(members: Sequence[object], value: object) -> list[Violation]:
     if isinstance(value, Sequence) and not isinstance(value, str):  # for the reason that its entries do not fit
         members = [*(member for member in members if typing.get_origin(member) is Sequence), *members]
     attempts = [violations(member, value) for member in members]
-    return [] if [] in attempts else attempts[0]
+    if [] in attempts:
+        return []
+    others = [described(member) for member in members if typing.get_origin(member) is Literal]
+    others += ["null"] if NoneType in members else []
+    return [unfit._replace(reason=", or ".join([unfit.reason, *others])) for unfit in attempts[0]]
 
 
 def _in_list(kind: object, value: object) -> list[Violation]:

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from torch import Tensor
 
+from completesplat.data.images.files import label_font
 from completesplat.data.loading.training_statistics import world_up
 from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.errors import DataError
@@ -102,7 +103,7 @@ def write_contact_sheet(sequences: Sequence[PosedSequence], path: Path, images: 
     """
     rows = [_row(sequence, images) for sequence in sequences]
     header = Image.new("RGB", (rows[0].width, MARGIN + 60), PAPER)
-    ImageDraw.Draw(header).text((MARGIN, MARGIN), f"{title}\n{LEGEND}", INK, ImageFont.load_default(size=13))
+    ImageDraw.Draw(header).text((MARGIN, MARGIN), f"{title}\n{LEGEND}", INK, label_font(12))
     write_png(path, Image.fromarray(np.concatenate([np.asarray(part) for part in (header, *rows)])))
 
 
@@ -125,7 +126,7 @@ def _image_cell(sequence: PosedSequence, index: int, cross: Cross) -> SheetCell:
         frame = sequence.read(index)
     except DataError as error:
         cell = Image.new("RGB", (CELL, CELL), GREY)
-        ImageDraw.Draw(cell).text((MARGIN, CELL // 2), error.kind, INK, ImageFont.load_default(size=13))
+        ImageDraw.Draw(cell).text((MARGIN, CELL // 2), error.kind, INK, label_font(12))
         return SheetCell(_tensor(cell), label)
     cell = _with_outline(frame)
     camera, draw = sequence.cameras[index], ImageDraw.Draw(cell)

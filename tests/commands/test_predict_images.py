@@ -292,7 +292,7 @@ def test_a_photo_unlike_the_training_images_gets_a_warning_with_nearer_weights(t
 def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
     given = {}
 
-    def read(path, size, fov, default, remove_background):
+    def read(path, size, fov, default, remove_background, whole_object):
         given["removed"] = remove_background
         return Photograph(torch.full((3, size, size), 0.5), default, "default")
 
@@ -303,6 +303,18 @@ def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
         assert ("a.png: removing the background" in done.out) == removed
         settings = strict_json(tmp_path / "out/a/scene.json")["settings"]
         assert (given["removed"], settings.get("background")) == (removed, "remove" if removed else None)
+
+
+def test_a_hidden_part_of_the_central_square_does_not_go_with_an_object_that_is_larger_than_it(predict, tmp_path):
+    for top, status, message in ((40, 0, ""), (0, 2, "box= hide parts of a photo's central square, but its object")):
+        cut_out = Image.new("RGBA", (32, 96))
+        cut_out.paste("blue", (10, top, 22, 56))
+        cut_out.save(tmp_path / "a.png")
+        done = predict(tmp_path / "a.png", "box=[0,0,0.5,0.5]")
+        assert done.status == status
+        assert message in done.err
+    assert predict(tmp_path / "a.png", "fov=50").status == 0
+    assert strict_json(tmp_path / "out/a/scene.json")["settings"]["fov_degrees"] == pytest.approx(108.9, abs=0.1)
 
 
 def test_videos_and_formats_are_written_and_recorded_and_a_strange_field_of_view_told(predict, tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """Objects cut out of their background by a stand-in for rembg, hidden parts, and what tells images of a kind apart."""
 
+import math
 import sys
 from functools import partial
 from pathlib import Path
@@ -55,12 +56,27 @@ def test_the_object_is_sought_in_all_of_the_image_and_fills_its_share_of_the_squ
     image = Image.new("RGB", (64, 32), "red")
     image.paste("blue", (2, 4, 14, 10))  # left of the central square
     image.save(tmp_path / "a.png")
-    with pytest.raises(ImageError, match="leaves nothing"):
-        read_photograph(tmp_path / "a.png", 24, remove_background=True)
     result = read_photograph(tmp_path / "a.png", 24, remove_background=True, background=0.0, object_share=0.5).image
     expected = torch.zeros(3, 24, 24)
     expected[2, 9:15, 6:18] = 1
     assert torch.equal(result, expected)
+
+
+@pytest.mark.parametrize(("fov", "source"), [(40.0, "given"), (None, "default")])
+def test_the_central_square_grows_until_it_holds_the_whole_object_and_its_field_of_view_with_it(rembg, fov, source):
+    image = Image.new("RGB", (32, 64), "red")
+    image.paste("blue", (10, 4, 22, 58))  # a bottle, from 28 above the middle to 26 below
+    photo = read_photograph(image, 28, fov, 40.0, remove_background=True, whole_object=True)
+    expected = torch.ones(3, 56, 56)
+    expected[:2, :54, 22:34] = 0
+    assert torch.allclose(photo.image, expected.unflatten(2, (28, 2)).mean(3).unflatten(1, (28, 2)).mean(2), atol=0.2)
+    grown = math.degrees(2 * math.atan(56 / 32 * math.tan(math.radians(40) / 2)))
+    assert (photo.crop, photo.fov_source) == ("object", source)
+    assert photo.fov_degrees == pytest.approx(grown if source == "given" else 40)
+    inside = Image.new("RGB", (32, 64), "red")
+    inside.paste("blue", (10, 20, 22, 40))
+    photo = read_photograph(inside, 32, fov, 40.0, remove_background=True, whole_object=True)
+    assert (photo.crop, photo.fov_degrees) == ("center", 40)
 
 
 def test_an_object_as_long_as_an_image_may_be_is_reduced_before_its_square_is_made(tmp_path):

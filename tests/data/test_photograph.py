@@ -191,7 +191,7 @@ def test_what_is_no_photograph_is_refused(tmp_path, monkeypatch):
     if "HEIF" not in files.photo_formats():
         refuse(tmp_path / "f.HEIC", r"HEIC needs: pip install \"completesplat\[heic\]\"")
     refuse(tmp_path / "e.jpg", "no such file")
-    refuse(tmp_path, "no such file")
+    refuse(tmp_path, "a folder; give a file")
     for size in ((7, 100), (100, 7)):
         Image.new("RGB", size).save(tmp_path / "a.png")
         refuse(tmp_path / "a.png", "at least 8")

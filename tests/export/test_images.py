@@ -37,6 +37,12 @@ def test_every_image_of_a_sheet_lies_in_its_row_and_column_and_places_may_be_emp
     torch.testing.assert_close(result, expected, atol=0.5 / 255 + 1e-5, rtol=0)
 
 
+def test_letters_with_accents_and_of_other_alphabets_are_drawn_not_boxes():
+    image = [[SheetCell(torch.rand(3, 16, 16))]]
+    drawn = [image_sheet(["heading"], image, title).tobytes() for title in "éřкβ→\uffff"]
+    assert len(set(drawn)) == len(drawn)
+
+
 def test_headings_and_labels_are_drawn_and_move_nothing():
     image = torch.rand(3, 16, 16)
     plain = np.asarray(image_sheet(["", ""], [[SheetCell(image), None]])).astype(int)

@@ -24,6 +24,7 @@ def task(
     part: Part | Literal[False],
     anything: Any,
     seed: Natural | Sequence[Natural] = 0,
+    background: Annotated[float, Range(0, 1)] | Literal["remove"] | None = None,
 ) -> None: ...
 
 
@@ -47,10 +48,12 @@ GOOD: dict[str, Any] = {
         ("words", "x", "must be a list, such as words=[x]"),
         ("words", [], "must not be empty"),
         ("words", ["x", "z"], "choose one of x, y"),
-        ("workers", -1, "must be at least 0"),
+        ("workers", -1, "must be at least 0, or null"),
         ("words", None, "must be a list"),
         ("by_name", [1], "must be a mapping"),
         ("seed", "x", "must be a whole number"),
+        ("background", "white", "must be a number, or remove, or null"),
+        ("background", 2, "must lie between 0 and 1, or remove, or null"),
     ],
 )
 def test_what_does_not_fit_is_named_with_what_it_may_be(setting, value, message):

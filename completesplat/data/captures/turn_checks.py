@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from completesplat.data.images.files import save_image, to_uint8
+from completesplat.data.images.files import label_font, save_image, to_uint8
 from completesplat.errors import DataError
 from completesplat.files import printable
 from completesplat.geometry.cameras import Cameras, crop_resize, project
@@ -118,7 +118,7 @@ def write_sheet(turns: Mapping[str, Turn], path: Path) -> None:
     columns = math.ceil(math.sqrt(len(turns) * height / width))
     rows = math.ceil(len(turns) / columns)
     sheet = Image.new("RGB", (columns * width, rows * height), "white")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(LABEL - 2)
+    draw, font = ImageDraw.Draw(sheet), label_font(LABEL - 3)
     for index, (name, turn) in enumerate(turns.items()):
         left, top = index // rows * width, index % rows * height
         draw.text((left, top), printable(f"{name}  {turn.overlap:.2f}"), "black", font)

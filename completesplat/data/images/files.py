@@ -7,10 +7,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
+import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageFile, UnidentifiedImageError
+from PIL import Image, ImageFile, ImageFont, UnidentifiedImageError
 from torch import Tensor
 
 from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, Tags, read_exif
@@ -185,6 +186,11 @@ def deep_grey(image: Image.Image, tiff_tags: Mapping[int, object]) -> np.ndarray
     if isinstance(image.info.get("transparency"), int):
         values[np.asarray(image) == image.info["transparency"]] = 1
     return values.astype(np.float32)
+
+
+def label_font(size: int) -> ImageFont.FreeTypeFont:
+    """Return the font of labels, of a size in pixels. It is DejaVu Sans, because Pillow's own font lacks accents."""
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")), size)
 
 
 def image_bytes(image: Image.Image, kind: str, **options: int | bytes) -> bytes:

@@ -29,7 +29,7 @@ FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM
 SMALLEST_SIDE = 8
 FOVS = 0.1, 179  # degrees; float32 holds neither the focal lengths nor the depths of others
 DEEP_GREY_MODES = (*files.SIXTEEN_BIT_MODES, "I", "F")
-LARGEST_OBJECT = 4096  # pixels; larger ones are reduced before they are padded to a square of unbounded size
+LARGEST_PADDED = 6000  # pixels; larger squares are reduced before they are padded, because their size has no bound
 SAME_SHAPE = 0.02  # largest difference between the side ratios of a photo and its mask
 LANCZOS_REACH = 3  # radius of the filter, in pixels of the coarser image
 # Networks of rembg under Apache 2.0, the best first (DIS, U2-Net, its small form); its default forbids commercial use.
@@ -42,13 +42,18 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Photograph(TensorDataclass):
-    """Square image (sRGB, 0 to 1) with the field of view across a side, and the source of the field of view."""
+    """Square image (sRGB, 0 to 1) with the field of view across a side, and the source of the field of view.
+
+    `crop` tells the central square of the photo from one that was chosen for its object.
+    """
 
     image: Float[Tensor, "3 size size"]
     fov_degrees: float
     fov_source: Literal["given", "exif", "default"]
+    crop: Literal["center", "object"] = "center"
 
 
+Window: TypeAlias = tuple[int, int, int, int]  # left, top, right and bottom of a square of an image, in pixels
 ImageLike: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor
 
 
@@ -60,6 +65,7 @@ def read_photograph(
     remove_background: bool = False,
     background: float = 1.0,
     object_share: float | None = None,
+    whole_object: bool = False,
 ) -> Photograph:
     """Turn an image upright, crop the largest central square and resize it (Lanczos, antialiased).
 
@@ -69,12 +75,13 @@ def read_photograph(
     Args:
         source: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, recognized by its content; a PIL image;
             an array [height, width, 3] or tensor [3, height, width] of bytes, or floats in [0, 1] (rounded to bytes).
-        fov_degrees: field of view of the square crop, if it is known.
-        default_fov_degrees: the same for images without usable EXIF focal length (50 is close to a phone's camera).
-        remove_background: see `without_background`; applied to the square, or with `object_share` to the whole image.
+        fov_degrees: field of view of the central square, if it is known; with `object_share` that of the crop.
+        default_fov_degrees: that of the crop without usable EXIF focal length (50 is close to a phone's camera).
+        remove_background: see `without_background`; applied to the whole image.
         background: grey value from 0 to 1 behind transparent and removed pixels, white by default.
         object_share: for an image with a transparent or removed background, crop the square around the object such that
             the object's longer side fills this share of it; None: crop the central square.
+        whole_object: enlarge that central square, and its field of view, such that it holds the whole object.
 
     Raises:
         ImageError: the file is missing or not a complete image of one of these formats, has more than 64 million pixels
@@ -85,32 +92,31 @@ def read_photograph(
         if fov is not None and not FOVS[0] <= fov <= FOVS[1]:
             raise CompleteSplatError(f"the field of view must lie between {FOVS[0]} and {FOVS[1]} degrees, not {fov}")
     try:
-        image, recorded = _square(source, size, remove_background, background, object_share)
+        file, exif = _loaded(source)
+        upright = files.turn_upright(file, exif.get(ORIENTATION))
+        if remove_background:
+            upright = _cut_out(upright, background)
+        central = _centered_window(upright.size, min(upright.size))
+        around = _object_window(upright, object_share) if whole_object or object_share is not None else None
+        window = central if around is None else around
+        image = _to_tensor(_cropped(upright, window), file, size, background)
     except ImageError as error:
         name = source if isinstance(source, (str, Path)) else "the image"
         raise ImageError(f"{name}: {error}") from error.__cause__
-    if fov_degrees is not None:
-        return Photograph(image, float(fov_degrees), "given")
-    if recorded is not None:
-        return Photograph(image, recorded, "exif")
-    return Photograph(image, float(default_fov_degrees), "default")
+    crop: Literal["center", "object"] = "center" if window == central else "object"
+    fov = crop_fov(exif, file.size) if fov_degrees is None else float(fov_degrees)
+    if fov is None:
+        return Photograph(image, float(default_fov_degrees), "default", crop)
+    if crop == "object" and object_share is None:
+        ratio = (window[2] - window[0]) / min(upright.size)
+        fov = math.degrees(2 * math.atan(ratio * math.tan(math.radians(fov) / 2)))
+    return Photograph(image, fov, "exif" if fov_degrees is None else "given", crop)
 
 
-def _square(
-    source: ImageLike, size: int, remove_background: bool, background: float, object_share: float | None
-) -> tuple[Float[Tensor, "3 size size"], float | None]:
-    """Return the resized central or object square, and the central square's EXIF field of view in degrees, if any."""
-    file, exif = _loaded(source)
-    seen = files.turn_upright(file, exif.get(ORIENTATION))
-    if object_share is None:
-        seen = _central_square(seen, min(seen.size))
-    if remove_background:
-        if seen.mode not in files.EIGHT_BIT_MODES:
-            raise ImageError(f"colour mode {seen.mode} goes without background=remove")
-        seen = without_background(_to_srgb(seen, background))
-    if object_share is not None:
-        seen = _around_object(seen, object_share) or _central_square(seen, min(seen.size))
-    return _to_tensor(seen, file, size, background), crop_fov(exif, file.size)
+def _cut_out(image: Image.Image, background: float) -> Image.Image:
+    if image.mode not in files.EIGHT_BIT_MODES:
+        raise ImageError(f"colour mode {image.mode} goes without background=remove")
+    return without_background(_to_srgb(image, background))
 
 
 def _loaded(source: ImageLike) -> tuple[Image.Image, Tags]:
@@ -137,31 +143,48 @@ def _require_content(path: Path) -> None:
     except OSError as error:  # such as a name that is too long
         raise ImageError(str(error.strerror)) from error
     if not exists:
-        raise ImageError("no such file")
+        raise ImageError("a folder; give a file" if path.is_dir() else "no such file")
     if not os.path.getsize(path):
         raise ImageError("the file is empty")
 
 
-def _around_object(image: Image.Image, share: float) -> Image.Image | None:
-    """Crop the square around the opaque part, which may extend beyond the image; None if all pixels are opaque."""
+def _object_window(image: Image.Image, share: float | None) -> Window | None:
+    """Return the square around the opaque part of which it fills this share; None if all pixels are opaque.
+
+    Without a share it is the smallest square in the middle that holds the central one and the opaque part.
+    """
     if image.mode not in files.EIGHT_BIT_MODES or not image.has_transparency_data:
         return None
-    cut_out = image.convert("RGBA")
-    alpha = cut_out.getchannel("A")
+    alpha = image.convert("RGBA").getchannel("A")
     if alpha.getextrema()[0] == 255:
         return None
     box = alpha.getbbox()
     if box is None:
         raise ImageError("nothing but transparency")
-    cut_out = cut_out.crop(box)
-    cut_out = cut_out.reduce(-(-max(cut_out.size) // LARGEST_OBJECT))
-    return _central_square(cut_out, round(max(cut_out.size) / share))
+    left, top, right, bottom = box
+    if share is not None:
+        size = right - left, bottom - top
+        return _centered_window(size, round(max(size) / share), left, top)
+    width, height = image.size
+    reach = max(width - 2 * left, 2 * right - width, height - 2 * top, 2 * bottom - height)
+    return _centered_window(image.size, max(reach, min(image.size)))
 
 
-def _central_square(image: Image.Image, side: int) -> Image.Image:
-    """Crop the square in the middle, which may extend beyond the image."""
-    left, top = (image.width - side) // 2, (image.height - side) // 2
-    return image.crop((left, top, left + side, top + side))
+def _centered_window(size: tuple[int, int], side: int, left: int = 0, top: int = 0) -> Window:
+    """Return the square in the middle of a box, which may extend beyond it, as left, top, right and bottom."""
+    left, top = left + (size[0] - side) // 2, top + (size[1] - side) // 2
+    return left, top, left + side, top + side
+
+
+def _cropped(image: Image.Image, window: Window) -> Image.Image:
+    """Crop a square. What extends beyond the image is transparent; a large square is reduced before it is padded."""
+    left, top, right, bottom = window
+    side = right - left
+    if left >= 0 and top >= 0 and right <= image.width and bottom <= image.height:
+        return image.crop(window)
+    factor = -(-side // LARGEST_PADDED)
+    left, top, side = left // factor, top // factor, side // factor
+    return image.convert("RGBA").reduce(factor).crop((left, top, left + side, top + side))
 
 
 def _pixels(image: np.ndarray | Tensor) -> Image.Image:
