@@ -7,7 +7,7 @@ import struct
 
 import torch
 
-from completesplat.gaussians import Gaussians
+from completesplat.gaussians import DirectionalGaussians, Gaussians
 
 NAMES = ("means", "quaternions", "scales", "opacities", "colors")
 SCENE = Gaussians(
@@ -17,6 +17,8 @@ SCENE = Gaussians(
     torch.tensor([0.9, 0.5, 0.2]),
     torch.tensor([[0.9, 0.1, 0.2], [0.2, 0.6, 0.4], [0.3, 0.3, 1.0]]),
 )
+HARMONICS = (torch.arange(3 * 15 * 3) * 7 % 16 / 16 - 0.5).unflatten(0, (3, 15, 3))
+DIRECTIONAL = DirectionalGaussians(**vars(SCENE), harmonics=HARMONICS)
 # The `.ply` of SCENE, converted by npm's @playcanvas/splat-transform 2.7.1 with --spz-version 3 and 4.
 CONVERTED = {
     3: "H4sIAAAAAAAAA/NzDw5gZmBgAGEGHiAWYGB48J/hwn+GH/8Z/vxnOPCfASb4rMF4m2d4eG9RSsrh6raJBdW9vdWJXVt/u3hfi33p"
@@ -27,7 +29,7 @@ CONVERTED = {
 }
 
 
-def version_2(gaussians: Gaussians, harmonics: int = 0) -> bytes:
+def version_2(gaussians: Gaussians) -> bytes:
     """Encode as Niantic's document of the format says: +y up, +z back; all parts one after another, gzipped."""
     parts = [b""] * 5
     for mean, q, scales, opacity, color in zip(*(getattr(gaussians, name).tolist() for name in NAMES), strict=True):
@@ -39,9 +41,21 @@ def version_2(gaussians: Gaussians, harmonics: int = 0) -> bytes:
         parts[3] += bytes(round((math.log(s) + 10) * 16) for s in scales)
         # Turning axes by half a turn about x turns y and z of a rotation's axis, too.
         parts[4] += bytes(round((x / length + 1) * 127.5) for x in (q[1], -q[2], -q[3]))
-    header = struct.pack("<4sIIBBBB", b"NGSP", 2, gaussians.count, int(harmonics > 0), 12, 0, 0)
-    return gzip.compress(header + b"".join(parts) + bytes(harmonics))
+    header = struct.pack("<4sIIBBBB", b"NGSP", 2, gaussians.count, 0, 12, 0, 0)
+    return gzip.compress(header + b"".join(parts))
 
 
 FILES = {f"v{version}.spz": base64.b64decode(text) for version, text in CONVERTED.items()}
-FILES |= {"v2.SPZ": version_2(SCENE), "harmonics.spz": version_2(SCENE, 3 * 9)}
+FILES["v2.SPZ"] = version_2(SCENE)
+# The same of DIRECTIONAL.
+DIRECTIONAL_FILES = {
+    "v3.spz": "H4sIAAAAAAAAA02NrwoCQRCHB6wG38UXuCD4D2TAcFeEES5cXEyHVzaJCAtrM040TtFiWfAFTBaLSfANBIV1PBEMM/Cb38c3o+4Y"
+    "GwBQT1NXC+Aa4RThEeEVIUT4HW+2ve+nqZvl+bFarE3lXDVd7Z6d4XlyH8wvh7DEDW19z6InYvSJRSbyqFmIxQaPzOSDRSNUSKl8wZkJNmhm"
+    "1F4MS52JjfJWDIn5FBkrn5TCJOpTXvt/v/L67+t/AwXlKAPTAAAA",
+    "v4.spz": "TkdTUAQAAAADAAAAAwwABiAAAAAAAAAAAAAAAAAAAAAkAAAAAAAAABsAAAAAAAAADAAAAAAAAAADAAAAAAAAABIAAAAAAAAACQAA"
+    "AAAAAAASAAAAAAAAAAkAAAAAAAAAFQAAAAAAAAAMAAAAAAAAAF8AAAAAAAAAhwAAAAAAAAAotS/9IBvZAAAAEAAA4P8A0P8A+P8A/P8AwP8A"
+    "AAAAEAAA4P8otS/9IAMZAADmgDMotS/9IAlJAAC2SVdXjXJkZMMotS/9IAlJAAB7hpFwe42Ne2EotS/9IAxhAACKtftES9Zd6Up627sotS/9"
+    "IIe1AgCyRxMUwCUdu0QmkUlkUn1imOgTma+qiwOdrYqK3ulzRP38QQwfFjoifryMnB5HhjffEXnnyFDwUGCGj52S6Wx15N4rUTdLROWtEkAH"
+    "EygwAQEA78iFKA==",
+}
+DIRECTIONAL_FILES = {name: base64.b64decode(text) for name, text in DIRECTIONAL_FILES.items()}

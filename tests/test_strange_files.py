@@ -8,7 +8,7 @@ import fake_converter
 import numpy as np
 import pytest
 import torch
-from splats_of_others import FILES, SCENE
+from splats_of_others import DIRECTIONAL_FILES, SCENE
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import RECORD
@@ -19,8 +19,8 @@ from completesplat.viewer.sample import read_scene
 
 
 def spz(system: int) -> bytes:
-    """Return SCENE as version 4 with the extension that names the axes of the stored values."""
-    content = bytearray(FILES["v4.spz"])
+    """Return DIRECTIONAL as version 4 with the extension that names the axes of the stored values."""
+    content = bytearray(DIRECTIONAL_FILES["v4.spz"])
     content[14] |= 2
     content[16:20] = (32 + 20 + 12).to_bytes(4, "little")
     unknown = struct.pack("<II12s", 0xDEAD0001, 12, b"")
@@ -35,18 +35,17 @@ AXES = {0: (1, -1, -1), 1: (-1, 1, -1), 3: (-1, -1, -1), 4: (1, -1, -1), 6: (1, 
 def test_the_axes_that_an_spz_names_are_turned_to_ours(tmp_path, system):
     (tmp_path / "a.spz").write_bytes(spz(system))
     read, flip = read_gaussians(tmp_path / "a.spz"), torch.tensor(AXES[system]) * torch.tensor([1.0, -1, -1])
+    (tmp_path / "usual.spz").write_bytes(DIRECTIONAL_FILES["v4.spz"])
+    usual, seen_from = read_gaussians(tmp_path / "usual.spz"), torch.tensor([0.3, -2.0, 0.5])
+    assert torch.allclose(read.seen_from(seen_from * flip).colors, usual.seen_from(seen_from).colors, atol=1e-5)
     assert torch.allclose(read.means, SCENE.means * flip, atol=1 / 8192)
     assert torch.allclose(read.covariances(), flip[:, None] * SCENE.covariances() * flip, atol=0.01)
 
 
-def test_other_axes_are_refused_and_lost_harmonics_named(tmp_path, caplog):
+def test_other_axes_are_refused(tmp_path):
     (tmp_path / "a.spz").write_bytes(spz(9))
     with pytest.raises(CompleteSplatError, match=r"a\.spz: .*coordinate system 9"):
         read_gaussians(tmp_path / "a.spz")
-    (tmp_path / "b.spz").write_bytes(FILES["harmonics.spz"])
-    assert read_gaussians(tmp_path / "b.spz").count == 3
-    message = "harmonics of degree 1 are left out: one colour for all directions"
-    assert caplog.messages == [f"{tmp_path / 'b.spz'}: {message}"]
 
 
 COMPRESSED = b"ply\nformat binary_little_endian 1.0\nelement chunk 0\nproperty float min_x\nelement vertex 0\n"

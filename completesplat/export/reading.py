@@ -4,7 +4,6 @@ Formats: antimatter15's splat (32 bytes a Gaussian), and Niantic's `load-spz.cc`
 installed, unpacks others.
 """
 
-import logging
 import math
 import os
 import shutil
@@ -24,21 +23,20 @@ from completesplat.export.cleaning import bounded, cleaned
 from completesplat.export.formats import RECORD
 from completesplat.export.ply import read_ply
 from completesplat.export.splat_transform import PROGRAM, convert
-from completesplat.gaussians import Gaussians
-from completesplat.geometry.harmonics import SH_C0
+from completesplat.gaussians import DirectionalGaussians, Gaussians
+from completesplat.geometry.harmonics import LARGEST_DEGREE, SH_C0, coefficients, rotated
 from completesplat.ply_files import LONGEST_HEADER, PACKED
 
 HEADER = struct.Struct("<4sIIBBBBI")  # magic, version, count, degree, fractional bits, flags, streams, their table
-WIDTHS = {2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}  # bytes of a Gaussian in each part, by version
+WIDTHS = {2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}  # bytes of a Gaussian in each part but harmonics
+DEGREES = 4  # of harmonics in a file
 EXTENDED, COORDINATES, RIGHT_UP_BACK = 2, 0xADBE0003, 4  # flag, type of an extension, its default
 OUR_AXES = np.array([1, -1, 1])  # right, down, forward
 LARGEST_RATIO = 40  # of what a file unpacks to; splat-transform's have 2
 
-log = logging.getLogger(__name__)
-
 
 def read_gaussians(path: str | Path) -> Gaussians:
-    """Read a file of the format that its suffix names, in our axes; colours are the zeroth harmonics.
+    """Read a file of the format that its suffix names, in our axes, with harmonics up to degree 3.
 
     Raises:
         PlyError: the file is missing or damaged, needs `splat-transform`, which is not installed, or has no finite
@@ -51,10 +49,13 @@ def read_gaussians(path: str | Path) -> Gaussians:
         packed = _packed_format(path)
         return read_ply(path) if packed is None else _read_by_splat_transform(path, packed)
     try:
-        values = read(path.read_bytes(), path)
+        values = read(path.read_bytes())
     except (OSError, EOFError, ValueError, struct.error, zlib.error) as error:
         raise PlyError(f"{path}: damaged, missing, or of another version ({error})") from error
-    gaussians = Gaussians(*(torch.from_numpy(value.astype(np.float32)) for value in values))
+    *parts, harmonics = (torch.from_numpy(value.astype(np.float32)) for value in values)
+    gaussians = Gaussians(*parts)
+    if harmonics.shape[1]:
+        gaussians = DirectionalGaussians(**vars(gaussians), harmonics=harmonics)
     return cleaned(gaussians, path, bounded)
 
 
@@ -78,25 +79,27 @@ def _read_by_splat_transform(path: Path, kind: str) -> Gaussians:
         return read_ply(Path(folder) / "unpacked.ply")
 
 
-def _read_splat(content: bytes, _: Path) -> list[np.ndarray]:
+def _read_splat(content: bytes) -> list[np.ndarray]:
     records = np.frombuffer(content, RECORD)
     colors, rotations = records["colors"] / 255, records["quaternions"] / 128 - 1
-    return [records["means"], rotations, records["scales"], colors[:, 3], colors[:, :3]]
+    return [records["means"], rotations, records["scales"], colors[:, 3], colors[:, :3], np.empty((len(records), 0, 3))]
 
 
-def _read_spz(content: bytes, path: Path) -> list[np.ndarray]:
+def _read_spz(content: bytes) -> list[np.ndarray]:
     most = max(LARGEST_RATIO * len(content), 2**24)
     data = content if content.startswith(b"NGSP") else GzipFile(fileobj=BytesIO(content)).read(most)
     magic, version, count, degree, bits, flags, streams, table = HEADER.unpack_from(data)
-    if magic != b"NGSP" or version not in WIDTHS or count * sum(WIDTHS[version]) > most:
-        raise ValueError(f"version {version}, {count} Gaussians")
-    if degree:
-        log.warning("%s: harmonics of degree %d are left out: one colour for all directions", path, degree)
+    ends = count * np.cumsum([*WIDTHS.get(version, ()), 3 * coefficients(degree)])
+    if magic != b"NGSP" or version not in WIDTHS or degree > DEGREES or ends[-1] > most:
+        raise ValueError(f"version {version}, {count} Gaussians, harmonics of degree {degree}")
     signs = _signs(data[32:table] if version == 4 and flags & EXTENDED else b"")
-    ends = count * np.cumsum(WIDTHS[version])
-    parts = _unpacked(data, table, streams, np.diff(ends, prepend=0)) if version == 4 else data[16 : 16 + ends[-1]]
+    sizes = np.diff(ends, prepend=0)
+    parts = _unpacked(data, table, streams, sizes[sizes > 0]) if version == 4 else data[16 : 16 + ends[-1]]
     blocks = np.split(np.frombuffer(parts, np.uint8, ends[-1]), ends[:-1])
-    places, opacities, colors, scales, rotations = (block.reshape(count, -1) for block in blocks)
+    places, opacities, colors, scales, rotations = (block.reshape(count, -1) for block in blocks[:5])
+    harmonics = blocks[5].reshape(count, coefficients(degree), 3)[:, : coefficients(LARGEST_DEGREE)] / 128 - 1
+    if degree:
+        harmonics = rotated(torch.from_numpy(harmonics), torch.from_numpy(np.diag(signs * 1.0))).numpy()
     whole = np.pad(places.reshape(count, 3, 3), ((0, 0), (0, 0), (1, 0)))  # 24 bits in the upper part of 32
     return [
         np.ldexp(whole.view("<i4")[..., 0] >> 8, -bits) * signs,
@@ -104,6 +107,7 @@ def _read_spz(content: bytes, path: Path) -> list[np.ndarray]:
         np.exp(scales / 16 - 10),
         opacities[:, 0] / 255,
         np.maximum(0.5 + SH_C0 * (colors / 255 - 0.5) / 0.15, 0),
+        harmonics,
     ]
 
 

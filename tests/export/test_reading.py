@@ -6,7 +6,7 @@ import struct
 
 import pytest
 import torch
-from splats_of_others import FILES, SCENE
+from splats_of_others import DIRECTIONAL, DIRECTIONAL_FILES, FILES, SCENE
 
 from completesplat.errors import PlyError
 from completesplat.export.formats import write_splat
@@ -29,6 +29,16 @@ def test_spz_of_others_is_read_in_our_axes(tmp_path, name):
     check(read_gaussians(tmp_path / name), position=1 / 8192, size=1 / 32 + 1e-4, color=0.005, shape=0.01)
 
 
+@pytest.mark.parametrize("name", DIRECTIONAL_FILES)
+def test_harmonics_of_spz_are_read_as_exactly_as_they_are_stored(tmp_path, name):
+    (tmp_path / name).write_bytes(DIRECTIONAL_FILES[name])
+    read = read_gaussians(tmp_path / name)
+    check(read, position=1 / 8192, size=1 / 32 + 1e-4, color=0.005, shape=0.01)
+    error = (read.harmonics - DIRECTIONAL.harmonics).abs()  # five bits for degree 1, four for the others
+    assert error[:, :3].max() <= 1 / 32 + 1e-6
+    assert error[:, 3:].max() <= 1 / 16 + 1e-6
+
+
 def test_splat_and_ply_are_read(tmp_path):
     write_splat(tmp_path / "a.splat", SCENE)
     check(read_gaussians(tmp_path / "a.splat"), position=0, size=1e-6, color=0.6 / 255, shape=0.003)
@@ -42,8 +52,8 @@ def test_splat_and_ply_are_read(tmp_path):
     check(read_gaussians(tmp_path / "a.ply"), position=0, size=1e-6, color=1e-6, shape=1e-6)
 
 
-def spz(version: int = 3, count: int = 1, body: bytes = bytes(20)) -> bytes:
-    return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", version, count, 0, 12, 0, 0) + body, mtime=0)
+def spz(version: int = 3, count: int = 1, body: bytes = bytes(20), degree: int = 0) -> bytes:
+    return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, 12, 0, 0) + body, mtime=0)
 
 
 V4 = FILES["v4.spz"]
@@ -57,6 +67,8 @@ V4 = FILES["v4.spz"]
         ("a.spz", b""),
         ("a.spz", b"ply\n"),
         ("a.spz", spz(version=1)),
+        ("a.spz", spz(degree=3)),
+        ("a.spz", spz(degree=9, body=bytes(999))),
         ("a.spz", spz(count=2)),
         ("a.spz", spz(count=2**32 - 1)),
         ("a.spz", spz()[:-12]),
