@@ -8,7 +8,7 @@ tensors are freed when real ones would be.
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -30,6 +30,7 @@ from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stage import Stage
 from completesplat.training.steps import Training, synthetic_batch
 
+T = TypeVar("T")
 aten = torch.ops.aten
 # torch's counter knows the attention kernels of GPUs only.
 FORWARD: Any = flop_counter.sdpa_flop_count
@@ -147,15 +148,10 @@ class LiveMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
     def _free(self, size: int) -> None:
         self.bytes -= size
 
-    def peak_since(self) -> int:
-        """Return the maximum since the last call."""
-        peak, self.peak = self.peak, self.bytes
-        return peak
-
-    def operations_since(self) -> list[Operation]:
-        """Return the operations since the last call."""
-        operations, self.operations = self.operations, []
-        return operations
+    def during(self, work: Callable[[], T]) -> tuple[T, int, list[Operation]]:
+        """Do some work; return its result, the maximum meanwhile, and its operations."""
+        self.peak, self.operations = self.bytes, []
+        return work(), self.peak, self.operations
 
 
 class _Store(torch.autograd.Function):
@@ -244,20 +240,12 @@ def count_step(
 
 def _count(training: Training, inputs: Batch, live: LiveMemory) -> tuple[list[list[Operation]], dict[str, int]]:
     """Return the operations of both passes and the update, and the memory; the weights are part of the batch's."""
-    before, operations = live.bytes, []
-    live.peak_since()
-    live.operations_since()
-    loss = training.loss(inputs)
-    forward, kept = live.peak_since(), live.bytes - before
-    operations.append(live.operations_since())
-    torch.autograd.backward([loss])
-    backward = live.peak_since()
-    operations.append(live.operations_since())
-    training.update()
-    changed = live.peak_since()
-    live.operations_since()
-    training.update()  # the first one also makes the optimizer's state
-    operations.append(live.operations_since())
+    before = live.bytes
+    loss, forward, of_forward = live.during(lambda: training.loss(inputs))
+    kept = live.bytes - before
+    _, backward, of_backward = live.during(lambda: torch.autograd.backward([loss]))
+    _, changed, _ = live.during(training.update)  # which also makes the optimizer's state
+    _, _, of_update = live.during(training.update)
     gradients = sum(p.grad.nbytes for p in training.module.parameters() if p.grad is not None)
     states = tree_leaves(list(training.optimizer.state.values()))
     state = sum(x.nbytes for x in states if isinstance(x, Tensor))
@@ -265,7 +253,7 @@ def _count(training: Training, inputs: Batch, live: LiveMemory) -> tuple[list[li
     peak = max(forward + gradients + state, backward + state, changed)
     memory = {"gradients": gradients, "optimizer": state, "batch": before, "activations": kept}
     memory["intermediate results"] = peak - sum(memory.values())
-    return operations, memory
+    return [of_forward, of_backward, of_update], memory
 
 
 @contextmanager

@@ -59,7 +59,7 @@ def test_fake_tensors_free_what_real_ones_do() -> None:
     training.optimizer.zero_grad()
     with live:
         loss = training.loss(scenes)
-        forward = live.peak_since()
+        forward = live.peak
     counts = step_counts.count_step(TwoLayers, SIZE, BATCH, 0, "32-true")
     assert live.bytes == counts.memory["activations"]
     del loss
