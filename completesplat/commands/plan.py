@@ -9,7 +9,7 @@ import statistics
 import time
 from collections.abc import Iterable, Mapping
 from functools import partial
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -229,12 +229,10 @@ def loading_seconds(config: DictConfig) -> float | None:
         return None
     data = build({**config.data, "workers": 0}, _convert_="all")
     data.setup("fit")
-    seconds, batches = [], iter(data.train_dataloader())
+    batches = iter(data.train_dataloader())
     next(batches)  # opens files and compiles
-    start = time.perf_counter()
-    for _ in islice(batches, TIMED_BATCHES):
-        seconds.append(time.perf_counter() - start)
-        start = time.perf_counter()
+    times = [time.perf_counter(), *(time.perf_counter() for _ in islice(batches, TIMED_BATCHES))]
+    seconds = [end - start for start, end in pairwise(times)]
     return statistics.median(seconds) / data.batch_size if seconds else None
 
 

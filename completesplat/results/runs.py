@@ -273,11 +273,11 @@ def _labelled(jobs: Sequence[Job]) -> list[Job]:
     differing = [key for key in keys if len({overrides.get(key) for overrides in all_overrides}) > 1]
     # A config group's key holds a mapping, or is absent if the group changes the whole config.
     settings = {key for job in jobs for key, value in job.config.items() if not isinstance(value, dict)}
-    named = []
-    for job in jobs:
-        parts = []
-        for key in (key for key in differing if key in job.overrides):
-            bare = "." not in key and "@" not in key and key not in settings
-            parts.append(job.overrides[key] if bare else f"{key}={job.overrides[key]}")
-        named.append(replace(job, label=", ".join(parts) or job.overrides.get("experiment", "all")))
-    return named
+    groups = {key for key in differing if "." not in key and "@" not in key and key not in settings}
+
+    def label(job: Job) -> str:
+        given = {key: job.overrides[key] for key in differing if key in job.overrides}
+        parts = [value if key in groups else f"{key}={value}" for key, value in given.items()]
+        return ", ".join(parts) or job.overrides.get("experiment", "all")
+
+    return [replace(job, label=label(job)) for job in jobs]

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -81,23 +81,14 @@ def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> Entry:
     by_job = [job.test.get(predictor, {}) for job in jobs]
     scenes = _common(int(table["scenes"]) for table in by_job if table)
     bound = any(table.get(UPPER_BOUND) for table in by_job)
-    scores = _complete_scores(by_job)
+    names = [name for name in by_job[0] if "_novel_" in name or "_reference_" in name]  # of views, not of the run
+    scores = {name: [x[name] for x in by_job] for name in names if all(name in x for x in by_job)}
     means = {name: fmean(values) for name, values in scores.items()}
     if predictor != MODEL:
         return Entry(label, means, scenes, predictor, bound, protocol=jobs[0].protocol)
     deviations = {name: _deviation(values) for name, values in scores.items()} if len(jobs) > 1 else {}
     steps = _common(job.steps for job in jobs)
     return Entry(label, means, scenes, predictor, bound, len(jobs), steps, deviations, jobs[0].protocol)
-
-
-def _complete_scores(by_job: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
-    """Return the values of the views' scores that all jobs have."""
-    scores = {}
-    for name in by_job[0]:
-        of_views = "_novel_" in name or "_reference_" in name
-        if of_views and all(name in table for table in by_job):
-            scores[name] = [table[name] for table in by_job]
-    return scores
 
 
 def _deviation(values: Sequence[float]) -> float:

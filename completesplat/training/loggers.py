@@ -64,24 +64,19 @@ class MetricsFile(ExperimentWriter):
         """
         if not self.metrics:
             return
-        new = set().union(*self.metrics) - set(self.metrics_keys)
+        new, text = set().union(*self.metrics) - set(self.metrics_keys), io.StringIO(newline="")
         if new or not self.begun:
             old = self._rows_to_keep()
             self.metrics_keys = sorted(new.union(self.metrics_keys, *old))
-            write_text(self.path, self._lines([*old, *self.metrics], header=True))
-        else:
-            lines = self._lines(self.metrics, header=False)
-            with writing(self.path), self.path.open("a", newline="") as file:
-                file.write(lines)
-        self.metrics, self.begun = [], True
-
-    def _lines(self, rows: Iterable[Mapping[str, object]], header: bool) -> str:
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, self.metrics_keys)
-        if header:
+            writer = csv.DictWriter(text, self.metrics_keys)
             writer.writeheader()
-        writer.writerows(rows)
-        return text.getvalue()
+            writer.writerows([*old, *self.metrics])
+            write_text(self.path, text.getvalue())
+        else:
+            csv.DictWriter(text, self.metrics_keys).writerows(self.metrics)
+            with writing(self.path), self.path.open("a", newline="") as file:
+                file.write(text.getvalue())
+        self.metrics, self.begun = [], True
 
     def _rows_to_keep(self) -> list[dict[str, str]]:
         if not self.path.is_file():

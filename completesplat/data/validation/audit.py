@@ -1,6 +1,6 @@
 """Check of a whole data set: numbers of usable sequences and frames, and reasons for those that are not usable."""
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -86,7 +86,9 @@ def _report(
 ) -> AuditReport:
     """Return what was found in sequences, which were read, and in sources, which refused some before."""
     refused = refused + [error for sequence in sequences for error in sequence.refused]
-    refused += _too_short(sequences, {error.sequence for error in refused})
+    explained = {error.sequence for error in refused}
+    short = [x for x in sequences if len(x.usable) < FEWEST_FRAMES and x.name not in explained]
+    refused += [TooFewFrames(f"{len(x.usable)} usable, 2 are needed", sequence=x.name) for x in short]
     unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in refused}
     usable = {split: [x.usable & x.frames.get(split, set()) for x in sequences] for split in sources}
     names = {split: source.names for split, source in sources.items()}
@@ -100,15 +102,8 @@ def _report(
 
 def _source_errors(source: SequenceSource) -> list[DataError]:
     """Return what a source refuses or leaves out before its sequences are read."""
-    errors = list(source.refused)
-    for reason, names in source.left_out.items():
-        errors += [ExcludedSequence(reason, sequence=name) for name in names]
-    return [*errors, *source.verify()]
-
-
-def _too_short(sequences: Sequence["_Sequence"], explained: Set[str | None]) -> list[DataError]:
-    short = [s for s in sequences if len(s.usable) < FEWEST_FRAMES and s.name not in explained]
-    return [TooFewFrames(f"{len(s.usable)} usable, 2 are needed", sequence=s.name) for s in short]
+    left_out = [ExcludedSequence(reason, sequence=x) for reason, names in source.left_out.items() for x in names]
+    return [*source.refused, *left_out, *source.verify()]
 
 
 def show_findings(findings: AuditReport) -> None:
