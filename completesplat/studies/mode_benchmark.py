@@ -59,7 +59,7 @@ def decoding_methods(
         def decode_part(part: slice) -> Gaussians:
             count = len(latents[part])
             skips = [feature.expand(count, -1, -1, -1) for feature in features]
-            cameras = scene.reference.cameras.map(lambda tensor: tensor.expand(count, -1, -1))
+            cameras = scene.reference.cameras[0].repeated(count)
             splatter_image: SplatterImage = model.reconstructor(latents[part], skips)
             return splatter_image.gaussians(cameras, scene.depth_range.expand(count, -1))
 

@@ -45,8 +45,7 @@ class SampleRenderer:
         """Render colour, depth and opacity [sample view] of one scene (a batch of one); settings are `generate`'s."""
         inputs = scene.reference.images, scene.reference.cameras, scene.depth_range
         gaussians = self.model.generate(*inputs, **{"samples": self.samples, "seed": self.seed, **settings})
-        cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(len(gaussians.means), *tensor.shape[1:]))
-        return self.rasterizer(gaussians, cameras)
+        return self.rasterizer(gaussians, scene.all_views().cameras[0].repeated(len(gaussians.means)))
 
 
 def first_scenes(data: SceneDataModule, count: int) -> list[SceneBatch]:

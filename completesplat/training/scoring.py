@@ -115,10 +115,8 @@ class Scorer(LightningModule):
 
     def render_from(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Render several sets of Gaussians [sample], each from the same cameras [view]: [sample view]."""
-        count = len(gaussians.means)
-        repeated = cameras.map(lambda tensor: tensor.expand(count, *tensor.shape))
         with torch.autocast(self.device.type, enabled=False):
-            return self.rasterizer(gaussians, repeated)
+            return self.rasterizer(gaussians, cameras.repeated(len(gaussians.means)))
 
     def render(self, gaussians: Gaussians, cameras: Cameras) -> Renders:
         """Render scenes [batch] from cameras [batch view], in full precision even if the network runs in less."""

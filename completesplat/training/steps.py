@@ -74,7 +74,7 @@ def synthetic_batch(size: int, batch: int, targets: int) -> SceneBatch:
     """Return views of noise from an orbit, because the content of images does not change the work of a step."""
     generator = torch.Generator().manual_seed(0)
     cameras = cameras_on_orbit(size, 1 + targets)[0]
-    cameras = cameras.relative_to(cameras[0]).map(lambda tensor: tensor.expand(batch, *tensor.shape))
+    cameras = cameras.relative_to(cameras[0]).repeated(batch)
     images = torch.rand(batch, 1 + targets, 3, size, size, generator=generator)
     views = Views(images, cameras, torch.ones_like(images[:, :, :1]))
     depth_range = torch.tensor([0.5 * DISTANCE, 2 * DISTANCE]).expand(batch, 2)

@@ -85,7 +85,7 @@ class Completion:
         def formed(step: int, level: int, estimate: Gaussians) -> None:
             nonlocal last_shown
             if self.page.worker.closed:
-                raise SystemExit  # ends the worker's thread
+                raise SystemExit  # ends this job
             progress.value = min(100.0, 100 * (step + 1) / settings["steps"])
             # A model that draws the samples in several batches does not say which of them these are.
             if len(estimate.means) == settings["samples"] and time.monotonic() - last_shown > PAUSE:

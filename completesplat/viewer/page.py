@@ -4,6 +4,8 @@ import logging
 import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent import futures
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -43,49 +45,39 @@ class Worker:
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
-        self._failed = failed
-        self._waiting: dict[str, Task] = {}
-        self._changed = threading.Condition()
-        self._busy = self.closed = False
-        self._thread = threading.Thread(target=self._run, name="completesplat-viewer", daemon=True)
-        self._thread.start()
+        self._failed, self._jobs = failed, dict[str, Future[None]]()
+        self._pool, self._lock = ThreadPoolExecutor(1, "completesplat-viewer"), threading.Lock()
+        self.closed = False
 
     def submit(self, kind: str, job: Task) -> None:
-        """Add a job after the waiting ones, or replace the waiting job of the same kind."""
-        with self._changed:
-            self._waiting[kind] = job
-            self._changed.notify_all()
+        """Add a job after the waiting ones, and drop a waiting one of the same kind."""
+        with self._lock:
+            if kind in self._jobs:
+                self._jobs[kind].cancel()  # without effect if it has begun
+            if not self.closed:
+                self._jobs[kind] = self._pool.submit(self._do, job)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until no job is left, at most `timeout` seconds; return whether none is left."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not self._busy and not self._waiting, timeout)
+        """Wait until no job is left, at most `timeout` seconds for one; return whether none is left."""
+        while left := [job for job in list(self._jobs.values()) if not job.done()]:
+            if futures.wait(left, timeout).not_done:
+                return False
+        return True
 
     def close(self) -> None:
         """Drop the waiting jobs, and wait for the current one: torch aborts a process that ends while it computes."""
-        with self._changed:
-            self._waiting.clear()
+        with self._lock:
             self.closed = True
-            self._changed.notify_all()
-        self._thread.join(timeout=30)
+        self._pool.shutdown(cancel_futures=True)
 
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._busy = False
-                self._changed.notify_all()
-                self._changed.wait_for(lambda: bool(self._waiting) or self.closed)
-                if self.closed:
-                    return
-                job = self._waiting.pop(next(iter(self._waiting)))
-                self._busy = True
+    def _do(self, job: Task) -> None:
+        try:
+            job()
+        except Exception as error:
             try:
-                job()
-            except Exception as error:
-                try:
-                    self._failed(error)
-                except Exception:
-                    log.exception("the viewer could not show an error")
+                self._failed(error)
+            except Exception:
+                log.exception("the viewer could not show an error")
 
 
 class Saver:

@@ -41,5 +41,5 @@ def test_waiting_jobs_are_dropped_on_close_which_ends_after_the_current_one(work
     threading.Timer(0.2, release.set).start()
     worker.close()
     assert release.is_set()
-    assert not any(thread.name == "completesplat-viewer" and thread.is_alive() for thread in [worker._thread])
+    assert not any(thread.is_alive() for thread in worker._pool._threads)
     assert done == []

@@ -23,10 +23,10 @@ from completesplat.errors import (
     BadAnnotation,
     BadCamera,
     BadImage,
-    CompleteSplatError,
     ImageError,
     TooFewFrames,
     errors_at,
+    needing,
 )
 from completesplat.files import by_numbers
 from completesplat.geometry.cameras import Cameras
@@ -231,11 +231,8 @@ def undistort(image: Image.Image, lens: Lens) -> Image.Image:
 def import_pycolmap() -> ModuleType:
     """Import pycolmap without its handler of SIGTERM, which ends a program before it has cleared up."""
     handler = signal.getsignal(signal.SIGTERM)
-    try:
+    with needing("colmap", "lenses with distortion and cameras=colmap need pycolmap"):
         import pycolmap
-    except ImportError:
-        message = 'lenses with distortion and cameras=colmap need pycolmap: pip install "completesplat[colmap]"'
-        raise CompleteSplatError(message) from None
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, handler)
     return pycolmap
