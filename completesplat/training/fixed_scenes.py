@@ -156,8 +156,7 @@ def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBat
             file = f"scene_{index}.ply"
             write_ply(folder / file, with_screen_space_dilation(selected, camera), [f"scene {name}", f"step {step}"])
             entries.append({"file": file, "scene": name, "reference_camera": plain_camera(camera)})
-    summary = {"step": step, "up": up.tolist(), "scenes": entries}
-    write_json(folder / "scenes.json", summary)
+    write_json(folder / "scenes.json", {"step": step, "up": up.tolist(), "scenes": entries})
 
 
 def scene_panels(

@@ -71,12 +71,11 @@ def check_name(name: str) -> None:
 
 def check_folder(folder: Path) -> None:
     """Raise WeightsError if a file of weights is missing, or has another checksum than `SHA256SUMS`, if that exists."""
-    for name in (CONFIG_FILE, WEIGHTS_FILE):
-        if not (folder / name).is_file():
-            raise WeightsError(f"{folder}: no {name} here; give the folder that training wrote as `weights`")
     sums = folder / SUMS_FILE
     known = read_small(sums).splitlines() if sums.is_file() else None
     for name in (CONFIG_FILE, WEIGHTS_FILE):
+        if not (folder / name).is_file():
+            raise WeightsError(f"{folder}: no {name} here; give the folder that training wrote as `weights`")
         if known is not None and f"{sha256_of(folder / name)}  {name}" not in known:
             raise WeightsError(
                 f"{folder / name}: damaged or changed, its SHA-256 is not the one in {SUMS_FILE}; "

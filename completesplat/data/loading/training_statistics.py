@@ -94,5 +94,4 @@ def excerpts(store: SceneStore, images: int = IMAGES) -> Iterator[tuple[PosedSeq
     for name in names:
         with suppress(DataError):
             sequence = store.source.read(name)
-            count = len(sequence.frames)
-            yield sequence, sorted({i * count // most for i in range(most)})
+            yield sequence, sorted({i * len(sequence.frames) // most for i in range(most)})
