@@ -4,7 +4,7 @@ import re
 import shlex
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TypedDict, Unpack
+from typing import Annotated, Any, TypedDict, Unpack
 
 import torch
 from hydra.utils import instantiate
@@ -76,6 +76,11 @@ def set_scoring(module: Scorer, evaluation: Config) -> None:
         raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")
 
 
+def built_parts(group: Config | None) -> list[Any]:
+    """Build the parts of a config group, without those that are null."""
+    return [part for part in instantiate(group or {}, _convert_="all").values() if part is not None]
+
+
 @stopped_together()
 def run(
     evaluation: EvaluationSettings,
@@ -96,7 +101,7 @@ def run(
     data = scored_data(run_config, evaluation)
     module = tested.open_module(run_config)
     set_scoring(module, evaluation)
-    loggers = list(instantiate(logger or {}, _convert_="all").values())
+    loggers = built_parts(logger)
     tester: Trainer = instantiate(trainer, precision=evaluation["precision"], logger=loggers, _convert_="all")
     with wandb_runs(loggers, OmegaConf.load(out / CONFIG)):
         tester.test(module, datamodule=data, verbose=False)
@@ -177,7 +182,7 @@ def run_hidden_modes(
     write_json(out / "protocol.json", settings | used)
     write_modes(measured, samples, out / "hidden_modes.png")
     scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
-    loggers: list[Logger] = list(instantiate(logger or {}, _convert_="all").values())
+    loggers: list[Logger] = built_parts(logger)
     with wandb_runs(loggers, OmegaConf.load(out / CONFIG)):
         for each in loggers:
             each.log_metrics(scores, step=0)

@@ -13,7 +13,7 @@ from lightning.pytorch.utilities.model_summary.model_summary import ModelSummary
 from omegaconf import DictConfig, OmegaConf
 
 from completesplat.commands import quieten
-from completesplat.commands.evaluate import scored_data, set_scoring
+from completesplat.commands.evaluate import built_parts, scored_data, set_scoring
 from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol
 from completesplat.data.loading.data_module import SceneDataModule
@@ -69,7 +69,7 @@ def run(config: DictConfig, out: Path) -> None:
     data, module = instantiate(config)
     # A test that cannot work is refused now, not after the training.
     tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
-    callbacks, loggers = _parts(config, "callbacks"), _parts(config, "logger")
+    callbacks, loggers = built_parts(config.get("callbacks")), built_parts(config.get("logger"))
     trainer = build(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if tested is not None:
@@ -98,11 +98,6 @@ def run(config: DictConfig, out: Path) -> None:
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
             show(evaluation_table({"protocol": described} | scores), width=160)
         write_json(out / METRICS, results)  # the last file, because it means that the job is done
-
-
-def _parts(config: DictConfig, group: str) -> list[Any]:
-    parts = build(config.get(group, {}), _convert_="all")
-    return [part for part in parts.values() if part is not None]
 
 
 def _train(trainer: Trainer, module: Stage, data: SceneDataModule, resumed: str | None, out: Path) -> dict[str, float]:

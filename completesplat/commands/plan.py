@@ -128,7 +128,9 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
         seconds, measured = measure_steps(config, counts, batch)
         step = {"steps as timed here": seconds * accumulated}
     else:
-        step = parts_of_step(counts, speeds_of_gpu(config))
+        speeds = speeds_of_gpu(config)
+        drawing = counts.drawn * counts.accumulated * speeds.drawing
+        step = {**seconds_of(counts.operations, speeds), "rasterizer": drawing}
     seconds, loading = sum(step.values()), loading_seconds(config) if there else None
     parts = {**step, **parts_beside_steps(config, counts, batch, seconds, loading)}
     total, views = sum(filter(None, parts.values())), 1 if data.latent_cache is not None else 1 + data.targets
@@ -172,12 +174,6 @@ def seconds_of(operations: Iterable[Operation], speeds: Speeds) -> dict[str, flo
         longest = max(times, key=lambda name: times[name])
         parts[longest] += times[longest]
     return parts
-
-
-def parts_of_step(counts: StepCounts, speeds: Speeds) -> dict[str, float]:
-    """Return the seconds of a step by what takes them."""
-    drawing = counts.drawn * counts.accumulated * speeds.drawing
-    return {**seconds_of(counts.operations, speeds), "rasterizer": drawing}
 
 
 def parts_beside_steps(

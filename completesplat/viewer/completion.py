@@ -78,8 +78,7 @@ class Completion:
         def arranged(scenes: Sequence[Gaussians], finished: bool) -> list[Sample]:
             """Return the earlier samples and then the new ones, without the first ones if there are too many."""
             infos = [{**settings, "image": name, "sample": i} for i in range(len(scenes))]
-            pairs = zip(scenes, infos, strict=True)
-            new = [Sample(x.to("cpu"), layers, reference, info, finished, True) for x, info in pairs]
+            new = [Sample(x.to("cpu"), layers, reference, infos[i], finished, True) for i, x in enumerate(scenes)]
             return [*earlier, *new][-MOST_SAMPLES:]
 
         def formed(step: int, level: int, estimate: Gaussians) -> None:
