@@ -195,14 +195,13 @@ class Evaluation:
         """Return {predictor: {region: {view: {metric: mean over scenes}}, "scenes": n, "views": n of novel views}}."""
         results = {predictor: self._means_of(predictor) for predictor in self.scores}
         if self.drawn:
-            names = sorted(self.drawn)
+            drawn = [self.drawn[name] for name in sorted(self.drawn)]
             for kind in ("curve", "curve_noisy_mean"):
-                results[BEST][kind] = _means([self.drawn[name][kind] for name in names])
-            results[MEAN]["diversity"] = sum(self.drawn[name]["diversity"] for name in names) / len(names)
+                results[BEST][kind] = _means([scene[kind] for scene in drawn])
+            results[MEAN]["diversity"] = sum(scene["diversity"] for scene in drawn) / len(drawn)
             for region in ("full", "hidden"):
-                ranks = [self.drawn[name]["ranks"] for name in names if region in self.drawn[name]["ranks"]]
-                if ranks:
-                    results[MEAN][f"ranks_{region}"] = _means([shares[region] for shares in ranks])
+                if ranks := [scene["ranks"][region] for scene in drawn if region in scene["ranks"]]:
+                    results[MEAN][f"ranks_{region}"] = _means(ranks)
         return results
 
     def _means_of(self, predictor: str) -> dict[str, Any]:

@@ -99,20 +99,19 @@ def is_comparable(table: PublishedTable, entry: measured.Entry) -> bool:
     """
     protocol = entry.protocol
     wanted = table.evaluations.get(str(protocol.get("name")))
-    if wanted is None or protocol.get("skipped") or entry.upper_bound:
-        return False
-    if protocol.get("background") is not None or protocol.get("skip_weight") not in (None, 1):
-        return False
-    if protocol["data_set"] not in {data_set for *_, data_set in score_columns(table)}:
-        return False
-    if "subset" in table and protocol.get("subset") != table.subset:
+    if wanted is None:
         return False
     is_oracle = entry.predictor in (measured.BEST_OF_K, measured.BEST_BY_METRIC)
-    if is_oracle and protocol.get("samples") != table.get("oracle_samples"):
-        return False
-    if protocol["scenes"] not in wanted.get("scenes", [protocol.get("scenes_listed")]):
-        return False
-    return (protocol["resolution"], protocol.get("protocol_views")) == (wanted["resolution"], wanted["protocol_views"])
+    differences = (
+        protocol.get("skipped") or entry.upper_bound,
+        protocol.get("background") is not None or protocol.get("skip_weight") not in (None, 1),
+        protocol["data_set"] not in {data_set for *_, data_set in score_columns(table)},
+        "subset" in table and protocol.get("subset") != table.subset,
+        is_oracle and protocol.get("samples") != table.get("oracle_samples"),
+        protocol["scenes"] not in wanted.get("scenes", [protocol.get("scenes_listed")]),
+        (protocol["resolution"], protocol.get("protocol_views")) != (wanted["resolution"], wanted["protocol_views"]),
+    )
+    return not any(differences)
 
 
 def sweep_entries(table: PublishedTable, name: str, jobs: Sequence[Job]) -> list[measured.Entry]:
