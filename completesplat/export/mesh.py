@@ -52,9 +52,8 @@ def mesh_of(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras, pivot:
     arm = pivot - reference.centers
     tangent = reference.image_size[1] / 2 / reference.intrinsics[0, 0].item()
     radius = REACH * tangent * arm.norm().item()
-    center = (
-        pivot + torch.nn.functional.normalize(arm, dim=-1) * radius / 3
-    )  # the pivot lies on the front, or in objects
+    # The pivot lies on the front, or in objects.
+    center = pivot + torch.nn.functional.normalize(arm, dim=-1) * radius / 3
     scene = scene[(scene.means - center).norm(dim=-1) < radius]
     cameras = cameras_around(center, radius, tangent)
     views = [rasterizer(scene[None], cameras[i : i + 1][None])[0, 0] for i in range(VIEWS)]

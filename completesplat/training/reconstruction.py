@@ -52,8 +52,7 @@ class ReconstructionScorer(Scorer):
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Return Gaussians from the posterior's mode; nothing is drawn, so the seed has no effect."""
-        reconstruction: Reconstruction = self(scenes)
-        return reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
+        return self(scenes).splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
 
 
 class ReconstructionModule(ReconstructionScorer, Stage):
