@@ -52,7 +52,8 @@ class ReconstructionScorer(Scorer):
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Return Gaussians from the posterior's mode; nothing is drawn, so the seed has no effect."""
-        return self(scenes).splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
+        reconstruction: Reconstruction = self(scenes)
+        return reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
 
 
 class ReconstructionModule(ReconstructionScorer, Stage):
