@@ -2,7 +2,7 @@
 
 import gzip
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -158,12 +158,3 @@ def write_tree(root: Path, counts: Mapping[str, int], splits: Mapping[str, Seque
             entries.append(entry)
         write_cloud(folder / "pointcloud.ply", OCTAHEDRON)
     return write_annotations(root, entries, [sequence_entry(name) for name in counts], splits)
-
-
-def change(path: Path, edit: Callable[[Any], object]) -> None:
-    """Change a (gzipped) JSON file: `edit` changes the content in place, or returns another one."""
-    packed, raw = path.suffix == ".jgz", path.read_bytes()
-    content = json.loads(gzip.decompress(raw) if packed else raw)
-    other = edit(content)
-    text = json.dumps(content if other is None else other).encode()
-    path.write_bytes(gzip.compress(text, 1) if packed else text)

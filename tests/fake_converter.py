@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from support import write_program
+
 # Notes its arguments beside itself and copies the last but one to the last.
 COPY = """
 echo "$@" >> "$0.log"
@@ -14,10 +16,7 @@ cp "$source" "$target"
 def install(folder: Path, name: str, script: str = COPY) -> Path:
     """An executable shell script in a folder for PATH."""
     folder.mkdir(exist_ok=True)
-    path = folder / name
-    path.write_text(f"#!/bin/sh\n{script}")
-    path.chmod(0o755)
-    return path
+    return write_program(folder / name, script)
 
 
 def calls(program: Path) -> list[str]:

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import torch
 from hydra.utils import instantiate
+from packed_sequences import prepared
 from realestate10k_trees import make_clip, module, write_tree
 from support import compose_config
 
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
-from completesplat.data.packed.writing import prepare
 from completesplat.data.realestate10k.module import RE10KDataModule
 
 FRAMES = 5
@@ -39,10 +39,7 @@ def broken_rooms(root: Path) -> Path:
 
 def pack(raw: Path, **settings: object) -> Path:
     """The packed store of these clips, beside them."""
-    data = rooms(raw, **settings)
-    sources = {split: data.source(split) for split in ("train", "val", "test")}
-    out = raw.with_name("packed")
-    return prepare(sources, data.packed_settings(), out, workers=1, policy=("skip", 1.0), progress=False)
+    return prepared(rooms(raw, **settings), raw.with_name("packed"), policy=("skip", 1.0))
 
 
 def rooms(root: Path, **settings: object) -> RE10KDataModule:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from support import write_program
 
 from completesplat.data.rendered.blender import find_blender
 from completesplat.errors import CompleteSplatError
@@ -52,6 +53,18 @@ def write_ply(path: Path, vertices: Sequence[Sequence[float]]) -> Path:
     content = np.array(vertices, dtype="<f4").tobytes() + bytes([3]) + np.arange(3, dtype="<i4").tobytes()
     path.write_bytes(header.encode() + content)
     return path
+
+
+def write_textured(folder: Path, texture: str, library: str = "a.mtl") -> None:
+    """Write the OBJ of a triangle whose material names a texture."""
+    (folder / "a.mtl").write_text(f"newmtl m\nmap_Kd -s 1 1 1 {texture}\n")
+    write_triangle(folder / "a.obj", vertices=f"mtllib {library}\nv 0 0 0\nv 1 0 0\nv 0 1 0\n")
+
+
+def write_stand_in(folder: Path) -> str:
+    """Write a program that is no Blender, for meshes that are refused before it starts."""
+    answer = '[ "$1" = --version ] && echo Blender 4.2.0 || echo has started; exit 1'
+    return str(write_program(folder / "blender", answer))
 
 
 def need_blender() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.writing import prepare
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.errors import BadImage, DataError
@@ -92,6 +93,12 @@ def pack(source: ListedSource, out: Path, split: str = "train", settings: dict |
     """Prepare a store of one split: two sequences in each shard, in this process."""
     quick = {"sequences_per_shard": 2, "workers": 1, "progress": False}
     return prepare({split: source}, {"image_size": SIZE} | (settings or {}), out, **quick | options)
+
+
+def prepared(data: SceneDataModule, out: Path, **settings: Any) -> Path:
+    """The packed store of a data module."""
+    sources = {split: data.source(split) for split in ("train", "val", "test")}
+    return prepare(sources, data.packed_settings(), out, **{"workers": 1, "progress": False, **settings})
 
 
 def contents(folder: Path) -> dict[str, bytes]:

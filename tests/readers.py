@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import meshes
 import numpy as np
 import pytest
-from co3d_trees import CATEGORY, SUBSET, change
+from co3d_trees import CATEGORY, SUBSET
 from co3d_trees import write_tree as write_category
 from latent_caches import rooms, small_autoreconstructor, sound_rooms
 from PIL import Image
@@ -16,7 +16,7 @@ from pretrained_vaes import build, random_vae
 from published_weights import write_published
 from realestate10k_trees import StoredClip, make_clip, module, write_chunk_form, write_text_form
 from splats_of_others import SCENE
-from support import some_gaussians, write_capture
+from support import change_json, some_gaussians, write_capture
 
 from completesplat.baselines.splatter_image.model import find_published, read_tensors
 from completesplat.data.captures.module import CaptureDataModule
@@ -147,10 +147,7 @@ def write_meshes(folder: Path) -> None:
     Image.new("RGB", (8, 8), (200, 40, 40)).save(folder / "outside/private.png")
     (folder / "outside/private.mtl").write_text("newmtl m\n")
     (folder / "meshes/sub").mkdir(parents=True)
-    (folder / "blender").write_text(
-        '#!/bin/sh\n[ "$1" = --version ] && echo Blender 4.2.0 || echo has started; exit 1\n'
-    )
-    (folder / "blender").chmod(0o755)
+    meshes.write_stand_in(folder)
 
 
 def read_meshes(folder: Path) -> None:
@@ -182,7 +179,7 @@ READERS = {
 
 def edit(file: str, edit_content: Callable[[Any], object]) -> Damage:
     """Edit a (gzipped) JSON file."""
-    return lambda folder: change(folder / file, edit_content)
+    return lambda folder: change_json(folder / file, edit_content)
 
 
 def put(file: str, keys: str, value: object) -> Damage:

@@ -1,14 +1,17 @@
 """Helpers that tests of commands share."""
 
 import functools
+import gzip
 import json
 import math
 import pickle
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +21,7 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from PIL import Image
+from PIL import ExifTags, Image
 
 from completesplat import cli
 from completesplat.commands import refusal
@@ -80,6 +83,59 @@ def script(folder: Path) -> Path:
     return path
 
 
+def python(program: str, *arguments: object, **settings: Any) -> str:
+    """Run a program in a new process, which must succeed, and return what it prints."""
+    started = [sys.executable, "-c", program, *map(str, arguments)]
+    done = subprocess.run(started, capture_output=True, text=True, **settings)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def write_program(path: Path, text: str) -> Path:
+    """Write an executable shell script."""
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return path
+
+
+def flip_bit(path: Path, bit: int | None = None) -> None:
+    """Flip a bit of a file: of its middle byte, if none is given."""
+    content = bytearray(path.read_bytes())
+    bit = 8 * (len(content) // 2) if bit is None else bit
+    content[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(content)
+
+
+def change_json(path: Path, edit: Callable[[Any], object]) -> None:
+    """Change a (gzipped) JSON file: `edit` changes the content in place, or returns another one."""
+    packed, raw = path.suffix == ".jgz", path.read_bytes()
+    content = json.loads(gzip.decompress(raw) if packed else raw)
+    other = edit(content)
+    text = json.dumps(content if other is None else other).encode()
+    path.write_bytes(gzip.compress(text, 1) if packed else text)
+
+
+def hub_snapshot(monkeypatch: pytest.MonkeyPatch, hub: Path, name: str) -> Path:
+    """Keep to a cache of the Hugging Face hub, and return the folder, not made yet, of a repository's files in it."""
+    import huggingface_hub.constants
+
+    repository, commit = hub / f"models--{name.replace('/', '--')}", "0" * 40
+    (repository / "refs").mkdir(parents=True)
+    (repository / "refs/main").write_text(commit)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(hub))
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    return repository / "snapshots" / commit
+
+
+def shipped_folders(root: Path, **known: tuple[int, Sequence[float] | None]) -> dict[str, Path]:
+    """Folders with descriptions of weights: the size and the mean colour of their training images, None if unknown."""
+    for name, (size, mean) in known.items():
+        (root / name).mkdir(parents=True)
+        training = {} if mean is None else {"picture_mean": [*map(float, mean), *[0.0] * 5], "picture_std": [0.1] * 8}
+        (root / name / "config.json").write_text(json.dumps({"image_size": size, "training": training}))
+    return {name: root / name for name in known}
+
+
 def strict_json(path: Path):
     """Parse JSON, refusing the NaN and Infinity that Python's reader lets through."""
 
@@ -127,6 +183,13 @@ def write_capture(folder: Path, frames: int, names: Sequence[str] = ()) -> None:
         Image.new("RGB", (16, 12), (30 * number,) * 3).save(folder / name)
         listed.append({"file_path": name, "transform_matrix": pose.tolist()})
     (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": listed}))
+
+
+def exif_turned(orientation: int) -> Image.Exif:
+    """A record that says how an image is to be turned."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    return exif
 
 
 def tiny_generator() -> CompleteSplat:

@@ -199,8 +199,7 @@ def textured(texture: str, library: str = "a.mtl", pipe: bool = False, link: boo
         if link:
             (folder / "t.png").symlink_to(folder / "../../outside/private.png")
         if form == "obj":
-            (folder / "a.mtl").write_text(f"newmtl m\nmap_Kd -s 1 1 1 {texture}\n")
-            meshes.write_triangle(folder / "a.obj", vertices=f"mtllib {library}\nv 0 0 0\nv 1 0 0\nv 0 1 0\n")
+            meshes.write_textured(folder, texture, library)
             return
         path = meshes.write_gltf(folder / "a.gltf", texture)
         if form == "glb":

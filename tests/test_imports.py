@@ -1,9 +1,7 @@
 """Postponed imports: diffusers, numba and other libraries work as if the modules had been imported."""
 
-import subprocess
-import sys
-
 import pytest
+from support import python
 
 pytestmark = pytest.mark.processes
 
@@ -100,6 +98,4 @@ PROGRAMS = {name: IMPORTED + script for name, script in SCRIPTS.items()} | ALONE
 
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_libraries_work_with_postponed_imports(name: str) -> None:
-    program = f"import sys\nfrom completesplat.imports import POSTPONED, postponing\n{PROGRAMS[name]}"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-3000:]
+    python(f"import sys\nfrom completesplat.imports import POSTPONED, postponing\n{PROGRAMS[name]}")

@@ -6,6 +6,7 @@ import subprocess
 import time
 
 import pytest
+from support import flip_bit, hub_snapshot
 
 from completesplat import weights
 from completesplat.errors import WeightsError
@@ -25,9 +26,7 @@ def test_checksums_are_those_of_sha256sum(folder):
 
 
 def test_a_flipped_bit_is_refused_until_the_checksums_are_rewritten(folder):
-    content = bytearray((folder / WEIGHTS_FILE).read_bytes())
-    content[len(content) // 2] ^= 1
-    (folder / WEIGHTS_FILE).write_bytes(content)
+    flip_bit(folder / WEIGHTS_FILE)
     with pytest.raises(WeightsError, match=rf"{WEIGHTS_FILE}: damaged or changed.*remove {SUMS_FILE}"):
         CompleteSplat.from_pretrained(folder)
     write_sums(folder)
@@ -57,16 +56,8 @@ def test_shipped_weights_are_named_first(folder, tmp_path, monkeypatch):
 
 
 def test_a_hub_repository_in_the_cache_needs_no_network(tiny_weights, tmp_path, monkeypatch):
-    import huggingface_hub.constants
-
-    repository = tmp_path / "hub" / "models--some--splats"
-    commit = "0123456789abcdef0123456789abcdef01234567"
-    (repository / "refs").mkdir(parents=True)
-    (repository / "refs" / "main").write_text(commit)
-    shutil.copytree(tiny_weights, repository / "snapshots" / commit)
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
-    assert locate("some/splats") == repository / "snapshots" / commit / WEIGHTS_FILE
+    snapshot = shutil.copytree(tiny_weights, hub_snapshot(monkeypatch, tmp_path / "hub", "some/splats"))
+    assert locate("some/splats") == snapshot / WEIGHTS_FILE
     with pytest.raises(WeightsError, match="other/splats: no folder here, and not to be had from the hub"):
         locate("other/splats")
 

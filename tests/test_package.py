@@ -1,9 +1,7 @@
 """What `import completesplat` offers."""
 
-import subprocess
-import sys
-
 import pytest
+from support import python
 
 import completesplat
 from completesplat.export.ply import read_ply, write_ply
@@ -22,4 +20,4 @@ def test_the_package_offers_the_model_and_its_scenes():
 
 def test_the_package_itself_does_not_wait_for_torch():
     code = "import sys, completesplat; print('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
+    assert python(code) == "False\n"

@@ -5,6 +5,7 @@ import re
 import pytest
 import yaml
 from published_weights import config, write_published
+from support import hub_snapshot
 
 from completesplat.baselines.splatter_image.model import find_published, is_published
 from completesplat.errors import WeightsError
@@ -30,15 +31,8 @@ def test_a_file_a_folder_and_a_name_of_the_hub_are_known(tmp_path, tiny_weights)
 
 
 def test_the_hub_is_asked_once_and_without_it_a_line_says_what_to_fetch(tmp_path, monkeypatch):
-    import huggingface_hub.constants
-
-    snapshot = tmp_path / "hub/models--szymanowiczs--splatter-image-v1/snapshots" / ("0" * 40)
-    refs = snapshot.parents[1] / "refs"
-    refs.mkdir(parents=True)
-    (refs / "main").write_text("0" * 40)
+    snapshot = hub_snapshot(monkeypatch, tmp_path / "hub", "szymanowiczs/splatter-image-v1")
     path = write_published(snapshot, "objaverse")
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     assert find_published("splatter_image:objaverse").weights == path
     fetched = "config_cars.yaml model_cars.pth --local-dir DIR` fetches it; then give weights=DIR/model_cars.pth"
     with pytest.raises(

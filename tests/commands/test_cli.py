@@ -4,6 +4,7 @@ import sys
 
 import pytest
 from omegaconf import OmegaConf
+from support import python
 
 from completesplat import __version__
 from completesplat.cli import VERBS
@@ -13,12 +14,6 @@ from completesplat.settings.help import help_page
 NOT_THERE = [["predict", "a.jpg"], ["predict"], ["test"], ["test", "ckpt=a.ckpt"]]
 NOT_THERE += [["predict", __file__, setting] for setting in ("weights=none", "formats=obj", "video=zoom")]
 NOT_THERE += [["view", "weights=none"]]
-
-
-def python(program: str, **settings) -> str:
-    """Run a program in a new process and return what it prints."""
-    started = [sys.executable, "-c", program]
-    return subprocess.run(started, capture_output=True, text=True, check=True, **settings).stdout
 
 
 @pytest.mark.processes

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from co3d_trees import change
 from realestate10k_trees import make_clip, write_tree
-from support import SMALL, strict_json
+from support import SMALL, change_json, strict_json
 
 from completesplat.data.toy import write_objects
 
@@ -50,13 +49,13 @@ def test_every_planted_fault_is_found_and_nothing_else(command, intact, damaged,
     image, pose, cloud, sound, *_ = sorted(path.name for path in damaged.iterdir() if (path / "images").is_dir())
     cut_short(damaged / image / "images/frame000002.jpg")
     cut_short(damaged / cloud / "pointcloud.ply")
-    change(damaged / SET_LIST, lambda lists: lists["train"].append([sound, 99]))  # frame 99 has no annotation
+    change_json(damaged / SET_LIST, lambda lists: lists["train"].append([sound, 99]))  # frame 99 has no annotation
 
     def plant(entries: list[dict]) -> None:
         entry = [entry for entry in entries if entry["sequence_name"] == pose][1]
         entry["viewpoint"].update(T=[0.0, float("nan"), 1.0])
 
-    change(damaged / FRAMES, plant)
+    change_json(damaged / FRAMES, plant)
     finished, results = checked(command, damaged.parent, tmp_path / "out")
     assert finished.status == 0
     places = {(entry["sequence"], entry["frame"]) for entry in results["refused"]}
@@ -87,7 +86,7 @@ def test_where_nothing_is_usable_the_status_is_1(command, damaged, tmp_path, dam
 
 
 def test_validation_on_test_sequences_is_reported(command, damaged, tmp_path):
-    change(damaged / SET_LIST, lambda lists: lists.update(val=lists["test"]))
+    change_json(damaged / SET_LIST, lambda lists: lists.update(val=lists["test"]))
     finished, results = checked(command, damaged.parent, tmp_path / "out")
     assert finished.status == 1
     assert "1 sequences are in both val and test" in results["refused"][-1]["reason"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 import pytest
 from omegaconf import OmegaConf
-from support import LIMIT, SMALL, refused, strict_json, write_capture
+from support import LIMIT, SMALL, flip_bit, refused, strict_json, write_capture
 
 from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.data.toy import write_rooms
@@ -86,9 +86,7 @@ def test_prepared_data_pass_the_check_until_a_bit_flips_and_are_not_prepared_aga
     assert "the data to be prepared lie there" in command.refuses("data", "prepare", *sets["rooms"], own_place)
     assert checked()["refused"] == []
     shard = next(store.glob("train-*.arrow"))
-    content = bytearray(shard.read_bytes())
-    content[len(content) // 2] ^= 1
-    shard.write_bytes(content)
+    flip_bit(shard)
     results = checked()
     assert any(entry["file"] == str(shard) for entry in results["refused"])
     assert "changed file" in results["counts"]

@@ -5,7 +5,7 @@ from functools import partial
 from importlib import import_module
 
 from packaging.requirements import Requirement
-from support import strict_json
+from support import strict_json, write_program
 
 from completesplat.commands import doctor
 from completesplat.commands.doctor import Finding, findings_of, required_packages
@@ -73,9 +73,7 @@ def test_missing_node_and_blender_are_no_errors_but_ffmpeg_and_space_are_needed(
     monkeypatch.delenv("COMPLETESPLAT_BLENDER", raising=False)
     expected = {"ffmpeg": "yes", "node": "no", "blender": "no", "free disk": "yes"}
     assert states(doctor.check_tools(tmp_path)) == expected
-    blender = tmp_path / "program"
-    blender.write_text("#!/bin/sh\necho Blender 4.5.1 LTS\n")
-    blender.chmod(0o700)
+    blender = write_program(tmp_path / "program", "echo Blender 4.5.1 LTS")
     monkeypatch.setenv("COMPLETESPLAT_BLENDER", str(blender))
     expected["blender"] = "yes"
     monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: 1 / 0)

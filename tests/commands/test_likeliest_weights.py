@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.stats import norm
-from support import compose_config, strict_json
+from support import change_json, compose_config, shipped_folders, strict_json
 
 from completesplat.commands.trained import likeliest_weights, open_generator
 from completesplat.errors import WeightsError
@@ -20,12 +20,7 @@ COUCH = SHIPPED / "rendered_couches/held_out.jpg"
 @pytest.fixture
 def package(tmp_path, monkeypatch):
     """Three folders of weights in place of the package's; their training images had these mean colours and sizes."""
-    folders = {}
-    for name, size, mean in (("blues", 16, [0, 0, 1.0]), ("greens", 48, [0, 1.0, 0]), ("reds", 24, [1.0, 0, 0])):
-        folders[name] = tmp_path / "package" / name
-        folders[name].mkdir(parents=True)
-        training = {"picture_mean": mean + [0.0] * 5, "picture_std": [0.1] * 8}
-        (folders[name] / "config.json").write_text(json.dumps({"image_size": size, "training": training}))
+    folders = shipped_folders(tmp_path / "package", blues=(16, (0, 0, 1)), greens=(48, (0, 1, 0)), reds=(24, (1, 0, 0)))
     for module in ("scene_model", "commands.trained"):
         monkeypatch.setattr(f"completesplat.{module}.shipped", lambda: folders)
     return folders
@@ -50,9 +45,7 @@ def test_the_likeliest_for_the_images_that_can_be_read_are_chosen_and_the_others
     assert likeliest_weights(images[:2], False) == ("blues", f"; no image can be read {others}")
     assert likeliest_weights([], False) == ("blues", f"; there is no image to choose by {others}")
     for name in ("blues", "greens"):  # of one kind each
-        config = json.loads((package[name] / "config.json").read_text())
-        config["training"]["log_odds"] = 1.0
-        (package[name] / "config.json").write_text(json.dumps(config))
+        change_json(package[name] / "config.json", lambda config: config["training"].update(log_odds=1.0))
     assert likeliest_weights(images[:2], False)[0] == "reds"
     package.clear()
     with pytest.raises(WeightsError, match="this package has no weights; give weights=DIR"):
@@ -66,12 +59,9 @@ def test_of_many_images_a_few_from_all_over_are_looked_at(package, tmp_path):
 
 
 def test_probabilities_are_those_of_normal_distributions_and_log_odds(package, tmp_path):
-    config = json.loads((package["blues"] / "config.json").read_text())
-    config["training"] = {"picture_mean": [0.5] * 3 + [0.0] * 5, "picture_std": [0.5] * 8}
-    (package["blues"] / "config.json").write_text(json.dumps(config))
-    config = json.loads((package["reds"] / "config.json").read_text())
-    config["training"]["log_odds"] = 1.5
-    (package["reds"] / "config.json").write_text(json.dumps(config))
+    training = {"picture_mean": [0.5] * 3 + [0.0] * 5, "picture_std": [0.5] * 8}
+    change_json(package["blues"] / "config.json", lambda config: config.update(training=training))
+    change_json(package["reds"] / "config.json", lambda config: config["training"].update(log_odds=1.5))
     found = match_shipped(photo(tmp_path / "photo.png", "#b70000"))  # nearer to blues, but likelier among reds
     features = np.array([0xB7 / 255, 0, 0, 0, 0, 0, 0, 0])
     broad, narrow = np.full(8, 0.5), np.full(8, 0.1)
@@ -88,9 +78,7 @@ def test_probabilities_are_those_of_normal_distributions_and_log_odds(package, t
 
 @pytest.mark.parametrize(("border", "chosen"), [("white", "reds"), ("red", "blues")])
 def test_weights_of_objects_on_white_are_for_images_whose_border_is_white(package, tmp_path, border, chosen):
-    config = json.loads((package["reds"] / "config.json").read_text())
-    config["training"]["background"] = 1.0
-    (package["reds"] / "config.json").write_text(json.dumps(config))
+    change_json(package["reds"] / "config.json", lambda config: config["training"].update(background=1.0))
     image = Image.new("RGB", (60, 60), border)
     image.paste("red", (3, 3, 60, 57))  # the object touches the right side
     image.save(tmp_path / "object.png")

@@ -1,11 +1,11 @@
 """A user's own part of the networks: trained in both stages, written with the weights by its name, and read again."""
 
-import json
 import shutil
 import sys
 
 import pytest
-from support import SMALL, strict_json
+from readers import put
+from support import SMALL, hub_snapshot, strict_json
 
 from completesplat import CompleteSplat
 from completesplat.errors import WeightsError
@@ -111,14 +111,8 @@ def test_a_run_that_somebody_works_in_is_not_the_users_own(runs, imported, monke
 
 
 def test_what_the_hub_has_sent_is_not_the_users_own_even_below_the_working_folder(runs, imported, monkeypatch):
-    import huggingface_hub.constants
-
-    repository, commit = runs / "cache/hub/models--some--splats", "0123456789abcdef0123456789abcdef01234567"
-    (repository / "refs").mkdir(parents=True)
-    (repository / "refs/main").write_text(commit)
-    snapshot = shutil.copytree(runs / "STAGE2/weights", repository / "snapshots" / commit)
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(runs / "cache/hub"))
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    place = hub_snapshot(monkeypatch, runs / "cache/hub", "some/splats")
+    snapshot = shutil.copytree(runs / "STAGE2/weights", place)
     for weights in ("some/splats", snapshot):
         must_be_refused(weights, imported)
     assert CompleteSplat.from_pretrained("some/splats", trust=True).image_size == 32
@@ -129,9 +123,7 @@ def test_trust_allows_only_what_the_users_modules_define(runs, imported, foreign
     weights = runs / "STAGE2/weights"
     (weights / SUMS_FILE).unlink()
     for settings in ({"_target_": foreign}, {"_target_": "myenc.Enc", "inner": [{"x": {"_target_": foreign}}]}):
-        written = json.loads((runs / "STAGE2/weights" / CONFIG_FILE).read_text())
-        written["autoreconstructor"]["encoder"] = settings
-        (weights / CONFIG_FILE).write_text(json.dumps(written))
+        put(CONFIG_FILE, "autoreconstructor.encoder", settings)(weights)
         with pytest.raises(WeightsError, match=rf"names {foreign}, .* of your own, which lies in the working folder"):
             CompleteSplat.from_pretrained(weights, trust=True)
 

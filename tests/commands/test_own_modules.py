@@ -1,6 +1,5 @@
 """Modules and settings of the user's own, in the working folder, as the documents describe them."""
 
-import json
 import os
 import shutil
 import subprocess
@@ -10,7 +9,7 @@ from itertools import product
 
 import pytest
 from omegaconf import OmegaConf
-from support import SMALL, strict_json
+from support import SMALL, change_json, strict_json
 from written_commands import ROOT
 
 from completesplat import compose
@@ -177,9 +176,8 @@ def test_a_metric_that_a_run_names_is_not_imported(command, own_metric, pipeline
     shutil.copytree(pipeline.var, own_metric / "RUN")
     config = OmegaConf.load(own_metric / "RUN/config.yaml")
     config.evaluation.metrics = {"psnr": {"_target_": "mymetric.Bias"}}
-    record = strict_json(own_metric / "RUN/run.json")
-    record["overrides"] += [OWN_METRIC, "evaluation.metrics.ssim=null"]
-    (own_metric / "RUN/run.json").write_text(json.dumps(record))
+    more = [OWN_METRIC, "evaluation.metrics.ssim=null"]
+    change_json(own_metric / "RUN/run.json", lambda record: record["overrides"].extend(more))
     OmegaConf.save(config, own_metric / "RUN/config.yaml")
     printed = command.succeeds("test", "ckpt=RUN", "trainer.accelerator=cpu", "out=OUT").out
     assert not (own_metric / "imported").exists()

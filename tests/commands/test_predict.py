@@ -1,6 +1,4 @@
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -9,7 +7,7 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 from plyfile import PlyData
-from support import strict_json
+from support import python, strict_json
 
 from completesplat.commands.predict import visible_part
 from completesplat.errors import CompleteSplatError
@@ -65,8 +63,7 @@ def test_a_prediction_imports_only_what_it_needs_and_the_garbage_collector_leave
     program = f"import gc, sys; sys.argv = {['completesplat', 'predict', *given, f'out={tmp_path}']}\n"
     program += "from completesplat.cli import main; main()\n"
     program += f"print([name for name in {UNNEEDED} if name in sys.modules], gc.isenabled(), gc.get_freeze_count())"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    unneeded, enabled, frozen = done.stdout.splitlines()[-1].rsplit(" ", 2)
+    unneeded, enabled, frozen = python(program).splitlines()[-1].rsplit(" ", 2)
     assert (unneeded, enabled) == ("[]", "True")
     assert int(frozen) > 100_000
 

@@ -11,6 +11,7 @@ import pytest
 import skimage
 import torch
 from PIL import Image
+from support import exif_turned
 
 from completesplat.data.images.photograph import (
     image_features,
@@ -27,9 +28,7 @@ def photo(path: Path, background: str = "red") -> Path:
     """A blue square in the upper left quarter of what EXIF says is upside down."""
     image = Image.new("RGB", (32, 32), background)
     image.paste("blue", (0, 0, 16, 16))
-    exif = Image.Exif()
-    exif[274] = 3
-    image.save(path, exif=exif)
+    image.save(path, exif=exif_turned(3))
     return path
 
 

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from packed_sequences import prepared
 from support import write_capture
 
 from completesplat.data.captures.capture_set import CaptureSetDataModule
 from completesplat.data.captures.module import CaptureDataModule
-from completesplat.data.packed.writing import prepare
 from completesplat.errors import BadAnnotation, DataError, MissingFile, SharedSequences
 
 OBJECTS, RINGS = ("apple", "cherry", "pear", "plum"), ("r0", "r1")
@@ -87,9 +87,7 @@ def test_a_folder_without_captures_or_no_folder_is_refused(tmp_path: Path) -> No
 
 def test_packed_captures_are_the_same_data_set(root: Path, tmp_path: Path) -> None:
     data = module(root, val_fraction=0.25, test_fraction=0.25)
-    sources = {part: data.source(part) for part in ("train", "val", "test")}
-    prepare(sources, data.packed_settings(), tmp_path / "store", codec="png", workers=1, progress=False)
-    packed = module(tmp_path / "store", val_fraction=0.25, test_fraction=0.25)
+    packed = module(prepared(data, tmp_path / "store", codec="png"), val_fraction=0.25, test_fraction=0.25)
     for part, names in split(data).items():
         assert sorted(packed.source(part).names) == names
         sequence = packed.source(part).read(names[0])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support import write_capture
+from support import change_json, exif_turned, flip_bit, write_capture
 
 from completesplat.data.captures import transforms_json
 from completesplat.data.captures.capture import CapturedFrame
@@ -163,11 +163,13 @@ def test_known_points_are_where_the_cameras_of_transforms_see_them_in_images_and
     path = write_transforms(tmp_path, suffix, **lens)
     assert reprojection_errors(tmp_path).max() < 0.1
     assert (first_sequence(tmp_path).read(2).mask == 255).all()  # Without masks, everything is foreground.
-    content = json.loads(path.read_text())
-    for frame in content["frames"]:
-        frame["mask_path"] = Path(frame["file_path"]).with_suffix(".mask.png").as_posix()
-        Image.open(tmp_path / frame["file_path"]).convert("L").save(tmp_path / frame["mask_path"])
-    path.write_text(json.dumps(content))
+
+    def add_masks(content):
+        for frame in content["frames"]:
+            frame["mask_path"] = Path(frame["file_path"]).with_suffix(".mask.png").as_posix()
+            Image.open(tmp_path / frame["file_path"]).convert("L").save(tmp_path / frame["mask_path"])
+
+    change_json(path, add_masks)
     assert reprojection_errors(tmp_path, "mask").max() < 0.1
 
 
@@ -270,9 +272,8 @@ def test_frames_without_an_image_are_named_and_left_out(tmp_path, caplog):
 def test_a_missing_frame_costs_one_resolved_path(tmp_path, monkeypatch):
     """Resolving the links of every ending that an image may have took a minute for 100,000 missing frames."""
     write_capture(tmp_path, 6)
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    content["frames"] += [content["frames"][0] | {"file_path": f"gone/{number}"} for number in range(50)]
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    gone = [{"file_path": f"gone/{number}", "transform_matrix": np.eye(4).tolist()} for number in range(50)]
+    change_json(tmp_path / "transforms.json", lambda content: content["frames"].extend(gone))
     resolved, path_below = [], transforms_json.path_below
     monkeypatch.setattr(transforms_json, "path_below", lambda *given: resolved.append(given) or path_below(*given))
     assert len(read_transforms(tmp_path / "transforms.json").frames) == 6
@@ -339,21 +340,9 @@ def test_photographs_have_the_cameras_of_their_squares(tmp_path):
         read_photographs([tmp_path / "0/images/r_0.png"], path, 32)
 
 
-def turn(path: Path) -> None:
-    exif = Image.Exif()
-    exif[274] = 3  # Upside down: the size is the same.
-    Image.open(path).save(path, exif=exif)
-
-
-def flip_a_bit(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 16
-    path.write_bytes(content)
-
-
 IMAGES = {
-    "upside down by EXIF": (turn, r"EXIF orientation 3"),
-    "damaged": (flip_a_bit, "cannot be decoded"),
+    "upside down by EXIF": (lambda path: Image.open(path).save(path, exif=exif_turned(3)), r"EXIF orientation 3"),
+    "damaged": (flip_bit, "cannot be decoded"),
     "of another size": (lambda path: Image.new("RGB", (WIDTH, 9)).save(path), "has 9 x 210 pixels"),
     "of another size, with alpha": (lambda path: Image.new("RGBA", (HEIGHT, WIDTH)).save(path), "has 210 x 150 pixels"),
 }

@@ -3,10 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, change, write_tree
+from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, write_tree
 from PIL import Image
 from plyfile import PlyData
 from realestate10k_trees import epoch, equal, same
+from support import change_json
 
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.source import object_placement
@@ -137,7 +138,7 @@ def test_the_fingerprint_tells_other_annotations_and_lists(tmp_path):
         (FRAMES, lambda entries: entries[0]["viewpoint"].update(focal_length=[3, 3.1])),
         (SET_LIST, lambda splits: splits["val"].clear()),
     ):
-        change(category / file, edit)
+        change_json(category / file, edit)
         result.append(fingerprint())
     assert len(set(result)) == 4
 

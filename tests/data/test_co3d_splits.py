@@ -7,6 +7,7 @@ from pathlib import Path
 import co3d_trees as trees
 import numpy as np
 import pytest
+from support import change_json
 
 from completesplat.commands.data import prepare
 from completesplat.data.co3d.module import CO3DDataModule
@@ -43,8 +44,8 @@ def many(count: int) -> dict[str, int]:
 
 def test_frames_come_in_order_whatever_the_file_says(tmp_path):
     annotate(tmp_path, {"a": 4, "b": 4, "c": 4}, {"train": ["a"], "val": ["b"], "test": ["c"]})
-    trees.change(tmp_path / trees.CATEGORY / trees.FRAMES, lambda entries: entries.reverse())
-    trees.change(tmp_path / trees.CATEGORY / trees.SET_LIST, lambda splits: splits["train"].reverse())
+    change_json(tmp_path / trees.CATEGORY / trees.FRAMES, lambda entries: entries.reverse())
+    change_json(tmp_path / trees.CATEGORY / trees.SET_LIST, lambda splits: splits["train"].reverse())
     frames = [read(tmp_path).splits[split].frames[name] for split, name in zip(SPLITS, "abc", strict=True)]
     assert [[frame.number for frame in each] for each in frames] == [[0, 1, 2, 3]] * 3
     assert frames[0][0].camera.image_size == (24, 32)
@@ -170,7 +171,7 @@ def test_cameras_that_do_not_move_are_refused(tmp_path):
             entries[i]["viewpoint"] = trees.look(np.array([0.019 * i, 0, -4]), target)
             entries[3 + i]["viewpoint"] = trees.look(np.array([0.022 * i, 0, -4]), target)
 
-    trees.change(category / trees.FRAMES, stand)
+    change_json(category / trees.FRAMES, stand)
     data = CO3DDataModule(str(tmp_path), trees.CATEGORY, image_size=8)
     with pytest.raises(BadCamera, match="do not move") as caught:
         data.source("train").read("a")
@@ -253,7 +254,7 @@ def test_a_source_knows_how_many_sequences_its_list_has(tmp_path):
     """Also those that filters leave out or that cannot be read."""
     category = trees.write_tree(tmp_path, COUNTS, APART | {"train": "abcd", "test": "efh"})
     assert module(tmp_path, min_frames=4).source("test").listed == 3
-    trees.change(category / trees.SET_LIST, lambda splits: splits["test"].append(["gone", 0, "x"]))
+    change_json(category / trees.SET_LIST, lambda splits: splits["test"].append(["gone", 0, "x"]))
     source = module(tmp_path).source("test")
     assert (len(source.names), source.listed) == (3, 4)
 
@@ -264,13 +265,13 @@ FEW = {"train": "ab", "val": "c", "test": "d"}
 def test_what_nobody_reads_may_be_broken(tmp_path):
     """NaN in a number that is not used (Python's `json`, which wrote CO3D, writes it); frames that no list names."""
     category = trees.write_tree(tmp_path, dict.fromkeys("abcd", 4), FEW)
-    trees.change(category / trees.FRAMES, lambda entries: entries[2]["mask"].update(mass=float("nan")))
-    trees.change(category / trees.FRAMES, lambda entries: entries[2]["depth"].update(scale_adjustment=2))
+    change_json(category / trees.FRAMES, lambda entries: entries[2]["mask"].update(mass=float("nan")))
+    change_json(category / trees.FRAMES, lambda entries: entries[2]["depth"].update(scale_adjustment=2))
     result = read(tmp_path)
     assert result.refused == []
     assert result.splits["train"].frames["a"][2].depth.scale_adjustment == 2.0
-    trees.change(category / trees.SET_LIST, lambda splits: splits["train"].remove(splits["train"][2]))
-    trees.change(category / trees.FRAMES, lambda entries: entries[2].update(viewpoint=None))
+    change_json(category / trees.SET_LIST, lambda splits: splits["train"].remove(splits["train"][2]))
+    change_json(category / trees.FRAMES, lambda entries: entries[2].update(viewpoint=None))
     result = read(tmp_path)
     assert [frame.number for frame in result.splits["train"].frames["a"]] == [0, 1, 3]
     assert result.refused == []

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageCms, ImageFile
+from support import exif_turned
 
 from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.exif import ORIENTATION
 from completesplat.data.images.files import decode_image, read_depth
 from completesplat.errors import BadImage, DataError, MissingFile
 
@@ -30,10 +30,9 @@ LARGE = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
 
 
 def saved(pixels: np.ndarray | Image.Image, kind: str = "PNG", orientation: int | None = None, **options) -> bytes:
-    buffer, record = io.BytesIO(), Image.Exif()
+    buffer = io.BytesIO()
     if orientation is not None:
-        record[ORIENTATION] = orientation
-        options["exif"] = record.tobytes()
+        options["exif"] = exif_turned(orientation).tobytes()
     (pixels if isinstance(pixels, Image.Image) else Image.fromarray(pixels)).save(buffer, kind, **options)
     return buffer.getvalue()
 

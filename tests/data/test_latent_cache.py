@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 from latent_caches import broken_rooms, rooms, small_autoreconstructor, sound_rooms
+from readers import read_latents
+from support import flip_bit
 
 from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.data.loading.loader import SceneLoader
@@ -137,28 +139,20 @@ def copy(cache, tmp_path) -> Path:
     return Path(shutil.copytree(cache, tmp_path / "copy"))
 
 
-def read_all(folder: Path) -> list[tuple]:
-    store = LatentCache(folder)
-    scenes = [store.scene(name, frame) for name, sequence in store.sequences.items() for frame in sequence.stored]
-    return [(scene.mean.tolist(), scene.log_variance.tolist(), scene.condition.tolist()) for scene in scenes]
-
-
 def test_every_changed_byte_of_every_file_is_refused_or_changes_nothing(copy):
-    values = read_all(copy)
+    values = read_latents(copy)
     chance = random.Random(0)
     noticed = dict.fromkeys(copy.iterdir(), 0)
     for path in noticed:
         content = path.read_bytes()
         for place in [*chance.sample(range(len(content)), 60), len(content) - 2]:
-            changed = bytearray(content)
-            changed[place] ^= 1
-            path.write_bytes(changed)
+            flip_bit(path, 8 * place)
             try:
-                assert read_all(copy) == values
+                assert read_latents(copy) == values
             except DataError as error:
                 noticed[path] += 1
                 assert "\n" not in str(error)  # noqa: PT017
-        path.write_bytes(content)
+            path.write_bytes(content)
     assert noticed[copy / "manifest.json"] == 61
     assert noticed[copy / "latents.arrow"] > 40
 
@@ -167,9 +161,7 @@ def test_a_changed_value_of_a_frame_is_refused_with_its_place_and_others_are_rea
     store, path = LatentCache(copy), copy / "latents.arrow"
     scene = store.scene("c2", 3)
     place = path.read_bytes().index(scene.mean.numpy().tobytes())
-    content = bytearray(path.read_bytes())
-    content[place] ^= 1
-    path.write_bytes(content)
+    flip_bit(path, 8 * place)
     store = LatentCache(copy)
     with pytest.raises(DataError, match="its checksum is another") as caught:
         store.scene("c2", 3)

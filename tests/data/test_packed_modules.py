@@ -5,16 +5,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from packed_sequences import prepared
 from realestate10k_trees import equal, make_clip, write_tree
 
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.data.packed.writing import prepare
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.writing import SUBSET
 from completesplat.errors import DataError
-
-SPLITS = ("train", "val", "test")
 
 
 def objects(root: Path, **settings) -> CO3DDataModule:
@@ -25,11 +23,6 @@ def objects(root: Path, **settings) -> CO3DDataModule:
 def clips(root: Path, **settings) -> RE10KDataModule:
     small = {"image_size": 8, "batch_size": 2, "targets": 2, "val_fraction": 0.3}
     return RE10KDataModule(str(root), **small | settings)
-
-
-def prepared(data: SceneDataModule, out: Path, **settings) -> Path:
-    sources = {split: data.source(split) for split in SPLITS}
-    return prepare(sources, data.packed_settings(), out, workers=1, progress=False, **settings)
 
 
 def assert_same_batches(raw: SceneDataModule, packed: SceneDataModule) -> None:

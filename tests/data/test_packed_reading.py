@@ -1,10 +1,5 @@
-import json
 import os
 import pickle
-import subprocess
-import sys
-from functools import reduce
-from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +9,8 @@ import pytest
 import torch
 from packed_sequences import SIZE, ListedSource, make_sequence, pack, smooth_image
 from PIL import Image
+from readers import put
+from support import flip_bit, python
 
 from completesplat.data.packed.manifest import is_packed, read_manifest, settings_must_match
 from completesplat.data.packed.rows import EncodedImage, decode_square, encode, from_row, to_row
@@ -121,7 +118,7 @@ def test_only_a_complete_store_with_its_own_shards_opens(store: Path, tmp_path: 
         read_manifest(tmp_path)
     shard = store / SHARD
     content = shard.read_bytes()
-    shard.write_bytes(content[:-99] + bytes([content[-99] ^ 1]) + content[-98:])
+    flip_bit(shard, -99 * 8)
     assert [error.file for error in source.verify()] == [str(shard)]
     shard.write_bytes(content + b"\0")
     with pytest.raises(ChangedFile, match=SHARD):
@@ -220,24 +217,19 @@ def test_bytes_that_are_not_the_image_are_refused_with_their_place() -> None:
         read(1)
 
 
-FIRST = ("splits", "train", "shards", 0)
-
-
 @pytest.mark.parametrize(
-    ("place", "value", "kind"),
+    ("keys", "value", "kind"),
     [
-        (["format"], 1, UnreadableFile),
-        (["settings"], {"image_size": [1]}, BadAnnotation),
-        (["splits", "train", "names"], ["s3"], BadAnnotation),
-        (["splits", "train", "refused"], [{}], BadAnnotation),
-        ([*FIRST, "file"], "../secret.arrow", OutsidePath),
-        ([*FIRST, "bytes"], True, BadAnnotation),
+        ("format", 1, UnreadableFile),
+        ("settings", {"image_size": [1]}, BadAnnotation),
+        ("splits.train.names", ["s3"], BadAnnotation),
+        ("splits.train.refused", [{}], BadAnnotation),
+        ("splits.train.shards.0.file", "../secret.arrow", OutsidePath),
+        ("splits.train.shards.0.bytes", True, BadAnnotation),
     ],
 )
-def test_a_manifest_that_does_not_fit_is_refused(place: list, value: object, kind: type, store: Path) -> None:
-    content = json.loads((store / "manifest.json").read_text())
-    reduce(getitem, place[:-1], content)[place[-1]] = value
-    (store / "manifest.json").write_text(json.dumps(content))
+def test_a_manifest_that_does_not_fit_is_refused(keys: str, value: object, kind: type, store: Path) -> None:
+    put("manifest.json", keys, value)(store)
     with pytest.raises(kind, match=r"manifest\.json"):
         PackedSource(store, "train")
 
@@ -260,7 +252,5 @@ def test_reading_needs_no_network_and_writes_nothing_into_the_home_folder(store:
     (home := tmp_path / "home").mkdir()
     variables = ("HF_HOME", "HF_DATASETS_CACHE", "XDG_CACHE_HOME")
     environment = {key: value for key, value in os.environ.items() if key not in variables} | {"HOME": str(home)}
-    result = subprocess.run([sys.executable, "-c", "\n".join(lines)], env=environment, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.split() == ["3", str(SIZE), str(SIZE)]
+    assert python("\n".join(lines), env=environment).split() == ["3", str(SIZE), str(SIZE)]
     assert list(home.rglob("*")) == []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from realestate10k_trees import FORMS, HEIGHT, encode, epoch, equal, make_clip, module, same, write_tree
-from support import compose_config
+from support import change_json, compose_config
 
 from completesplat.data.realestate10k import clips
 from completesplat.data.validation.audit import check
@@ -150,8 +150,7 @@ def test_the_evaluation_index_and_the_scene_list_decide(root, tmp_path, caplog):
 def test_missing_clips_are_counted_and_left_out(form, tmp_path, caplog):
     write_tree(tmp_path, form, TRAIN, TEST)
     if form == "chunks":
-        index = json.loads((tmp_path / "train/index.json").read_text())
-        (tmp_path / "train/index.json").write_text(json.dumps(index | {"x": "000099.torch", "y": "000099.torch"}))
+        change_json(tmp_path / "train/index.json", lambda index: index | dict.fromkeys("xy", "000099.torch"))
     else:
         for name in "xy":
             (tmp_path / f"train/{name}.txt").write_text("address\n")
@@ -198,7 +197,7 @@ def test_a_folder_without_any_use_is_raised_under_either_policy(tmp_path, index,
 
 def test_annotations_that_cannot_be_used_are_raised_or_skipped_with_a_line(tmp_path, caplog):
     index = write_tree(tmp_path, "chunks", TRAIN, TEST) / "train/index.json"
-    index.write_text(json.dumps(json.loads(index.read_text()) | {"b": "../b.torch"}))
+    change_json(index, lambda files: files | {"b": "../b.torch"})
     with pytest.raises(OutsidePath):
         module(tmp_path, on_bad="raise").setup("fit")
     module(tmp_path, on_bad="skip").setup("fit")

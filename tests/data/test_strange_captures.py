@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 from realestate10k_trees import make_clip, module, write_tree
+from support import change_json, exif_turned
 
 from completesplat.baselines.fitting import gaussians_at_points
 from completesplat.data.captures.importing import import_capture
@@ -198,10 +199,8 @@ def test_points_that_float32_cannot_hold_are_left_out_with_a_word(tmp_path, capl
 
 def resave(folder: Path, change: Callable[[Image.Image], Image.Image], orientation: int = 1, suffix: str = "") -> None:
     """Change all images, and tag them to be turned."""
-    exif = Image.Exif()
-    exif[274] = orientation
     for path in sorted((folder / "images").iterdir()):
-        change(Image.open(path)).save(path.with_suffix(suffix or path.suffix), exif=exif)
+        change(Image.open(path)).save(path.with_suffix(suffix or path.suffix), exif=exif_turned(orientation))
 
 
 def resized(width: int, height: int) -> Callable[[Image.Image], Image.Image]:
@@ -260,10 +259,7 @@ def test_photographs_with_stored_pixels_are_not_turned(tmp_path):
 def test_windows_separators_lead_to_the_images(tmp_path):
     write_transforms(tmp_path)
     expected, file = sequence(tmp_path), tmp_path / "transforms.json"
-    content = json.loads(file.read_text())
-    for frame in content["frames"]:
-        frame["file_path"] = frame["file_path"].replace("/", "\\")
-    file.write_text(json.dumps(content))
+    file.write_text(file.read_text().replace("images/", r"images\\"))
     must_agree(sequence(tmp_path), expected)
 
 
@@ -284,9 +280,7 @@ def test_import_names_photos_whose_pixels_are_not_the_cameras(tmp_path, orientat
     write_transforms(tmp_path)
     resave(tmp_path, resized(*size), orientation)
     if change:
-        content = json.loads((tmp_path / "transforms.json").read_text())
-        change(content)
-        (tmp_path / "transforms.json").write_text(json.dumps(content))
+        change_json(tmp_path / "transforms.json", change)
     with pytest.raises(BadImage, match=rf"images/0\.png, .*frame 0: .*{reason}"):
         import_capture(str(tmp_path), None, 100, 1000, tmp_path / "out")
 

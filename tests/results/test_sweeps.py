@@ -3,7 +3,6 @@
 import json
 import math
 import re
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -18,6 +17,8 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
+from readers import put
+from support import python
 
 from completesplat.results.machine import machine
 from completesplat.results.measured import Entry, score_rows, time_cell
@@ -39,10 +40,8 @@ def remarks(sweep) -> list[str]:
 
 def test_the_same_image_is_called_so_as_in_the_terminal_and_in_the_tables_of_reports(sweep) -> None:
     for seed in range(2):
-        path = sweep.scored(f"seed={seed}", psnr=20.0, full_reference_psnr=100.0) / "metrics.json"
-        metrics = json.loads(path.read_text())
-        metrics["test"]["copy_reference"]["full"]["reference"] = {"psnr": 100.0}
-        path.write_text(json.dumps(metrics))
+        job = sweep.scored(f"seed={seed}", psnr=20.0, full_reference_psnr=100.0)
+        put("metrics.json", "test.copy_reference.full.reference", {"psnr": 100.0})(job)
     lines = as_markdown(write_summary(sweep.folder)).splitlines()
     (model,), (copied,) = (
         [line for line in lines if line.startswith(f"| {name} |")] for name in ("small", "copy_reference")
@@ -197,11 +196,9 @@ def test_all_files_have_means_deviations_marks_and_remarks(ablations) -> None:
 def test_a_metric_of_the_users_own_is_shown_and_marked_as_its_results_say(sweep) -> None:
     style = {"heading": "bias", "better": "↓", "decimals": 1}
     for ablation, bias in {"full": 0.25, "m1": 0.75}.items():
-        path = sweep.scored(f"ablation={ablation}", psnr=20.0) / "metrics.json"
-        metrics = json.loads(path.read_text())
-        metrics["test"]["protocol"] = {"metrics": {"my_bias": {"_target_": "mine.Bias", "style": style}}}
-        metrics["test"]["model"]["full"]["novel"]["my_bias"] = bias
-        path.write_text(json.dumps(metrics))
+        job = sweep.scored(f"ablation={ablation}", psnr=20.0)
+        put("metrics.json", "test.protocol", {"metrics": {"my_bias": {"_target_": "mine.Bias", "style": style}}})(job)
+        put("metrics.json", "test.model.full.novel.my_bias", bias)(job)
     head, _, m1, full, *_ = as_markdown(write_summary(sweep.folder)).splitlines()[2:]
     assert head.endswith("| all pixels, novel views: bias ↓ |")
     assert (m1.split("|")[5].strip(), full.split("|")[5].strip()) == ("<ins>0.8</ins>", "**0.2**")
@@ -365,8 +362,7 @@ def test_a_summary_that_cannot_be_written_is_logged_and_stops_nothing(launched, 
 def test_the_hook_is_loaded_without_the_heavy_libraries() -> None:
     heavy = ["torch", "pandas", "numpy", "rich", "matplotlib"]
     code = f"import sys, completesplat.results.sweeps; print(*(sys.modules.keys() & {heavy}))"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (result.returncode, result.stdout.split()) == (0, []), result.stderr
+    assert python(code).split() == []
 
 
 def test_jobs_on_several_machines_make_one_summary(sweep, tmp_path, command) -> None:

@@ -11,7 +11,7 @@ from functools import partial
 import pytest
 import torch
 from small_runs import STEPS, Logging, fit
-from support import refused
+from support import flip_bit, refused
 
 from completesplat.errors import WeightsError
 from completesplat.training.checkpoints import CheckpointFiles, newest_whole
@@ -23,12 +23,6 @@ def checkpoint(tmp_path):
     torch.manual_seed(0)
     CheckpointFiles().save_checkpoint({"state_dict": torch.nn.Linear(30, 30).state_dict()}, tmp_path / "last.ckpt")
     return tmp_path / "last.ckpt"
-
-
-def flip(path, bit: int) -> None:
-    content = bytearray(path.read_bytes())
-    content[bit // 8] ^= 1 << bit % 8
-    path.write_bytes(content)
 
 
 def refusal(path) -> str | None:
@@ -46,7 +40,7 @@ def test_every_flipped_bit_and_every_cut_is_noticed_unless_it_changes_nothing(ch
     check_whole(checkpoint)
     noticed = set()
     for bit in [*chance.sample(range(8 * len(whole)), 60), *range(8 * len(whole) - 8 * 100, 8 * len(whole), 17)]:
-        flip(checkpoint, bit)
+        flip_bit(checkpoint, bit)
         message = refusal(checkpoint)
         if message is not None:
             assert message.startswith(f"{checkpoint}: not a readable checkpoint (damaged")
@@ -55,7 +49,7 @@ def test_every_flipped_bit_and_every_cut_is_noticed_unless_it_changes_nothing(ch
             read = read_checkpoint(checkpoint)["state_dict"]
             assert all(torch.equal(weights[name], value) for name, value in read.items())
             assert read.keys() == weights.keys()
-        flip(checkpoint, bit)
+        flip_bit(checkpoint, bit)
     assert any(first <= bit < first + bits_of_a_value for bit in noticed)
     assert checkpoint.read_bytes() == whole
     for size in [*chance.sample(range(len(whole)), 30), *range(len(whole) - 100, len(whole), 5)]:
@@ -97,7 +91,7 @@ def test_a_file_with_two_lists_of_its_parts_is_refused(checkpoint, order):
 def test_a_damaged_checkpoint_is_refused_where_weights_are_loaded(checkpoint):
     load_part(torch.nn.Linear(30, 30), checkpoint, prefix="")
     weights = checkpoint.read_bytes().index(read_checkpoint(checkpoint)["state_dict"]["weight"].numpy().tobytes())
-    flip(checkpoint, 8 * weights + 3)
+    flip_bit(checkpoint, 8 * weights + 3)
     resume = partial(CheckpointFiles().load_checkpoint, weights_only=True)  # as Lightning does
     for load in (lambda: load_part(torch.nn.Linear(30, 30), checkpoint, ""), lambda: resume(checkpoint)):
         with pytest.raises(WeightsError, match=r"last\.ckpt: not a readable checkpoint \(damaged"):

@@ -14,7 +14,7 @@ import torch
 from lightning.fabric.strategies.launchers import subprocess_script as launcher
 from lightning.pytorch.trainer.connectors import signal_connector
 from small_runs import STEPS, Logging, fit, rows
-from support import LIMIT
+from support import LIMIT, write_program
 
 from completesplat import signals
 from completesplat.signals import ENDING, Interrupted, ended_by_signals, received
@@ -75,9 +75,8 @@ def test_a_signal_waits_for_the_end_of_a_step_of_several_batches(tmp_path):
 
 def test_slurm_queues_a_job_again_after_its_own_signal_only(tmp_path, monkeypatch):
     """With the variables of `srun`, as Lightning's plugin reads them, and a `scontrol` that notes its arguments."""
-    called, program = tmp_path / "called", tmp_path / "scontrol"
-    program.write_text(f'#!/bin/sh\necho "$@" >> {called}\n')
-    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    called = tmp_path / "called"
+    write_program(tmp_path / "scontrol", f'echo "$@" >> {called}')
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     numbers = {"NTASKS": 1, "PROCID": 0, "LOCALID": 0, "NODEID": 0, "JOB_ID": 4711}
     for name, value in {**numbers, "JOB_NAME": "training"}.items():

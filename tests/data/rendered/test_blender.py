@@ -3,14 +3,13 @@
 import errno
 import os
 import signal
-import stat
 import subprocess
 import sys
 from pathlib import Path
 
 import meshes
 import pytest
-from support import refused, waited_for
+from support import refused, waited_for, write_program
 
 from completesplat import files
 from completesplat.data.rendered import blender
@@ -33,14 +32,7 @@ def bare(tmp_path, monkeypatch):
 @pytest.fixture
 def program(tmp_path):
     """Write a shell script."""
-
-    def write(text, name="blender"):
-        path = tmp_path / name
-        path.write_text(f"#!/bin/sh\n{text}\n")
-        path.chmod(path.stat().st_mode | stat.S_IXUSR)
-        return str(path)
-
-    return write
+    return lambda text, name="blender": str(write_program(tmp_path / name, text))
 
 
 VERSION = 'if [ "$1" = --version ]; then echo "Color management: a warning"; echo "Blender {}"; exit; fi\n'

@@ -8,7 +8,7 @@ import meshes
 import numpy as np
 import pytest
 import torch
-from support import write_capture
+from support import change_json, write_capture
 
 from completesplat.data.captures.transforms_json import read_cameras, read_transforms
 from completesplat.data.rendered import rendering
@@ -79,8 +79,7 @@ def test_light_and_surfaces_are_values_that_json_holds_and_depend_on_the_generat
 def test_cameras_of_a_transforms_json_are_those_that_a_capture_has(tmp_path):
     write_capture(tmp_path / "capture", frames=6)  # images of 16 x 12 pixels, and no size in the file
     path = tmp_path / "capture/transforms.json"
-    content = json.loads(path.read_text()) | {"w": 16, "h": 12, "cx": 7.0, "cy": 6.5}
-    path.write_text(json.dumps(content))
+    change_json(path, lambda content: content | {"w": 16, "h": 12, "cx": 7.0, "cy": 6.5})
     captured = [frame.camera() for frame in sorted(read_transforms(path).frames, key=lambda frame: frame.number)]
     for camera, other in zip(read_cameras(path, 48), captured, strict=True):
         assert camera.image_size == (48, 64)
@@ -111,7 +110,7 @@ def test_cameras_without_a_size_are_square(tmp_path):
 def test_cameras_that_cannot_be_rendered_are_refused(tmp_path, change, message):
     write_capture(tmp_path / "capture", frames=2)
     path = tmp_path / "capture/transforms.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    change_json(path, lambda content: content | change)
     with pytest.raises(DataError, match=message):
         read_cameras(path, 32)
 

@@ -2,7 +2,6 @@
 
 import json
 import re
-import stat
 import subprocess
 import sys
 from collections import Counter
@@ -12,11 +11,11 @@ import numpy as np
 import pytest
 from packed_sequences import contents
 from PIL import Image
-from support import strict_json, waited_for
+from support import strict_json, waited_for, write_program
 
 QUICK = ["views=2", "size=8", "samples=1", "workers=1"]
 # Stands for Blender: copies files of two views; refuses `c_broken`; lists the meshes that it got.
-STAND_IN = """#!/bin/sh
+STAND_IN = """
 if [ "$1" = --version ]; then echo Blender 4.2.0; exit; fi
 for job; do :; done
 files=$(dirname "$0")/files
@@ -40,9 +39,7 @@ def render(command, tmp_path):
         np.save(tmp_path / f"files/000{view}.npy", np.ones((8, 8, 3), np.float32))
     result = {"center": [0, 0, 0], "scale": 1.0, "ground": -1.0, "left_out": 0}
     (tmp_path / "files/result.json").write_text(json.dumps(result))
-    program = tmp_path / "blender"
-    program.write_text(STAND_IN)
-    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    program = write_program(tmp_path / "blender", STAND_IN)
     return lambda out, *more: [
         *("data", "render", f"meshes={tmp_path / 'meshes'}", f"blender={program}", *QUICK),
         *(f"out={tmp_path / out}", *more),
@@ -74,8 +71,8 @@ def test_a_shard_whose_objects_are_all_broken_fails_only_if_no_other_is_left(com
 @pytest.mark.processes
 def test_jobs_at_the_same_time_share_a_folder_unless_one_is_for_all_objects(command, render, tmp_path):
     command.succeeds(*render("whole"))
-    program, wait = tmp_path / "blender", tmp_path / "wait"
-    program.write_text(STAND_IN.replace("cp ", f"while [ -e {wait} ]; do sleep 0.1; done\ncp "))
+    wait = tmp_path / "wait"
+    write_program(tmp_path / "blender", STAND_IN.replace("cp ", f"while [ -e {wait} ]; do sleep 0.1; done\ncp "))
     wait.touch()
     (tmp_path / "started").unlink()
     started = [sys.executable, "-P", "-m", "completesplat"]

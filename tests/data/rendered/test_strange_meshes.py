@@ -22,38 +22,24 @@ def blender() -> None:
     meshes.need_blender()
 
 
-@pytest.fixture
-def stand_in(tmp_path) -> str:
-    """Program that is no Blender, for meshes that are refused before it starts."""
-    program = tmp_path / "blender"
-    program.write_text('#!/bin/sh\n[ "$1" = --version ] && echo Blender 4.2.0 || echo has started; exit 1\n')
-    program.chmod(0o755)
-    return str(program)
-
-
 def png(path: Path) -> bytes:
     Image.new("RGB", (8, 8), (200, 40, 40)).save(path)
     return path.read_bytes()
 
 
-def named_by_obj(folder: Path, texture: str, library: str = "a.mtl") -> None:
-    (folder / "a.mtl").write_text(f"newmtl m\nmap_Kd -s 1 1 1 {texture}\n")
-    meshes.write_triangle(folder / "a.obj", vertices=f"mtllib {library}\nv 0 0 0\nv 1 0 0\nv 0 1 0\n")
-
-
-def test_files_anywhere_in_the_folder_of_meshes_are_taken(tmp_path, stand_in):
-    (tmp_path / "meshes/sub").mkdir(parents=True)
-    png(tmp_path / "meshes/t.png")
-    named_by_obj(tmp_path / "meshes/sub", "../t.png")
-    with pytest.raises(DataError, match=r"Blender failed: has started$"):
-        render(str(tmp_path / "meshes"), out=tmp_path / "data", blender=stand_in, **QUICK)
-
-
-def test_folders_and_long_words_in_a_material_are_no_files(tmp_path, stand_in):
+@pytest.mark.parametrize(
+    ("folder", "texture"),
+    [("meshes/1", "../t.png"), ("meshes", f". .. {'x' * 5000}")],
+    ids=["file above the mesh", "folders and a long word"],
+)
+def test_files_anywhere_in_the_folder_of_meshes_are_taken_and_folders_and_long_words_are_none(
+    tmp_path, folder, texture
+):
     (tmp_path / "meshes/1").mkdir(parents=True)
-    named_by_obj(tmp_path / "meshes", f". .. {'x' * 5000}")
+    png(tmp_path / "meshes/t.png")
+    meshes.write_textured(tmp_path / folder, texture)
     with pytest.raises(DataError, match=r"Blender failed: has started$"):
-        render(str(tmp_path / "meshes"), out=tmp_path / "data", blender=stand_in, **QUICK)
+        render(str(tmp_path / "meshes"), out=tmp_path / "data", blender=meshes.write_stand_in(tmp_path), **QUICK)
 
 
 def test_a_pipe_among_the_textures_of_floors_is_left_out(tmp_path):
