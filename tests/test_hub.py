@@ -6,11 +6,11 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from hashlib import sha256
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
-from threading import Thread
 
 import pytest
+from support import serving
 
 COMMIT = "a" * 40
 MODEL = "someone/model"
@@ -53,10 +53,8 @@ class Hub(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def address(tiny_weights: Path) -> Iterator[str]:
-    with ThreadingHTTPServer(("127.0.0.1", 0), type("TinyHub", (Hub,), {"files": tiny_weights})) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
+    with serving(type("TinyHub", (Hub,), {"files": tiny_weights})) as address:
+        yield address
 
 
 @pytest.mark.processes

@@ -3,12 +3,12 @@
 import hashlib
 import socket
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
-from threading import Thread
 
 import pytest
 import torch
+from support import serving
 
 from completesplat.errors import WeightsError
 from completesplat.weights import weights_file
@@ -60,10 +60,8 @@ def hub(tmp_path, monkeypatch):
 def url(file):
     """Serve the file's folder at this address."""
     handler = partial(SimpleHTTPRequestHandler, directory=str(file.parent))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        Thread(target=partial(server.serve_forever, poll_interval=0.01), daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
+    with serving(handler) as address:
+        yield address
 
 
 def test_a_url_is_downloaded_once_into_torchs_cache(hub, file, url):

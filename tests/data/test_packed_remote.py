@@ -1,19 +1,18 @@
 """A packed store that a web server holds, read by several processes: shards are fetched once, when they are needed."""
 
 import os
-import threading
 from collections.abc import Iterator
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 
 import pytest
-from packed_sequences import ListedSource, pack
+from packed_sequences import ListedSource, pack, prepared
 from realestate10k_trees import equal
+from support import flip_bit, serving
 
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.packed.source import PackedSource, local_root
-from completesplat.data.packed.writing import prepare
 from completesplat.data.toy.writing import SUBSET
 from completesplat.errors import ChangedFile, DataError, MissingFile
 
@@ -36,13 +35,8 @@ def served(tmp_path, monkeypatch) -> Iterator[tuple[str, Path, list[str]]]:
     (tmp_path / "served").mkdir()
     asked: list[str] = []
     handler = type("Handler", (Logged,), {"asked": asked})
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=str(tmp_path / "served")))
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_port}/STORE", tmp_path / "served/STORE", asked
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    with serving(partial(handler, directory=str(tmp_path / "served"))) as address:
+        yield f"{address}/STORE", tmp_path / "served/STORE", asked
 
 
 def make(out: Path, content: str = "a") -> None:
@@ -79,9 +73,7 @@ def test_what_cannot_be_fetched_or_is_another_file_is_said(served):
     make(folder)
     source = PackedSource(local_root(address), "train")
     shards = sorted(folder.glob("*.arrow"))
-    content = bytearray(shards[0].read_bytes())
-    content[-1] ^= 1
-    shards[0].write_bytes(content)
+    flip_bit(shards[0], -8)
     shards[1].unlink()
     with pytest.raises(ChangedFile, match="checksum is not that of the manifest"):
         source.read("s0")
@@ -115,8 +107,7 @@ def test_training_reads_it_in_worker_processes(served, toy_root):
     address, folder, asked = served
     settings = {"subset": SUBSET, "image_size": 16, "batch_size": 2, "targets": 2}
     raw = CO3DDataModule(str(toy_root), "toy_objects", **settings)
-    sources = {split: raw.source(split) for split in ("train", "val", "test")}
-    prepare(sources, raw.packed_settings(), folder, sequences_per_shard=1, workers=1, progress=False)
+    prepared(raw, folder, sequences_per_shard=1)
     data = CO3DDataModule(address, "toy_objects", workers=2, **settings)
     data.setup("fit")
     assert len(list(data.train_dataloader())) == 1
