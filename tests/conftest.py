@@ -200,6 +200,16 @@ def installed(built_once: Folders) -> Installed:
 
 
 @pytest.fixture
+def set_threads() -> Iterator[Callable[[int], None]]:
+    """Sets torch's number of threads, until the test ends."""
+    import torch
+
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def plain_signals():
     """The system's signal handlers, as in a new process; trainers of other tests may have left Lightning's."""
     from completesplat.signals import ENDING

@@ -1,8 +1,6 @@
 import copy
 import json
 import math
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -14,7 +12,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from published_weights import write_published
 from safetensors.torch import load_file, save
-from support import compose_config, tiny_generator
+from support import compose_config, python, tiny_generator
 
 from completesplat import scene_model
 from completesplat.commands.predict import photo_warnings
@@ -88,8 +86,7 @@ def test_no_lightning_is_needed_to_generate(folder, photo):
     program = "import sys; from completesplat.generator import CompleteSplat; "
     program += f"scenes = CompleteSplat.from_pretrained({str(folder)!r})({str(photo)!r}, samples=1, steps=1); "
     program += "print(len(scenes), 'lightning' in sys.modules)"
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert result.stdout.split() == ["1", "False"]
+    assert python(program).split() == ["1", "False"]
 
 
 def test_seeds_decide_and_samples_differ(model, photo):
@@ -110,18 +107,11 @@ def test_one_model_draws_in_four_threads_what_it_draws_one_after_the_other(model
     assert all(same(*pair) for scenes in zip(alone, together, strict=True) for pair in zip(*scenes, strict=True))
 
 
-@pytest.fixture
-def threads():
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
-
 @pytest.mark.parametrize("mixed", [False, True], ids=["float32", "bfloat16"])
-def test_any_number_of_threads_draws_the_same_scenes_bit_for_bit_and_stays_set(model, photo, threads, mixed):
+def test_any_number_of_threads_draws_the_same_scenes_bit_for_bit_and_stays_set(model, photo, set_threads, mixed):
     drawn = []
     for number in (1, 2, 3):
-        threads(number)
+        set_threads(number)
         with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
             drawn.append(model(photo, samples=10, steps=2))
         assert torch.get_num_threads() == number

@@ -23,19 +23,16 @@ def test_two_threads_have_work_before_parts_become_larger_and_many_samples_give_
     assert {count: part_of(count) for count in sizes} == sizes
 
 
-def test_calls_that_overlap_leave_torchs_number_of_threads_as_it_was():
-    before, denoiser = torch.get_num_threads(), torch.nn.Linear(1, 1)
-    torch.set_num_threads(3)
-    try:
-        with one_thread_each(denoiser, torch.device("cpu")), ThreadPoolExecutor(1) as pool:
-            inner = one_thread_each(denoiser, torch.device("cpu"))
-            assert pool.submit(inner.__enter__).result() == 3
-        pool_of_new_threads = ThreadPoolExecutor(1)
-        pool_of_new_threads.submit(inner.__exit__, None, None, None).result()
-        with ThreadPoolExecutor(1) as later:
-            assert later.submit(torch.get_num_threads).result() == 3
-    finally:
-        torch.set_num_threads(before)
+def test_calls_that_overlap_leave_torchs_number_of_threads_as_it_was(set_threads):
+    denoiser = torch.nn.Linear(1, 1)
+    set_threads(3)
+    with one_thread_each(denoiser, torch.device("cpu")), ThreadPoolExecutor(1) as pool:
+        inner = one_thread_each(denoiser, torch.device("cpu"))
+        assert pool.submit(inner.__enter__).result() == 3
+    pool_of_new_threads = ThreadPoolExecutor(1)
+    pool_of_new_threads.submit(inner.__exit__, None, None, None).result()
+    with ThreadPoolExecutor(1) as later:
+        assert later.submit(torch.get_num_threads).result() == 3
 
 
 def test_parts_that_do_not_fit_are_halved_until_they_do(caplog):

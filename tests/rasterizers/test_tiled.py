@@ -1,5 +1,6 @@
 """The tiled rasterizer is the reference, faster: the same images and gradients on random scenes."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -63,16 +64,13 @@ def test_neighbours_with_equal_depth_in_float32_keep_their_order() -> None:
     assert_agrees(TiledRasterizer(), CONSTANTS, gaussians, cameras, 6)
 
 
-def test_the_number_of_threads_changes_no_bit() -> None:
+def test_the_number_of_threads_changes_no_bit(set_threads: Callable[[int], None]) -> None:
     gaussians, cameras = scenes(5, 1, 1, (50, 70), CONSTANTS)
-    threads, results = torch.get_num_threads(), []
-    try:
-        for number in (1, 2, 2, 3):
-            torch.set_num_threads(number)
-            images, gradients = render_with_gradients(TiledRasterizer(), gaussians, cameras, cotangents_for(cameras, 5))
-            results.append([*vars(images).values(), *gradients.values()])
-    finally:
-        torch.set_num_threads(threads)
+    results = []
+    for number in (1, 2, 2, 3):
+        set_threads(number)
+        images, gradients = render_with_gradients(TiledRasterizer(), gaussians, cameras, cotangents_for(cameras, 5))
+        results.append([*vars(images).values(), *gradients.values()])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 

@@ -7,6 +7,7 @@ import os
 import runpy
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import pytest
 import torch
 from degenerate_gaussians import camera, healthy
 from numba.core.caching import CacheImpl
-from support import LIMIT
+from support import LIMIT, python
 
 from completesplat.data.toy import raytracing
 from completesplat.rasterizers.kernels import compilation, drawing
@@ -27,16 +28,8 @@ def image() -> torch.Tensor:
     return TiledRasterizer()(healthy(4), camera()).color
 
 
-@pytest.fixture
-def two_threads() -> object:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.mark.usefixtures("two_threads")
-def test_every_task_runs_once_and_exceptions_come_back() -> None:
+def test_every_task_runs_once_and_exceptions_come_back(set_threads: Callable[[int], None]) -> None:
+    set_threads(2)
     done = []
     parallel(done.append, 100)
     assert sorted(done) == list(range(100))
@@ -45,10 +38,10 @@ def test_every_task_runs_once_and_exceptions_come_back() -> None:
 
 
 @pytest.mark.processes
-@pytest.mark.usefixtures("two_threads")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_forked_child_renders() -> None:
+def test_a_forked_child_renders(set_threads: Callable[[int], None]) -> None:
+    set_threads(2)
     expected = image()  # starts the threads of this process
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
@@ -78,44 +71,40 @@ def test_a_second_process_compiles_nothing() -> None:
         "kernels = [composite.composite, project.prepare, project.project]; "
         "print([(sum(k.stats.cache_hits.values()), sum(k.stats.cache_misses.values())) for k in kernels])"
     )
-    command = [sys.executable, "-c", code, str(Path(__file__).parents[2])]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT)
-    assert result.stdout.strip() == "[(1, 0), (1, 0), (1, 0)]", result.stderr
+    assert python(code, Path(__file__).parents[2], timeout=LIMIT) == "[(1, 0), (1, 0), (1, 0)]\n"
 
 
-def test_without_a_writable_folder_kernels_are_compiled_but_not_kept(tmp_path, monkeypatch, caplog) -> None:
-    blocked = tmp_path / "file"
-    blocked.touch()  # no folder can be made under a file
-    monkeypatch.setattr(compilation.numba_config, "CACHE_DIR", str(blocked))
-    compilation.cache_directory.cache_clear()
-    try:
-        assert compilation.cache_directory() is None
-        double = compilation.kernel(_double)
-        assert double(3) == 6
-        assert double.stats.cache_path is None
-        monkeypatch.setattr(compilation.numba_config, "CACHE_DIR", str(tmp_path))
-        compilation.cache_directory.cache_clear()
-        with caplog.at_level(logging.INFO):
-            assert compilation.kernel(_double)(3) == 6
-            assert list(tmp_path.glob("kernels-*/*/*.nbc"))
-            assert caplog.text.count("compiling the kernels on first use") == 1
-            compilation.cache_directory.cache_clear()
-            compilation.cache_directory()
-            assert caplog.text.count("compiling the kernels on first use") == 1  # they are in the cache
-    finally:
-        compilation.cache_directory.cache_clear()
-
-
-def test_the_ray_tracer_compiles_where_numba_can_write_nowhere(tmp_path, monkeypatch) -> None:
-    """As in a read-only installation of a user without a home: numba finds no folder for its cache."""
-    monkeypatch.setattr(CacheImpl, "_locator_classes", [])
-    (tmp_path / "file").touch()
+@pytest.fixture
+def no_writable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    (tmp_path / "file").touch()  # no folder can be made under a file
     monkeypatch.setattr(compilation.numba_config, "CACHE_DIR", str(tmp_path / "file"))
     compilation.cache_directory.cache_clear()
-    try:
-        assert runpy.run_path(raytracing.__file__)["_trace"].stats.cache_path is None
-    finally:
+    yield
+    compilation.cache_directory.cache_clear()
+
+
+@pytest.mark.usefixtures("no_writable_folder")
+def test_without_a_writable_folder_kernels_are_compiled_but_not_kept(tmp_path, monkeypatch, caplog) -> None:
+    assert compilation.cache_directory() is None
+    double = compilation.kernel(_double)
+    assert double(3) == 6
+    assert double.stats.cache_path is None
+    monkeypatch.setattr(compilation.numba_config, "CACHE_DIR", str(tmp_path))
+    compilation.cache_directory.cache_clear()
+    with caplog.at_level(logging.INFO):
+        assert compilation.kernel(_double)(3) == 6
+        assert list(tmp_path.glob("kernels-*/*/*.nbc"))
+        assert caplog.text.count("compiling the kernels on first use") == 1
         compilation.cache_directory.cache_clear()
+        compilation.cache_directory()
+        assert caplog.text.count("compiling the kernels on first use") == 1  # they are in the cache
+
+
+@pytest.mark.usefixtures("no_writable_folder")
+def test_the_ray_tracer_compiles_where_numba_can_write_nowhere(monkeypatch) -> None:
+    """As in a read-only installation of a user without a home: numba finds no folder for its cache."""
+    monkeypatch.setattr(CacheImpl, "_locator_classes", [])
+    assert runpy.run_path(raytracing.__file__)["_trace"].stats.cache_path is None
 
 
 def _double(x: int) -> int:
