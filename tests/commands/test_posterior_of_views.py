@@ -1,11 +1,10 @@
 """`posterior=views` through both stages: training, cache, tests, predictions and reports."""
 
-import csv
-
 import numpy as np
 import pytest
 from conftest import made
 from plyfile import PlyData
+from small_runs import rows
 from support import SMALL, refused, strict_json, write_capture
 
 LADDER = {"model", "posterior_mean", "posterior_samples", "mean_predictor", "true_sampler"}
@@ -27,8 +26,7 @@ def runs(built_once):
 
 
 def column(run, name):
-    rows = csv.DictReader((run / "metrics.csv").open())
-    return [float(row[name]) for row in rows if row.get(name)]
+    return [float(row[name]) for row in rows(run) if row.get(name)]
 
 
 def test_validation_logs_the_scores_of_a_perfect_second_stage(runs):

@@ -1,18 +1,17 @@
-import csv
 import re
 from pathlib import Path
 
 import pytest
 import yaml
 from omegaconf import OmegaConf
+from small_runs import rows
 
 import completesplat.training
 from completesplat.training.loggers import ContinuedCSVLogger, WandbRun
 
 
 def numbers(folder: Path) -> list[dict[str, float]]:
-    with (folder / "metrics.csv").open(newline="") as file:
-        return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file)]
+    return [{k: float(v) for k, v in row.items() if v} for row in rows(folder)]
 
 
 def log(folder: Path, *entries: dict[str, float]) -> None:
@@ -47,8 +46,7 @@ def test_columns_are_those_of_old_and_new_rows(tmp_path, new):
     log(tmp_path, *OLD)
     log(tmp_path, new | {"step": 11}, {"d": 4.0, "step": 12}, {"a": 5.0, "step": 13})
     assert numbers(tmp_path) == [*OLD, new | {"step": 11}, {"d": 4.0, "step": 12}, {"a": 5.0, "step": 13}]
-    with (tmp_path / "metrics.csv").open() as file:
-        assert set(next(csv.reader(file))) == {"a", "b", "d", "step", *new}
+    assert set(rows(tmp_path)[0]) == {"a", "b", "d", "step", *new}
 
 
 def test_a_line_that_was_cut_off_is_left_out(tmp_path):

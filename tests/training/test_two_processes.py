@@ -1,6 +1,5 @@
 """Training by two processes, which talk through gloo, against one: figures, weights, and what is left is rounding."""
 
-import csv
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,6 +7,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from hydra.utils import instantiate
+from small_runs import rows
 from support import SMALL, compose_config
 from torch import multiprocessing
 
@@ -33,10 +33,8 @@ def train(root: Path, folder: Path, devices: int, *settings: str, dtype: torch.d
     """Train in a spawned process, because forks of this one could crash: threads of other tests may have run in it."""
     folder.mkdir()
     multiprocessing.spawn(train_here, (root, folder, devices, settings, dtype))
-    with (folder / "metrics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
     weights, metrics = torch.load(folder / "trained.pt", weights_only=True)
-    return Trained(weights, rows, metrics)
+    return Trained(weights, rows(folder), metrics)
 
 
 def train_here(_: int, root: Path, folder: Path, devices: int, settings: tuple[str, ...], dtype: torch.dtype) -> None:
