@@ -182,8 +182,7 @@ def test_training_stops_where_its_checkpoint_does_not_fit(command, pipeline, tmp
         finished = command("fit", *FIT, f"data.root={pipeline.toy}", f"out={tmp_path}/run")
     assert re.fullmatch(rf"error: {tmp_path}/run/checkpoints/last\.ckpt: {SAID}", line(finished))
     assert list((tmp_path / "run/checkpoints").iterdir()) == []
-    continued = command("fit", *FIT, f"data.root={pipeline.toy}", f"out={tmp_path}/run", "ckpt_path=last")
-    assert continued.status == 0
+    command.succeeds("fit", *FIT, f"data.root={pipeline.toy}", f"out={tmp_path}/run", "ckpt_path=last")
 
 
 def test_training_stops_where_its_folder_was_removed(command, pipeline, tmp_path, monkeypatch):

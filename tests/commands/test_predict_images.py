@@ -1,6 +1,5 @@
 """Predictions of several images at once, file formats, videos, warnings and refusals."""
 
-import json
 import os
 import re
 import subprocess
@@ -14,7 +13,7 @@ import torch
 from fake_converter import calls, install
 from PIL import Image
 from rich.progress import Progress
-from support import compose_config, some_gaussians, strict_json
+from support import compose_config, shipped_folders, some_gaussians, strict_json
 
 from completesplat.commands import trained
 from completesplat.commands.inputs import find_images
@@ -44,7 +43,7 @@ def predict(command, tiny_weights, tmp_path, monkeypatch):
         given = [f"image={image}", f"weights={tiny_weights}", f"out={tmp_path / 'out'}", *QUICK]
         return command("predict", *given, *settings)
 
-    return start
+    return command._replace(run=start)
 
 
 def save(path: Path, color: str = "red") -> Path:
@@ -168,10 +167,9 @@ def test_images_that_fail_are_named_and_do_not_stop_the_others(predict, tmp_path
 
 def test_a_prediction_leaves_no_file_of_an_earlier_one_and_what_a_user_put_there(predict, tmp_path):
     image, folder = save(tmp_path / "a.png"), tmp_path / "out/a"
-    assert predict(image, "formats=[ply,glb]", "video=[orbit]", "maps=true").status == 0
+    predict.succeeds(image, "formats=[ply,glb]", "video=[orbit]", "maps=true")
     (folder / "sample_00_mine.ply").write_text("mine")
-    again = predict(image, "formats=[splat]")
-    assert again.status == 0
+    again = predict.succeeds(image, "formats=[splat]")
     assert f"{folder}: an earlier prediction is replaced" in again.out + again.err
     kept = {"photo.png", "sample_00.splat", "sample_00_mine.ply", "sheet.png", "scene.json"}
     assert {path.name for path in folder.iterdir()} == kept
@@ -179,7 +177,7 @@ def test_a_prediction_leaves_no_file_of_an_earlier_one_and_what_a_user_put_there
 
 def test_a_finished_prediction_is_not_repeated_unless_something_has_changed(predict, tmp_path, monkeypatch):
     images = [save(tmp_path / f"x/{name}.png") for name in "abc"]
-    assert predict(tmp_path / "x").status == 0
+    predict.succeeds(tmp_path / "x")
 
     def repeated(*settings: str) -> set[str]:
         out = predict(tmp_path / "x", *settings).out.splitlines()
@@ -202,8 +200,8 @@ def test_shards_are_each_image_once_and_names_do_not_depend_on_them(predict, tmp
     assert "1/2 a.png" in predict(images, "shard=0", "shards=2").out
     assert sorted(path.name for path in (tmp_path / "out").glob("*/")) == ["a", "a_2", "shard-0"]
     assert "1/1 b.png" in predict(images, "shard=1", "shards=2").out
-    assert predict(images, "shard=3", "shards=4").status == 0  # nothing is left for it
-    assert "shard=2: must lie between 0 and 1, for shards=2" in predict(images, "shard=2", "shards=2").err
+    predict.succeeds(images, "shard=3", "shards=4")  # nothing is left for it
+    assert "shard=2: must lie between 0 and 1, for shards=2" in predict.refuses(images, "shard=2", "shards=2")
 
 
 @pytest.mark.processes
@@ -275,12 +273,8 @@ def test_a_photo_unlike_the_training_images_gets_a_warning_with_nearer_weights(t
     assert max(len(unlike), len(elsewhere)) <= 125
     assert len(photo_warnings(red, model, whole=True)) == len(photo_warnings(blue, model, whole=False)) == 1
     assert len(photo_warnings(blue, model_with(tiny_weights), whole=True)) == 1  # nothing is known of the training
-    folders = {}
-    for name, mean in (("reds", [0.9, 0, 0]), ("blues", [0, 0, 1.0]), ("greens", [0, 0.5, 0]), ("unknown", None)):
-        folders[name] = tmp_path / name
-        folders[name].mkdir()
-        training = {} if mean is None else {"picture_mean": mean + [0.0] * 5, "picture_std": [0.1] * 8}
-        (folders[name] / "config.json").write_text(json.dumps({"image_size": 24, "training": training}))
+    means = {"reds": (0.9, 0, 0), "blues": (0, 0, 1), "greens": (0, 0.5, 0), "unknown": None}
+    folders = shipped_folders(tmp_path, **{name: (24, mean) for name, mean in means.items()})
     monkeypatch.setattr("completesplat.scene_model.shipped", lambda: folders)
     assert photo_warnings(blue, model, whole=True)[2] == "weights=blues are nearer (0.0)"
     monkeypatch.setattr("completesplat.scene_model.shipped", lambda: {"reds": folders["reds"]})
@@ -298,8 +292,7 @@ def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
 
     monkeypatch.setattr("completesplat.scene_model.read_photograph", read)
     for setting, removed in (("background=remove", True), ("background=1", False)):
-        done = predict(save(tmp_path / "a.png"), setting)
-        assert done.status == 0
+        done = predict.succeeds(save(tmp_path / "a.png"), setting)
         assert ("a.png: removing the background" in done.out) == removed
         settings = strict_json(tmp_path / "out/a/scene.json")["settings"]
         assert (given["removed"], settings.get("background")) == (removed, "remove" if removed else None)
@@ -321,8 +314,7 @@ def test_videos_and_formats_are_written_and_recorded_and_a_strange_field_of_view
     program = install(tmp_path / "bin", "splat-transform")
     monkeypatch.setenv("PATH", f"{program.parent}:/usr/bin:/bin")
     wanted = ["formats=[splat,sog,html]", "video=[swipe,wobble]", "frames=3", "fov=15"]
-    finished = predict(save(tmp_path / "a.png"), *wanted)
-    assert finished.status == 0
+    finished = predict.succeeds(save(tmp_path / "a.png"), *wanted)
     assert "a.png: the field of view is 15 degrees (given), 50 in training" in finished.out
     folder = tmp_path / "out/a"
     written = {path.name for path in folder.iterdir()}

@@ -196,8 +196,7 @@ def test_a_capture_stays_where_it_is_and_the_last_line_goes_on(command, tmp_path
     write_capture(tmp_path / "fox", frames=20)
     for number in (3, 17):
         (tmp_path / f"fox/frame{number}.png").unlink()
-    finished = command("data", "import", "fox", "out=out")
-    assert finished.status == 0
+    finished = command.succeeds("data", "import", "fox", "out=out")
     assert "2 of 20 frames have no image and are left out: frame3.png, frame17.png" in finished.out
     assert "fox: 18 images with cameras, of which 3 are held out" in finished.out
     last = [str(tmp_path / "out"), "go on with: completesplat fit experiment=capture data.root=fox"]

@@ -66,8 +66,7 @@ def test_accumulated_batches_share_the_batch_and_the_share_is_recorded(command, 
     monkeypatch.setattr(ReconstructionModule, "training_step", counted)
     settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "data.batch_size=4", "test=false"]
     settings += ["trainer.accumulate_grad_batches=2", "callbacks.images=null", "data.references_per_sequence=8"]
-    finished = command("fit", *settings, f"out={tmp_path / 'run'}")
-    assert finished.status == 0
+    command.succeeds("fit", *settings, f"out={tmp_path / 'run'}")
     assert counts == [2, 2, 2, 2]  # two optimizer steps
     assert strict_json(tmp_path / "run/metrics.json")["data.batch_per_process"] == 2
     assert "data.batch_per_process=2" in (tmp_path / "run/commands.log").read_text()
@@ -77,9 +76,7 @@ def test_accumulated_batches_share_the_batch_and_the_share_is_recorded(command, 
 def test_processes_of_a_launcher_need_one_directory(command, monkeypatch, variables):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    finished = command("fit", "experiment=toy_var")
-    assert finished.status == 2
-    assert "give them one out=DIR" in finished.err.splitlines()[-1]
+    assert "give them one out=DIR" in command.refuses("fit", "experiment=toy_var")
     assert not os.path.exists("outputs")
 
 

@@ -50,6 +50,4 @@ def test_fit_goes_straight_to_the_test(command, toy_root, tmp_path):
     ],
 )
 def test_a_fit_that_would_do_nothing_is_refused(command, toy_root, setting, reason):
-    refused = command("fit", "experiment=toy_var", "model=per_scene", f"data.root={toy_root}", setting)
-    assert (refused.status, refused.err.count("\n")) == (2, 1), refused.err
-    assert reason in refused.err
+    assert reason in command.refuses("fit", "experiment=toy_var", "model=per_scene", f"data.root={toy_root}", setting)

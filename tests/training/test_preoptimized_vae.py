@@ -24,8 +24,7 @@ MORE = ["trainer.max_steps=3", "test=false"]
 def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
     run = tmp_path / "run"
     settings = [*SETTINGS, f"data.root={toy_root}", f"model.folder={run}/fitted"]
-    first = command("fit", *settings, f"out={run}")
-    assert first.status == 0
+    first = command.succeeds("fit", *settings, f"out={run}")
     assert "fitted Gaussians to 2 scenes" in first.out + first.err
     files = {path: path.stat().st_mtime_ns for path in (run / "fitted").iterdir()}
     assert len(files) == 3  # two sequences of training, one of validation
@@ -33,8 +32,7 @@ def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
     state = read_checkpoint(checkpoint)["state_dict"]
     assert state["vae.std"].shape == (2, 15, 1, 1)
     assert not torch.equal(state["vae.std"], torch.ones(2, 15, 1, 1))
-    again = command("fit", *settings, f"ckpt_path={checkpoint}", *MORE, f"out={tmp_path / 'more'}")
-    assert again.status == 0
+    again = command.succeeds("fit", *settings, f"ckpt_path={checkpoint}", *MORE, f"out={tmp_path / 'more'}")
     assert strict_json(tmp_path / "more/metrics.json")["steps"] == 3
     assert "fitted Gaussians" not in again.out + again.err
     assert {path: path.stat().st_mtime_ns for path in (run / "fitted").iterdir()} == files

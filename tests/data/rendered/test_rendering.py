@@ -221,16 +221,14 @@ def test_images_do_not_depend_on_the_other_meshes_or_on_the_number_of_workers(cu
 def test_all_commands_read_renders(command, cubes, tmp_path):
     given = ["data=rendered", f"data.root={cubes / 'data'}", "data.image_size=32"]
     for task, file in {"check": "check.json", "stats": "stats.png", "show": "show.png"}.items():
-        finished = command("data", task, *given, f"out={tmp_path / task}")
-        assert finished.status == 0, finished.err
+        command.succeeds("data", task, *given, f"out={tmp_path / task}")
         assert (tmp_path / task / file).is_file()
     assert strict_json(tmp_path / "check/check.json")["refused"] == []
     assert command("data", "prepare", *given, "workers=1", f"out={tmp_path / 'store'}").status == 0
     packed = ["data=rendered", f"data.root={tmp_path / 'store'}", "data.image_size=32"]
     assert command("data", "check", *packed, f"out={tmp_path / 'packed'}").status == 0
     small = [*SMALL, "data.batch_size=1", "data.targets=2", "data.workers=0", "callbacks.images=null"]
-    finished = command("fit", "experiment=toy_var", *given, *small, f"out={tmp_path / 'run'}")
-    assert finished.status == 0, finished.err
+    command.succeeds("fit", "experiment=toy_var", *given, *small, f"out={tmp_path / 'run'}")
     assert strict_json(tmp_path / "run/metrics.json")["steps"] == 2
 
 
