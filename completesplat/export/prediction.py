@@ -14,6 +14,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
 from completesplat.export.formats import FORMATS, write_format
 from completesplat.export.formats import suffix as format_suffix
@@ -34,8 +35,10 @@ logger = logging.getLogger(__name__)
 
 DIRECTIONS, SHEET_NAME = 8, 18  # views on a sheet, and characters above a column
 PHOTO_FILE, SCENE_FILE = "photo.png", "scene.json"
+SCENE_FORMAT, UNFINISHED = "completesplat scene 1", ".unfinished"
 SPLATS, VIDEOS = "|".join(map(format_suffix, FORMATS)), "|".join(PATHS)
-WRITTEN = re.compile(rf"sample_\d+({SPLATS})|({VIDEOS})_\d+\.mp4|(depth|normals|opacity)_\d+\.png|{SCENE_FILE}")
+SCENES, MAPS = rf"sample_\d+({SPLATS})|({VIDEOS})_\d+\.mp4", r"(depth|normals|opacity)_\d+\.png"
+WRITTEN = re.compile(rf"{SCENES}|{MAPS}|sheet\.png|{PHOTO_FILE}|{SCENE_FILE}")
 FARTHEST = 1000.0  # scene radii from the origin, about, where float32 is still finer than a hundredth of a pixel
 CONVENTIONS = {
     "axes": "OpenCV's for cameras: +x right, +y down, +z forward; world_to_camera gives the world's",
@@ -135,7 +138,7 @@ def write_prediction(
 ) -> None:
     """Write `photo.png`, `sample_00.ply`, `orbit_00.mp4`, ..., `sheet.png` and, when all is done, `scene.json`.
 
-    The files of an earlier prediction in the folder are removed first; others that a user put there remain.
+    The files of an earlier prediction in the folder, finished or not, are removed first; others remain.
 
     Args:
         image: the input image.
@@ -144,16 +147,21 @@ def write_prediction(
         on_file: called with the name of each scene's file and video before it is written.
 
     Raises:
-        CompleteSplatError: all Gaussians of a sample are broken, or a converter fails.
+        CompleteSplatError: all Gaussians of a sample are broken, a converter fails, or files of such names are there
+            that no prediction wrote.
         DiskError: the disk is full, or the folder above `folder` is missing.
     """
     # Refuse samples without intact Gaussians before anything is written.
     shots = [replace(x, scene=cleaned(x.scene, f"{settings['image']}: sample {i}")) for i, x in enumerate(shots)]
     scenes, reference = [shot.scene for shot in shots], shots[0].camera
     make_folder(folder)
-    if (folder / SCENE_FILE).is_file():
+    old = sorted(file for file in folder.iterdir() if WRITTEN.fullmatch(file.name))
+    if is_described(folder):
         logger.info("%s: an earlier prediction is replaced", folder)
-    for file in filter(lambda file: WRITTEN.fullmatch(file.name), [*folder.iterdir()]):
+    elif old and not (folder / UNFINISHED).is_file():
+        raise CompleteSplatError(f"{folder}: {old[0].name} is there, which no prediction wrote; give another out=")
+    write_text(folder / UNFINISHED, "")
+    for file in old:
         file.unlink()
     write_png(folder / PHOTO_FILE, Image.fromarray(to_pixels(image)))
     views, depths = [], []
@@ -177,6 +185,7 @@ def write_prediction(
         files |= written
         recorded["depth_map_ends"] = list(ends)
     write_scene_json(folder / SCENE_FILE, reference, recorded, settings["seed"], {**files, "sheet": "sheet.png"})
+    (folder / UNFINISHED).unlink()
 
 
 def write_fitted_scene(
@@ -328,7 +337,7 @@ def write_scene_json(
 ) -> None:
     """Write a scene's description, `settings` and `files` as JSON; raise ValueError if a number is not finite."""
     scene = {
-        "format": "completesplat scene 1",
+        "format": SCENE_FORMAT,
         "reference_camera": plain_camera(reference),
         "conventions": CONVENTIONS,
         "settings": dict(settings),
@@ -336,6 +345,17 @@ def write_scene_json(
         "files": dict(files),
     }
     write_text(path, json.dumps(scene, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def is_described(folder: Path) -> bool:
+    """Return whether a folder has a description by `write_scene_json`; one that is damaged counts."""
+    file = folder / SCENE_FILE
+    try:
+        return file.is_file() and json.loads(file.read_bytes()).get("format") == SCENE_FORMAT
+    except ValueError:
+        return True
+    except AttributeError:  # no mapping
+        return False
 
 
 def plain_camera(camera: Cameras) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.access import show_status
-from completesplat.viewer.page import Page
+from completesplat.viewer.page import SHOWN, Page
 from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps, preview_of
 from completesplat.viewer.sample import Sample
 
@@ -48,7 +48,7 @@ class Completion:
         if self.photograph is None:
             return self.page.tell(CompleteSplatError("load an image first"), client)
         settings = {name: getattr(self.controls, name).value for name in SLIDERS}
-        self.page.worker.submit("draw", partial(self._draw, *self.photograph, settings, client))
+        self.page.worker.submit(SHOWN, partial(self._draw, *self.photograph, settings, client))
 
     def complete(self, image: Path, name: str, client: viser.ClientHandle | None) -> None:
         """Load an image file; raise a `CompleteSplatError` if it is none, or its background cannot be removed."""
@@ -71,7 +71,10 @@ class Completion:
         """Draw samples in the worker's thread, and show them while they form."""
         began = time.monotonic()
         progress, forming = self.controls.progress, self.controls.forming.value
-        earlier = [sample for sample in self.page.view.samples if sample.finished] if self.controls.keep.value else []
+        before, up = self.page.view.samples, self.model.up.tolist()
+        earlier = [sample for sample in before if sample.finished] if self.controls.keep.value else []
+        if self.page.view.up.tolist() != up:  # that of a scene which was opened meanwhile
+            self.page.view.set_up(up)
         layers = self.model.parameterization.layers
         reference, last_shown = self.model.camera(photograph).to("cpu"), 0.0
 
@@ -96,7 +99,9 @@ class Completion:
         try:
             scenes = self.model(photograph, on_step=formed if forming else None, **settings)
             self.page.show(arranged(scenes, finished=True), f"{len(scenes)} drawn in {time.monotonic() - began:.1f} s")
-        except CompleteSplatError as error:
+        except Exception as error:
+            if self.page.view.samples is not before:
+                self.page.show(before)
             self.page.tell(error, client)
         finally:
             progress.visible = False

@@ -3,7 +3,7 @@
 import logging
 import tempfile
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, partial
@@ -18,7 +18,7 @@ from completesplat.data.images.files import open_image, refused_as_bad
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import FORMATS, suffix, write_format
 from completesplat.export.images import to_pixels
-from completesplat.export.prediction import PHOTO_FILE
+from completesplat.export.prediction import PHOTO_FILE, is_described
 from completesplat.export.splat_transform import PageView
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.files import SPLATS, printable, write_text
@@ -33,6 +33,7 @@ from completesplat.viewer.splat_view import SplatView
 Task = Callable[[], None]
 
 THUMBNAIL, MOST_THUMBNAILS = 96, 24  # px
+SHOWN = "shown"  # kind of all jobs that show other samples
 
 log = logging.getLogger(__name__)
 
@@ -45,11 +46,11 @@ class Worker:
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
-        self._failed, self._jobs = failed, dict[str, Future[None]]()
+        self._failed, self._jobs = failed, dict[Hashable, Future[None]]()
         self._pool, self._lock = ThreadPoolExecutor(1, "completesplat-viewer"), threading.Lock()
         self.closed = False
 
-    def submit(self, kind: str, job: Task) -> None:
+    def submit(self, kind: Hashable, job: Task) -> None:
         """Add a job after the waiting ones, and drop a waiting one of the same kind."""
         with self._lock:
             if kind in self._jobs:
@@ -132,7 +133,8 @@ class Saver:
 
     def _next(self, stem: str, suffix: str) -> Path:
         taken = {path.name.partition(".")[0] for path in self.folder.glob(f"{stem}_*")}
-        return self.folder / f"{next(name for i in range(10**6) if (name := f'{stem}_{i:02}') not in taken)}{suffix}"
+        names = (f"{stem}_{i:02}{suffix}" for i in range(10**6))
+        return self.folder / next(name for name in names if name.partition(".")[0] not in taken)
 
 
 class Page:
@@ -144,6 +146,7 @@ class Page:
     def __init__(self, server: GuardedServer, view: SplatView, saver: Saver, scenes: Mapping[str, Path]) -> None:
         self.server, self.view, self.saver, self.scenes = server, view, saver, scenes
         self.complete: Callable[[Path, str, viser.ClientHandle | None], None] | None = None
+        self.told: Exception | None = None
         self.worker = Worker(self.tell)
         self.opening = panel.add_opening(server.gui, [*scenes])
         self.opening.upload.on_upload(self._upload)
@@ -179,9 +182,9 @@ class Page:
 
     def show_photo(self, scene: Path) -> None:
         """Show a prediction's photo, if its folder has one, in the panel; raise BadImage for a damaged one."""
-        file = (scene if scene.is_dir() else scene.parent) / PHOTO_FILE
-        self.photo.content = ""
-        if file.is_file():
+        folder = scene if scene.is_dir() else scene.parent
+        file, self.photo.content = folder / PHOTO_FILE, ""
+        if file.is_file() and is_described(folder):
             with refused_as_bad(str(file)), open_image(file, ("PNG",)) as image:
                 pixels = np.asarray(image.convert("RGB").resize((THUMBNAIL, THUMBNAIL)))
                 self.photo.content = panel.preview_of(pixels, "photo")
@@ -190,7 +193,7 @@ class Page:
         name = self.opening.chosen.value
         if name in self.scenes:
             self.opening.chosen.options = (*self.scenes,)
-            self.worker.submit("open", partial(self._open_for, event.client, self.scenes[name], name))
+            self.worker.submit(SHOWN, partial(self._open_for, event.client, self.scenes[name], name))
 
     def _open_for(self, client: viser.ClientHandle | None, path: Path, name: str) -> None:
         try:
@@ -199,13 +202,18 @@ class Page:
             self.tell(error, client)
 
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
-        """Show an uploaded scene, or complete an uploaded image; its name is never used as a path."""
-        file, name = self.opening.upload.value, printable(self.opening.upload.value.name)
+        """Show an uploaded scene, or complete an uploaded image, when the scene that is being drawn is finished."""
+        file = self.opening.upload.value
+        name, content = printable(file.name), file.content
+        file.content = b""  # which the button would keep until the next upload
+        self.worker.submit(SHOWN, partial(self._open_upload, event.client, name, content))
+
+    def _open_upload(self, client: viser.ClientHandle | None, name: str, content: bytes) -> None:
+        """Open an uploaded file, whose name is never used as a path."""
         suffix = Path(name).suffix.lower()
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"upload{suffix if suffix in SPLATS else ''}"
-            path.write_bytes(file.content)
-            file.content = b""  # which the button would keep until the next upload
+            path.write_bytes(content)
             try:
                 if suffix in SPLATS:
                     self.open(path, name)
@@ -213,11 +221,11 @@ class Page:
                 elif self.complete is None:
                     raise CompleteSplatError(f"{name}: not {', '.join(SPLATS)}; images need completesplat view IMAGE")
                 else:
-                    self.complete(path, name, event.client)
+                    self.complete(path, name, client)
             except CompleteSplatError as error:
-                self.tell(CompleteSplatError(str(error).replace(str(path), name)), event.client)
+                self.tell(CompleteSplatError(str(error).replace(str(path), name)), client)
             except Exception as error:
-                self.tell(error, event.client)
+                self.tell(error, client)
 
     def _let_choose_another(self, name: str) -> None:
         """Name an uploaded scene in the choice, so that each of `scenes` can be chosen next."""
@@ -237,9 +245,9 @@ class Page:
             self.looking.thumbnails.content = row
 
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
-        """Show an error in one browser or in all; log it as well if it is a fault of the program."""
+        """Show an error in one browser or in all, and keep it; log it as well if it is a fault of the program."""
         show_status(self.server, "")  # what was waited for
-        text = str(error)
+        self.told, text = error, str(error)
         if not isinstance(error, CompleteSplatError):
             text = f"{type(error).__name__}: {text}"
             log.error("the viewer goes on after %s", text, exc_info=error)
@@ -263,7 +271,7 @@ class Page:
             self._mark_thumbnail()
 
         def pressed(index: int, _: viser.CommandEvent) -> None:
-            if index < len(looking.chosen.options):
+            if index < len(looking.chosen.options) - 1:  # key 0, which is -1, chooses all
                 looking.chosen.value = looking.chosen.options[index]
 
         for digit, command in looking.keys.items():
@@ -274,22 +282,22 @@ class Page:
         looking.front.on_click(lambda event: view.look_from_the_front(event.client))
 
     def _save(self, event: viser.GuiEvent[Any]) -> None:
-        client, kind = event.client, self.saving.kind.value
+        client, kind, shown = event.client, self.saving.kind.value, list(self.view.visible)
         if client is None:
             return
 
         def save() -> None:
             show_status(self.server, f"saving {kind}")
             try:
-                files = self.saver.save(kind, self.view.visible)
-            except CompleteSplatError as error:
+                files = self.saver.save(kind, shown)
+            except Exception as error:
                 return self.tell(error, client)
             show_status(self.server, "")
             for file in files:
                 client.send_file_download(file.name, file.read_bytes())
             client.add_notification("Saved", f"{', '.join(file.name for file in files)} in {self.saver.folder}")
 
-        self.worker.submit(kind, save)
+        self.worker.submit(object(), save)  # each click counts
 
 
 def write_viewer_page(server: viser.ViserServer, path: Path) -> Path:

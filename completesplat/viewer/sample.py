@@ -15,6 +15,7 @@ from completesplat.data.images.files import MOST_PIXELS
 from completesplat.data.validation import field, finite_array, read_json, require_rotation
 from completesplat.errors import BadAnnotation, BadCamera, CompleteSplatError, errors_at
 from completesplat.export.cleaning import LARGEST, with_screen_space_dilation
+from completesplat.export.prediction import SCENE_FILE, is_described
 from completesplat.export.reading import read_gaussians
 from completesplat.files import by_numbers
 from completesplat.gaussians import Gaussians
@@ -68,7 +69,7 @@ class Sample:
 def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     """Read a file of Gaussians, or all samples of a prediction or fitted scene; return them and the direction up.
 
-    A file without `scene.json` beside it is seen by its `framing_camera`.
+    A file without our `scene.json` beside it is seen by its `framing_camera`.
 
     Raises:
         CompleteSplatError: there is nothing that can be shown.
@@ -77,8 +78,9 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     if not files:
         raise CompleteSplatError(f"{path}: no sample_*.ply or scene.ply in this folder")
     scenes = [read_gaussians(file) for file in files]
-    description = (path.parent if path.is_file() else path) / "scene.json"
-    if not description.is_file() or not all(file.name.startswith(("sample_", "scene.")) for file in files):
+    description = (path.parent if path.is_file() else path) / SCENE_FILE
+    is_ours = all(file.name.startswith(("sample_", "scene.")) for file in files) and is_described(description.parent)
+    if not is_ours:
         return [Sample(scene, 1, framing_camera(scene)) for scene in scenes], UP
     with errors_at(description):
         data = read_json(description)

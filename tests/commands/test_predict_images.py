@@ -175,6 +175,15 @@ def test_a_prediction_leaves_no_file_of_an_earlier_one_and_what_a_user_put_there
     assert {path.name for path in folder.iterdir()} == kept
 
 
+@pytest.mark.parametrize(("name", "status"), [("notes.txt", 0), ("depth_00.png", 2), ("photo.png", 2)])
+def test_files_of_others_with_a_predictions_names_are_refused_and_kept(predict, tmp_path, name, status):
+    (tmp_path / "out/a").mkdir(parents=True)
+    (tmp_path / "out/a" / name).write_text("mine")
+    done = predict(save(tmp_path / "a.png"))
+    assert (done.status, f"{name} is there, which no prediction wrote" in done.err) == (status, status == 2)
+    assert (tmp_path / "out/a" / name).read_text() == "mine"
+
+
 def test_a_finished_prediction_is_not_repeated_unless_something_has_changed(predict, tmp_path, monkeypatch):
     images = [save(tmp_path / f"x/{name}.png") for name in "abc"]
     predict.succeeds(tmp_path / "x")
@@ -184,7 +193,7 @@ def test_a_finished_prediction_is_not_repeated_unless_something_has_changed(pred
         return {line.split()[1] for line in out if re.match(r"\d/\d ", line)}
 
     assert repeated() == set()
-    (tmp_path / "out/a/scene.json").unlink()  # as a killed process leaves it
+    (tmp_path / "out/a/scene.json").rename(tmp_path / "out/a/.unfinished")  # as a killed process leaves it
     (tmp_path / "out/b/sample_00.ply").unlink()
     assert repeated() == {"a.png:", "b.png:"}
     save(images[2], "blue")

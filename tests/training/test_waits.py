@@ -143,7 +143,7 @@ def train(stage: str, folder: Path, precision: str, *settings: str) -> Trainer:
     folder.mkdir()
     data, module = fit.instantiate(config)
     quiet = {"logger": False, "enable_progress_bar": False, "limit_val_batches": 0, "log_every_n_steps": 1000}
-    callbacks = [*fit._parts(config, "callbacks"), *([Watched()] if torch.cuda.is_available() else [])]
+    callbacks = [*fit.built_parts(config.callbacks), *([Watched()] if torch.cuda.is_available() else [])]
     trainer = instantiate(
         config.trainer, callbacks=callbacks, precision=precision, max_steps=7, **quiet, _convert_="all"
     )

@@ -22,11 +22,13 @@ from completesplat.export.formats import write_splat
 from completesplat.export.images import to_pixels
 from completesplat.export.mesh import Mesh
 from completesplat.export.ply import read_ply, write_ply
+from completesplat.export.prediction import write_scene_json
 from completesplat.geometry.cameras import look_at
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
 
+from completesplat.viewer import completion as completion_module  # noqa: E402
 from completesplat.viewer import page as page_module  # noqa: E402
 from completesplat.viewer.access import start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
@@ -129,7 +131,8 @@ def test_keys_and_thumbnails_choose_a_sample(page):
     assert thumbnails.content.count("<img") == 3
     assert "key:'3'" in thumbnails.content
     first = thumbnails.content
-    for digit, chosen, value in (("2", 1, "sample 2"), ("9", 1, "sample 2"), ("0", None, SIDE_BY_SIDE)):
+    keys = ("2", 1, "sample 2"), ("4", 1, "sample 2"), ("9", 1, "sample 2"), ("0", None, SIDE_BY_SIDE)
+    for digit, chosen, value in keys:
         for callback in page.looking.keys[digit]._impl.trigger_cb:
             callback(viser.CommandEvent(client=Browser(), client_id=0, target=page.looking.keys[digit]))
         assert (page.view.chosen, page.looking.chosen.value) == (chosen, value)
@@ -155,6 +158,9 @@ def test_a_thumbnail_is_a_view_from_behind_where_samples_differ(page):
 
 def test_the_photo_of_a_predictions_folder_is_in_the_panel_and_a_damaged_one_refused(page, tmp_path):
     write_ply(tmp_path / "scene.ply", balls_sample().gaussians)
+    (tmp_path / "photo.png").write_bytes(b"of someone else")
+    page.open(tmp_path, "scene")
+    write_scene_json(tmp_path / "scene.json", balls_sample().reference, {}, 0, {})
     for content, shown in ((png(), True), (None, False), (b"no image", None)):
         (tmp_path / "photo.png").unlink(missing_ok=True)
         if content is not None:
@@ -334,6 +340,41 @@ def test_a_fault_is_shown_and_the_page_goes_on(completion, model, monkeypatch, c
     assert len(load(completion.page)) == 2
 
 
+def test_a_drawing_that_fails_half_way_leaves_the_samples_before(completion, model, monkeypatch):
+    before, forward, steps, shown = load(completion.page), model.denoiser.forward, [], []
+    monkeypatch.setattr(completion_module, "PAUSE", -1)
+    monkeypatch.setattr(model.denoiser, "forward", lambda *a: 1 / 0 if steps else steps.append(1) or forward(*a))
+    show = completion.page.show
+    monkeypatch.setattr(completion.page, "show", lambda *given: shown.append(given) or show(*given))
+    after = press(completion.page, completion.controls.draw)
+    assert len(shown) > 1  # estimates, and then the samples again
+    assert [id(sample) for sample in after] == [id(sample) for sample in before]
+
+
+def test_samples_stand_upright_after_a_scene_with_another_direction_up(completion, tmp_path):
+    load(completion.page)
+    own = completion.page.view.up.tolist()
+    write_ply(tmp_path / "a.ply", balls_sample().gaussians)
+    completion.page.view.set_up((1.0, 0.0, 0.0))
+    press(completion.page, completion.controls.draw)
+    assert completion.page.view.up.tolist() == own == completion.model.up.tolist()
+
+
+def test_an_upload_is_opened_after_the_drawing_that_it_waits_for(completion, model, monkeypatch, tmp_path):
+    entered, release = threading.Event(), threading.Event()
+    forward = model.denoiser.forward
+    load(completion.page)
+    monkeypatch.setattr(model.denoiser, "forward", lambda *a: (entered.set(), release.wait(LIMIT), forward(*a))[-1])
+    press(completion.page, completion.controls.draw, wait=False)
+    assert entered.wait(LIMIT)
+    write_ply(tmp_path / "a.ply", balls_sample().gaussians)
+    upload = completion.page.opening.upload
+    upload._impl.value = SimpleNamespace(name="a.ply", content=(tmp_path / "a.ply").read_bytes())
+    press(completion.page, upload, wait=False)
+    release.set()
+    assert [sample.gaussians.count for sample in finish(completion.page)] == [600]
+
+
 FILES = {"ply": ["sample_00.ply", "sample_01.ply"], "sog": ["sample_00.sog", "sample_01.sog"]}
 FILES |= {"video": ["orbit_00.mp4", "orbit_01.mp4"], "html": ["page_00.html"]}
 
@@ -363,6 +404,29 @@ def test_saving_again_overwrites_nothing_and_takes_the_chosen_sample(page):
     assert sorted(path.name for path in page.saver.folder.iterdir()) == files
 
 
+def test_each_click_saves_what_it_saw_for_its_browser(page):
+    release, browsers = threading.Event(), [Browser(), Browser()]
+    page.show([balls_sample(layers=4)])
+    page.worker.submit("drawing", lambda: release.wait(LIMIT))
+    for browser in browsers:
+        press(page, page.saving.save, browser, wait=False)
+    other = replace(balls_sample(), gaussians=balls_sample().gaussians[:5])
+    page.show([other])
+    release.set()
+    finish(page)
+    assert [list(browser.files) for browser in browsers] == [["sample_00.ply"], ["sample_01.ply"]]
+    assert [read_ply(path).count for path in sorted(page.saver.folder.iterdir())] == [600, 600]
+
+
+def test_a_fault_in_saving_goes_to_its_browser(page, monkeypatch, caplog):
+    browser, other = Browser(), Browser()
+    monkeypatch.setattr(page.server, "get_clients", lambda: {0: browser, 1: other})
+    monkeypatch.setattr(page.saver, "save", lambda *_: 1 / 0)
+    with caplog.at_level(logging.CRITICAL):
+        press(page, page.saving.save, browser)
+    assert (browser.messages, other.messages) == (["ZeroDivisionError: division by zero"], [])
+
+
 @pytest.mark.parametrize("exact", [True, False])
 def test_files_have_the_screen_space_dilation_once_and_videos_none(page, monkeypatch, exact):
     """Our rasterizer adds it itself; Gaussians from a file have it already."""
@@ -381,8 +445,9 @@ def test_a_mesh_is_saved_beside_the_splats(page, monkeypatch):
     tetrahedron = Mesh(corners, np.array([[0, 2, 1], [0, 3, 2], [0, 1, 3], [1, 2, 3]]), corners, 0.1)
     drawn = []
     monkeypatch.setattr("completesplat.export.formats.mesh_of", lambda *given: drawn.append(given) or tetrahedron)
-    paths = [page.saver.save(kind, [balls_sample()])[0] for kind in ("mesh", "ply", "mesh")]
-    assert [path.name for path in paths] == ["sample_00_mesh.glb", "sample_00.ply", "sample_01_mesh.glb"]
+    paths = [page.saver.save(kind, [balls_sample()])[0] for kind in ("mesh", "mesh", "ply", "mesh")]
+    numbered = ["sample_00_mesh.glb", "sample_01_mesh.glb", "sample_00.ply", "sample_02_mesh.glb"]
+    assert [path.name for path in paths] == numbered
     assert all(path.is_file() for path in paths)
     assert drawn[0][0] is page.saver.rasterizer()
 

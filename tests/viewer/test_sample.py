@@ -42,6 +42,7 @@ def test_a_ply_alone_is_seen_as_a_whole(tmp_path):
     assert ((pixels > 0) & (pixels < torch.tensor([width, height]))).all(-1).float().mean() > 0.85
 
 
+OURS = '"format": "completesplat scene 1"'
 CAMERA = '{"world_to_camera": [[1.0]], "intrinsics": [[1.0]], "image_size": [4, 4]}'
 
 
@@ -49,8 +50,8 @@ CAMERA = '{"world_to_camera": [[1.0]], "intrinsics": [[1.0]], "image_size": [4, 
     ("text", "reason"),
     [
         ("", "not a JSON file"),
-        ('{"settings": {}}', "no reference_camera in {'settings': {}}"),
-        (f'{{"reference_camera": {CAMERA}, "settings": {{}}}}', "world_to_camera must be 4 x 4 numbers"),
+        (f"{{{OURS}}}", "no reference_camera in {'format': 'completesplat scene 1'}"),
+        (f'{{{OURS}, "reference_camera": {CAMERA}, "settings": {{}}}}', "world_to_camera must be 4 x 4 numbers"),
     ],
 )
 def test_broken_descriptions_and_folders_without_samples_are_refused(tmp_path, text, reason):
@@ -59,6 +60,13 @@ def test_broken_descriptions_and_folders_without_samples_are_refused(tmp_path, t
     (prediction(tmp_path) / "scene.json").write_text(text)
     with pytest.raises(CompleteSplatError, match=rf"scene\.json: {reason}"):
         read_scene(tmp_path)
+
+
+@pytest.mark.parametrize("text", ['{"name": "a scene of Unity"}', "[1]"])
+def test_another_programs_description_does_not_count(tmp_path, text):
+    (prediction(tmp_path) / "scene.json").write_text(text)
+    samples, up = read_scene(tmp_path)
+    assert (len(samples), up) == (2, UP)
 
 
 def test_the_pivot_is_in_the_middle_of_the_image_despite_faint_gaussians():
