@@ -9,6 +9,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
+from completesplat.files import printable
 from completesplat.results import measured, tables
 from completesplat.results.runs import HOW, MODES, SCORES, Job, RunTree, collect
 from completesplat.results.sweeps import sweep_rows
@@ -141,13 +142,14 @@ def published_tables(tree: RunTree | None) -> list[tables.Table]:
     if not (tree.scores or tree.modes or tree.warnings):
         raise CompleteSplatError(f"runs={tree.folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
     sweeps = _ablation_sweeps(tree)
-    single = measured.entries_of(run for run in tree.scores if run.folder.parent not in sweeps)
+    listed = {folder / job.name for folder, tested in sweeps.items() for job in tested}
+    single = measured.entries_of(run for run in tree.scores if run.folder not in listed)
     made, placed = [], []
     for table in read_tables():
         entries = []
         if table.get("options"):
             for folder, tested in sweeps.items():
-                entries += sweep_entries(table, folder.relative_to(tree.folder).as_posix(), tested)
+                entries += sweep_entries(table, printable(folder.relative_to(tree.folder).as_posix()), tested)
         else:
             entries = [entry for entry in single if is_comparable(table, entry)]
             placed += entries

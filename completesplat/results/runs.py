@@ -6,16 +6,18 @@ import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from completesplat.errors import CompleteSplatError
+from completesplat.files import printable
 
 SCORES, MODES = "metrics.json", "hidden_modes.json"
 RECORD, CONFIG, PLAN = "run.json", "config.yaml", "multirun.yaml"
@@ -52,12 +54,18 @@ class Protocol(TypedDict, total=False):
 
 
 def read_mapping(path: Path) -> dict[str, object]:
-    """Read the mapping in a JSON file; return an empty one if that fails, as when its writer was killed."""
+    """Read the mapping in a file by `write_json`; return an empty one if that fails, as when its writer was killed."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = content if isinstance(content, dict) else {}
+        for entry in content.get("not_finite", ()):
+            place, _, value = entry.partition(": ")
+            *outer, key = place.split(".")
+            if isinstance(part := reduce(lambda part, key: part[key], outer, content), dict):  # else an entry of a list
+                part[key] = float(value)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return {}
-    return content if isinstance(content, dict) else {}
+    return content
 
 
 def read_record(folder: Path) -> Record:
@@ -141,7 +149,8 @@ def _result(path: Path, root: Path) -> ResultsFile:
             Style(**metric.get("style", {"heading": ""}))
     except (AttributeError, TypeError):
         raise ValueError("a metric's style in it is not one of this version") from None
-    return ResultsFile(path.parent, path.parent.relative_to(root).as_posix(), cast(Protocol, protocol), entries)
+    name = printable(path.parent.relative_to(root).as_posix())
+    return ResultsFile(path.parent, name, cast(Protocol, protocol), entries)
 
 
 def _mapping(value: object) -> Mapping[str, object]:
@@ -201,7 +210,8 @@ def _joined(parts: Sequence[list[Job]]) -> list[Job]:
 
 def _jobs(folder: Path) -> list[Job]:
     jobs = [_job(path, path.relative_to(folder).as_posix()) for path in _job_folders(folder)]
-    recorded = [job for job in jobs if job.record]
+    verb = _plan(folder).get("verb")  # people write results of other verbs there, too
+    recorded = [job for job in jobs if job.record and (verb is None or job.record["command"][0].endswith(f" {verb}"))]
     known = [job.overrides for job in recorded]
     waiting = [Job("", overrides) for overrides in map(_pairs, planned_jobs(folder)) if overrides not in known]
     # `waiting` also has the jobs that ended before their record, so that many folders without a record are left out.
@@ -224,19 +234,25 @@ def planned_jobs(folder: Path) -> list[list[str]]:
     The list is empty without the `multirun.yaml` that hydra writes when a sweep starts, or if that file does not
     determine the jobs: `glob(...)` depends on the config files.
     """
-    if not (folder / PLAN).is_file():
-        return []
     values = {}
     try:
-        arguments = list(OmegaConf.load(folder / PLAN).hydra.overrides.task)
+        arguments = list(_plan(folder).hydra.overrides.task)
         for override in OverridesParser.create().parse_overrides(arguments):
             sweep = override.is_sweep_override()
             texts = list(override.sweep_string_iterator()) if sweep else [override.get_value_element_as_str()]
             key = override.get_key_element()
             values[key] = [f"{key}={text}" for text in texts]
-    except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError, AttributeError, TypeError):
+    except (HydraException, ValueError, AttributeError, TypeError):
         return []
     return [list(job) for job in itertools.product(*values.values())]
+
+
+def _plan(folder: Path) -> Any:
+    try:
+        plan = OmegaConf.load(folder / PLAN)
+    except (OmegaConfBaseException, YAMLError, OSError, ValueError):
+        plan = None
+    return plan if isinstance(plan, DictConfig) else OmegaConf.create()
 
 
 def _pairs(overrides: Sequence[str]) -> dict[str, str]:
@@ -256,8 +272,9 @@ def _job(folder: Path, name: str) -> Job:
         config = {}
     if not config or not isinstance(config, dict) or "overrides" not in record:
         return Job(name)
-    tested = _mapping(metrics.get("test"))
-    test = {name: flat_scores(_mapping(entry)) for name, entry in tested.items() if name != PROTOCOL}
+    tested = metrics if PROTOCOL in metrics else _mapping(metrics.get("test"))
+    entries = {name: entry for name, entry in tested.items() if name != PROTOCOL and isinstance(entry, Mapping)}
+    test = {name: flat_scores(entry) for name, entry in entries.items()}
     steps, protocol = cast(int, metrics.get("steps", 0)), cast(Protocol, _mapping(tested.get(PROTOCOL)))
     return Job(name, _pairs(record["overrides"]), config, record, bool(metrics), steps, test, protocol)
 

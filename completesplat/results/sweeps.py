@@ -11,9 +11,10 @@ from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 
+from completesplat.files import printable
 from completesplat.results import tables
 from completesplat.results.machine import machine
-from completesplat.results.measured import Entry, score_rows, styles_of
+from completesplat.results.measured import Entry, group_by_protocol, score_rows, styles_of
 from completesplat.results.runs import MODEL, SEED, UPPER_BOUND, Job, Record, collect, shell_command
 
 # Hydra imports this file for every run, even to print the help, so torch and rich are imported only when a job has
@@ -108,14 +109,17 @@ def summarize(*folders: Path) -> tuple[list[Entry], tables.Table]:
     One seed has no standard deviation.
     """
     jobs = collect(*folders)
-    rows = sweep_rows([job for job in jobs if job.finished])
+    finished = [job for job in jobs if job.finished]
+    alike = len(group_by_protocol((job, job.protocol) for job in finished if job.protocol)) < 2
+    rows = [row for row in sweep_rows(finished) if alike or row.seeds is not None]
     styles = styles_of(rows)
     names = [name for name in tables.shown_scores(styles) if any(name in row.scores for row in rows)]
     columns = [(name, None) for name in names]
-    body = score_rows(rows, ("method", "seeds", "scenes"), columns, tables.Notes(), marked=True)
+    body = score_rows(rows, ("method", "seeds", "scenes"), columns, tables.Notes(), marked=alike)
     headings = [tables.Heading("ablation", figures=False), tables.Heading("seeds"), tables.Heading("scenes")]
     headings += [tables.score_heading(name, styles[tables.metric_of(name)]) for name in names]
     remarks = [CAPTION if rows else "No job of this sweep has finished.", *_progress_remarks(jobs)]
+    remarks += [] if alike else ["Not all jobs were tested alike (data, resolution, scenes), and do not compare."]
     remarks += [*_row_remarks(rows), *_program_remarks([job.record for job in jobs if job.record])]
     return rows, tables.Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
 
@@ -126,7 +130,7 @@ def _progress_remarks(jobs: Sequence[Job]) -> list[str]:
     names = []
     for job in unfinished:
         seed = [f"seed={job.overrides[SEED]}"] if SEED in job.overrides else []
-        names.append(job.name or ", ".join([job.label, *seed]))  # a job has no folder before it starts
+        names.append(printable(job.name) or ", ".join([job.label, *seed]))  # a job has no folder before it starts
     return [*remarks, f"Not finished: {'; '.join(names)}."] if names else remarks
 
 
@@ -135,8 +139,6 @@ def _row_remarks(rows: Sequence[Entry]) -> list[str]:
     mixed = [row for row in ours if isinstance(row.scenes, str)]
     remarks = [f"{row.label} has seen the views that it is scored on." for row in rows if row.upper_bound]
     remarks += [f"{row.label}: its jobs were tested on different scenes ({row.scenes})." for row in mixed]
-    if len({row.scenes for row in ours}) > 1:
-        remarks.append("The rows were not tested on equally many scenes and do not compare.")
     return remarks
 
 

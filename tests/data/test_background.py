@@ -14,6 +14,7 @@ from PIL import Image
 from support import exif_turned
 
 from completesplat.data.images.photograph import (
+    by_grabcut,
     image_features,
     outside_of_box,
     outside_of_mask,
@@ -118,6 +119,18 @@ def test_without_rembg_grabcut_keeps_the_largest_piece_that_differs_from_the_bor
     assert "rembg is better" in caplog.text
     with pytest.raises(ImageError, match="no object is found"):
         without_background(Image.new("RGB", (3000, 8), "red"))
+
+
+def test_grabcut_takes_the_object_in_the_middle_not_a_larger_thing_beside_it():
+    pytest.importorskip("cv2")
+    rows, columns = np.mgrid[:96, :128]
+    object_mask = np.hypot(rows - 50, columns - 66) < 17
+    pixels = np.where(rows[..., None] < 40, [60, 110, 160], [120, 100, 80])  # wall and floor
+    pixels[8:88, 5:21] = [40, 140, 60]
+    pixels[object_mask] = [200, 60, 40]
+    noisy = np.random.default_rng(0).normal(pixels, 10).clip(0, 255).astype(np.uint8)
+    alpha = np.array(by_grabcut(Image.fromarray(noisy)).getchannel("A")) > 127
+    assert (alpha & object_mask).sum() > 0.97 * (alpha | object_mask).sum()
 
 
 SHIPPED = (0.25, 0.5, 0.75, 1.0)

@@ -80,15 +80,19 @@ class Sweep:
             (job / "metrics.json").write_text(json.dumps(summary))
         return job
 
-    def scored(self, *overrides: str, psnr: float, scenes: int = 40, steps: int = 9, **others: float) -> Path:
+    def scored(
+        self, *overrides: str, psnr: float, scenes: int = 40, steps: int = 9, resolution: int = 64, **others: float
+    ) -> Path:
         """A finished job, with both naive predictors."""
+        protocol = PROTOCOL | {"scenes": scenes, "resolution": resolution}
         naive = {"mean_image": predictor(15.0, scenes), "copy_reference": predictor(12.0, scenes)}
-        return self.add(*overrides, test={"model": predictor(psnr, scenes, **others)} | naive, steps=steps)
+        tested = {"model": predictor(psnr, scenes, **others), "protocol": protocol}
+        return self.add(*overrides, test=tested | naive, steps=steps)
 
-    def plan(self, overrides: Sequence[str]) -> None:
+    def plan(self, overrides: Sequence[str], **more: str) -> None:
         """Write the file that hydra writes when the sweep starts."""
         self.folder.mkdir(exist_ok=True)
-        planned = {"hydra": {"overrides": {"task": list(overrides)}}, "out": "${somewhere:}"}
+        planned = {"hydra": {"overrides": {"task": list(overrides)}}, "out": "${somewhere:}", **more}
         OmegaConf.save(OmegaConf.create(planned), self.folder / "multirun.yaml")
 
 

@@ -1,6 +1,7 @@
 """Places of runs in the paper's tables or in a table of ours, and the texts of their cells."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -238,6 +239,18 @@ def test_a_sweep_stands_below_the_papers_rows_by_protocol(runs, job) -> None:
     assert len({label[-3:] for label in rows}) == 2  # notes on two protocols
     assert f"[{full['LPIPS ↓'].removeprefix('missing: note ')}] lpips: missing: no weights" in table.below()
     assert any("resolution 64" in line for line in table.below())
+
+
+def test_a_test_in_a_sweeps_folder_has_a_table_of_its_own(runs, job, run) -> None:
+    job("full", 0, 20.0)
+    run("sweep/test-of-full", 33.33)
+    (row,) = ours(made(runs)["own_1"])
+    assert "33.33" in row.values()
+
+
+def test_names_that_are_no_text_are_escaped(runs, run) -> None:
+    run("bad", 20.0).parent.rename(os.fsdecode(os.fsencode(runs) + b"/bad\xff\n"))
+    assert any(line.startswith("[1] bad\\udcff\\n: ") for line in made(runs)["own_1"].below())
 
 
 def test_a_sweep_without_ablations_counts_as_single_runs(runs, job) -> None:

@@ -20,6 +20,7 @@ from omegaconf import OmegaConf
 from readers import put
 from support import python
 
+from completesplat.files import write_json
 from completesplat.results.machine import machine
 from completesplat.results.measured import Entry, score_rows, time_cell
 from completesplat.results.runs import planned_jobs
@@ -66,7 +67,9 @@ def test_one_seed_has_no_deviation_one_without_a_score_no_mean_and_one_that_dive
     assert table.loc["full", "full_novel_lpips_mean"] == 0.25
     naive = [(row.seeds, row.steps, row.scenes) for row in summarize(sweep.folder)[0][2:]]
     assert naive == [(None, None, 40)] * 2
-    sweep.scored("ablation=m1", "seed=2", psnr=math.nan)
+    metrics = sweep.scored("ablation=m1", "seed=2", psnr=math.nan) / "metrics.json"
+    write_json(metrics, json.loads(metrics.read_text()))
+    assert "NaN" not in metrics.read_text()
     write_summary(sweep.folder)
     assert ",nan,nan" in (sweep.folder / "summary.csv").read_text()
 
@@ -88,6 +91,37 @@ def test_different_numbers_of_scenes_have_a_remark(sweep) -> None:
     assert [(row.scenes, row.steps) for row in rows[:3]] == [("40/38", "9/7"), (None, 9), (40, 9)]
     assert "m1: its jobs were tested on different scenes (40/38)." in table.remarks
     assert any("do not compare" in remark for remark in table.remarks)
+
+
+def test_jobs_that_were_not_tested_alike_are_not_ranked_and_share_no_naive_rows(sweep) -> None:
+    for seed in range(2):
+        sweep.scored("ablation=m1", f"seed={seed}", psnr=20.0, resolution=32)
+        sweep.scored("ablation=full", f"seed={seed}", psnr=25.0)
+    rows, table = summarize(sweep.folder)
+    assert [row.label for row in rows] == ["m1", "full"]
+    assert "Not all jobs were tested alike (data, resolution, scenes), and do not compare." in table.remarks
+    assert not any(cell.mark for row in table.rows for cell in row.cells)
+
+
+def test_results_of_other_verbs_in_a_sweeps_folder_are_no_jobs_of_it(sweep) -> None:
+    for seed in range(2):
+        sweep.scored("ablation=m1", f"seed={seed}", psnr=20.0)
+    planned = ["experiment=small", "ablation=m1", "seed=0,1", "data.root=/home/someone/data/set"]
+    sweep.plan(planned, verb="fit")
+    record = sweep.add("runs=TABLE") / "run.json"
+    record.write_text(record.read_text().replace("completesplat fit", "completesplat report"))
+    rows, table = summarize(sweep.folder)
+    assert [row.label for row in rows] == ["small", "mean_image", "copy_reference"]
+    assert "2 of 2 jobs have finished." in table.remarks
+
+
+def test_a_sweep_of_tests_has_their_scores(sweep) -> None:
+    for k in (1, 2):
+        metrics = sweep.scored(f"evaluation.samples={k}", psnr=20.0 + k) / "metrics.json"
+        metrics.write_text(json.dumps(json.loads(metrics.read_text())["test"]))
+    rows, _ = summarize(sweep.folder)
+    scores = {row.label: row.scores[PSNR] for row in rows if row.seeds is not None}
+    assert scores == {"evaluation.samples=1": 21.0, "evaluation.samples=2": 22.0}
 
 
 def named(sweep) -> list[str]:

@@ -36,6 +36,7 @@ LANCZOS_REACH = 3  # radius of the filter, in pixels of the coarser image
 CUTTERS = ("isnet-general-use", "u2net", "u2netp")
 DOWNLOADED = "u2net"
 GRABCUT_SIDE = 400  # pixels; more would take longer than a prediction
+MIDDLE = 0.7  # radii of the ellipse in which an object is expected at first, in halves of the sides
 
 log = logging.getLogger(__name__)
 
@@ -261,6 +262,8 @@ def without_background(image: Image.Image) -> Image.Image:
 def by_grabcut(image: Image.Image) -> Image.Image:
     """Keep the largest piece of what differs in colour from the image's border (GrabCut, Rother et al. 2004).
 
+    The colours in the middle are taken for the object's at first.
+
     Raises:
         CompleteSplatError: OpenCV is not installed.
     """
@@ -270,11 +273,14 @@ def by_grabcut(image: Image.Image) -> Image.Image:
         extras = 'pip install "completesplat[background]", or "completesplat[grabcut]" (no download, coarser)'
         raise CompleteSplatError(f"background=remove needs rembg or OpenCV: {extras}") from error
     width, height = (max(SMALLEST_SIDE, round(side * GRABCUT_SIDE / max(image.size))) for side in image.size)
-    small, labels = np.array(image.resize((width, height))), np.zeros((height, width), np.uint8)
     x, y = width // 30, height // 30  # at least one of them is above 0
+    rows, columns = np.ogrid[1 - height : height : 2, 1 - width : width : 2]
+    labels = np.where(np.hypot(rows / height, columns / width) < MIDDLE, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    labels = np.pad(labels[y : height - y, x : width - x], ((y, y), (x, x)), constant_values=cv2.GC_BGD)
     models = np.zeros((2, 1, 65))
     cv2.setRNGSeed(0)
-    cv2.grabCut(small, labels, (x, y, width - 2 * x, height - 2 * y), models[0], models[1], 5, cv2.GC_INIT_WITH_RECT)
+    small = np.array(image.resize((width, height)))
+    cv2.grabCut(small, labels, (0, 0, 0, 0), models[0], models[1], 5, cv2.GC_INIT_WITH_MASK)
     _, pieces, statistics, _ = cv2.connectedComponentsWithStats(labels & 1)
     sizes = [0, *statistics[1:, cv2.CC_STAT_AREA]]  # the first piece is the background
     mask = (pieces == np.argmax(sizes)) & (labels & 1 > 0)
