@@ -234,7 +234,7 @@ def as_markdown(table: Table) -> str:
         [MARKED_MARKDOWN[cell.mark].format(cell.text.replace("|", r"\|")) for cell in row.cells] for row in table.rows
     ]
     rule = ["---:" if heading.figures else "---" for heading in table.headings]
-    headings = [heading.joined() for heading in table.headings]
+    headings = [heading.joined().replace("|", r"\|") for heading in table.headings]
     lines = [f"| {' | '.join(line)} |" for line in [headings, rule, *cells]]
     return "\n".join([f"## {table.title}", "", *lines, "", *(f"- {line}" for line in table.below()), ""])
 

@@ -243,6 +243,7 @@ def test_a_sweep_stands_below_the_papers_rows_by_protocol(runs, job) -> None:
 
 def test_a_test_in_a_sweeps_folder_has_a_table_of_its_own(runs, job, run) -> None:
     job("full", 0, 20.0)
+    job("no_skips", 0, 15.0)
     run("sweep/test-of-full", 33.33)
     (row,) = ours(made(runs)["own_1"])
     assert "33.33" in row.values()

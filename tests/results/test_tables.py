@@ -56,6 +56,12 @@ def test_latex_is_balanced_and_all_rows_have_the_columns_of_their_table(written)
     assert text.isascii()
 
 
+def test_bars_in_headings_and_cells_make_no_columns_in_markdown() -> None:
+    row = tables.TableRow("ours", [tables.Cell("1|2")])
+    made = tables.Table("name", "title", [tables.Heading("|error|")], [row], [])
+    assert tables.as_markdown(made).splitlines()[2:5] == [r"| \|error\| |", "| ---: |", r"| 1\|2 |"]
+
+
 def test_all_files_have_the_published_figures_as_printed_and_the_csv_all_digits_of_ours(written, capsys) -> None:
     made, out = written
     markdown, latex = (out / "tables.md").read_text(), (out / "tables.tex").read_text()
