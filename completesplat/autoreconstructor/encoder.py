@@ -19,8 +19,7 @@ Features = list[Float[Tensor, "batch _ _ _"]]
 def recompute(block: nn.Module, *inputs: Tensor | None) -> Tensor:
     """Apply a block; in training, do not store its activations but recompute them in the backward pass."""
     recomputed = block.training and torch.is_grad_enabled()
-    output: Tensor = checkpoint(block, *inputs, use_reentrant=False) if recomputed else block(*inputs)
-    return output
+    return checkpoint(block, *inputs, use_reentrant=False) if recomputed else block(*inputs)
 
 
 def vae_encoder(inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, groups: int) -> vae.Encoder:

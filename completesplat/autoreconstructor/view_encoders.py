@@ -52,8 +52,7 @@ class PlaneSweep(nn.Module):
         with torch.autocast(views.images.device.type, enabled=False):
             swept = sweep(views, depth_range, self.planes)
         reference = nn.functional.avg_pool2d(views.images[:, 0], 2)
-        moments: Tensor = self.network(torch.cat([reference * 2 - 1, swept.flatten(1, 3)], 1))
-        return moments.float()
+        return self.network(torch.cat([reference * 2 - 1, swept.flatten(1, 3)], 1)).float()
 
 
 SHARPNESS = 4.0

@@ -42,8 +42,7 @@ class AutoDecoder(nn.Module):
 
     def forward(self, codes: Codes) -> SplatterImage:
         """Reconstruct from codes."""
-        image: SplatterImage = self.reconstructor(codes, ())
-        return image
+        return self.reconstructor(codes, ())
 
     def make_room(self, rows: int) -> None:
         """Replace the table by a new one for this number of images, with all rows free."""

@@ -42,8 +42,7 @@ class LearnedConditioning(nn.Module):
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch channel _ _"]:
         """Return features of sRGB images in [0, 1], at the latent's resolution."""
-        features: Tensor = self.network(images * 2 - 1)
-        return features
+        return self.network(images * 2 - 1)
 
 
 class StableDiffusionConditioning(nn.Module):
@@ -85,5 +84,4 @@ class StableDiffusionConditioning(nn.Module):
     @torch.no_grad()
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch channel _ _"]:
         """Return features of sRGB images in [0, 1], at an eighth of their resolution."""
-        mean: Tensor = self.encoder(images)[0].mean
-        return mean * STABLE_DIFFUSION_SCALE
+        return self.encoder(images)[0].mean * STABLE_DIFFUSION_SCALE

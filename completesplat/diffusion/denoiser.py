@@ -68,8 +68,7 @@ class ConditionalUNet(nn.Module):
     def forward(self, noisy_latent: Latents, timestep: Int[Tensor, " batch"], conditioning: Conditioning) -> Latents:
         """Predict the noise in h_t (paper, Eq. 3), or another target of training (`objective.target`), in float32."""
         inputs = torch.cat([conditioning, noisy_latent], dim=1)
-        sample: Tensor = self.network(inputs, timestep, **self.context_of(len(inputs))).sample
-        return sample.float()
+        return self.network(inputs, timestep, **self.context_of(len(inputs))).sample.float()
 
     def context_of(self, batch: int) -> dict[str, Tensor]:
         return {}
@@ -86,10 +85,8 @@ class ZeroTokenAttention(AttnProcessor2_0):
     ) -> Tensor:
         """Attend like diffusers' `AttnProcessor2_0`; input and output are [batch, place, channel]."""
         if torch.is_grad_enabled():
-            attended: Tensor = super().__call__(attn, hidden_states, *inputs, **settings)
-            return attended
-        constant: Tensor = attn.to_out[0](hidden_states.new_zeros(1, 1, attn.inner_dim))
-        return constant.expand_as(hidden_states)
+            return super().__call__(attn, hidden_states, *inputs, **settings)
+        return attn.to_out[0](hidden_states.new_zeros(1, 1, attn.inner_dim)).expand_as(hidden_states)
 
 
 class TextlessStableDiffusion(ConditionalUNet):

@@ -107,8 +107,7 @@ class Sampler:
         """Draw timesteps for training: uniform for diffusion, the logistic of a standard normal for flow matching."""
         if is_flow(self.scheduler):
             # This favours the middle (Esser et al. 2024, "Scaling Rectified Flow Transformers", Section 3.1).
-            middle: Tensor = torch.randn(count, device=device).sigmoid()
-            return (middle * self.training_timesteps).ceil().long()
+            return (torch.randn(count, device=device).sigmoid() * self.training_timesteps).ceil().long()
         return torch.randint(self.training_timesteps, (count,), device=device)
 
     def add_noise(self, latent: Latents, noise: Tensor, timestep: Tensor) -> Latents:
@@ -119,8 +118,7 @@ class Sampler:
     @property
     def training_timesteps(self) -> int:
         """Return T, the number of noise levels of the forward process."""
-        steps: int = self.scheduler.config.num_train_timesteps
-        return steps
+        return self.scheduler.config.num_train_timesteps
 
 
 def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:

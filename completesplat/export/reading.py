@@ -120,8 +120,7 @@ def _signs(extensions: bytes) -> np.ndarray:
     if system > 8:
         raise ValueError(f"coordinate system {system}")
     right_up_front = (system or RIGHT_UP_BACK) - 1 >> np.arange(3) & 1
-    signs: np.ndarray = (2 * right_up_front - 1) * OUR_AXES
-    return signs
+    return (2 * right_up_front - 1) * OUR_AXES
 
 
 def _unpacked(data: bytes, table: int, streams: int, sizes: np.ndarray) -> bytes:

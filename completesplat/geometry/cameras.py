@@ -116,8 +116,7 @@ def nearest_to_axes(cameras: Cameras, least_spread: float = PARALLEL) -> Float[T
     mean = across.mean(0)
     if torch.linalg.eigvalsh(mean)[0] < least_spread:
         return None
-    point: Tensor = torch.linalg.solve(mean, (across @ centers[..., None]).mean(0))[:, 0]
-    return point
+    return torch.linalg.solve(mean, (across @ centers[..., None]).mean(0))[:, 0]
 
 
 def crop_resize(cameras: Cameras, left: float, top: float, side: float, size: int) -> Cameras:

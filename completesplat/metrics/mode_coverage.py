@@ -26,8 +26,7 @@ def classify(samples: SampledPixels, modes: ModePixels, probabilities: Probabili
 
 def mean_of(modes: Float[Tensor, "mode *image _"], probabilities: Float[Tensor, " mode"]) -> Float[Tensor, "*image _"]:
     """Return the modes' mean, weighted by their probabilities."""
-    mean: Tensor = torch.tensordot(probabilities, modes, dims=1)
-    return mean
+    return torch.tensordot(probabilities, modes, dims=1)
 
 
 def scores(samples: SampledPixels, modes: ModePixels, probabilities: Probabilities) -> dict[str, float]:

@@ -47,8 +47,7 @@ class ReconstructionScorer(Scorer):
 
     def forward(self, scenes: SceneBatch) -> Reconstruction:
         """Return Splatter Images, and posteriors if the model has any."""
-        reconstruction: Reconstruction = self.model(scenes.reference.images)
-        return reconstruction
+        return self.model(scenes.reference.images)
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Return Gaussians from the posterior's mode; nothing is drawn, so the seed has no effect."""
@@ -161,8 +160,7 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         images = scenes.reference.images * scenes.visible if self.masked else scenes.reference.images
         images = images.contiguous(memory_format=self.memory_format)
         seen = (scenes.all_views()[:, : 1 + others], scenes.depth_range) if others else ()
-        reconstruction: Reconstruction = self.model(images, *seen)
-        return reconstruction
+        return self.model(images, *seen)
 
     def draw_others(self, targets: int) -> int:
         """Draw how many of the targets a posterior that sees views gets: mostly many, never all."""

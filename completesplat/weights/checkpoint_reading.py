@@ -80,8 +80,7 @@ def _checked_pickle(path: Path, sums: bool) -> bytes:
             raise TensorFileError("damaged: a record that is a directory")
         if sums and records.testzip() is not None:
             raise TensorFileError("damaged: its checksum is another")
-        pickled: bytes = archive.get_record("data.pkl")
-        return pickled
+        return archive.get_record("data.pkl")
 
 
 class _Made:

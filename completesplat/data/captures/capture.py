@@ -232,5 +232,4 @@ def import_pycolmap() -> ModuleType:
 
 def _distorted(lens: Lens) -> "Camera":
     (height, width), params = lens.image_size, [*lens.focal, *lens.center, *lens.distortion, 0.0, 0.0, 0.0]
-    camera: Camera = import_pycolmap().Camera(model="FULL_OPENCV", width=width, height=height, params=params)
-    return camera
+    return import_pycolmap().Camera(model="FULL_OPENCV", width=width, height=height, params=params)

@@ -375,5 +375,4 @@ def _touched(hidden: Bool[np.ndarray, "side _"], size: int) -> Bool[np.ndarray, 
     first = np.clip(np.floor(centers - reach), 0, side).astype(int)
     last = np.clip(np.ceil(centers + reach), 0, side).astype(int)
     counts = np.concatenate([np.zeros((1, hidden.shape[1]), dtype=int), hidden.cumsum(axis=0)])
-    touched: np.ndarray = counts[last] > counts[first]
-    return touched
+    return counts[last] > counts[first]

@@ -52,8 +52,7 @@ def spread_around(frames: int, reference: int, count: int) -> list[int]:
     They repeat if the sequence has fewer other frames.
     """
     steps = 1 + (np.arange(count) + 0.5) * (frames - 1) / max(count, 1)
-    places: list[int] = ((reference + np.floor(steps).astype(int).clip(1, frames - 1)) % frames).tolist()
-    return places
+    return ((reference + np.floor(steps).astype(int).clip(1, frames - 1)) % frames).tolist()
 
 
 def draw_spread_views(frames: int, targets: int, rng: np.random.Generator) -> Choice:

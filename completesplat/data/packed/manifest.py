@@ -94,8 +94,7 @@ def read_as(kind: type[T], path: Path, header: Mapping[str, str | int], remedy: 
             stored = field(content, key, type(readable))
             if stored != readable:
                 raise UnreadableFile(f"{key} {stored}, this version reads {readable}: {remedy}")
-        manifest: T = parsed(kind, content)
-        return manifest
+        return parsed(kind, content)
 
 
 def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:

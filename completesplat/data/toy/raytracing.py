@@ -380,5 +380,4 @@ def trace(
     means over a pixel's rays. The distance is measured along the middle ray, in units of its length.
     """
     dome, patch, room = (None, None, surroundings) if isinstance(surroundings, Room) else (*surroundings, None)
-    traced: tuple[Array, Array, Array] = _trace(shapes, light, dome, patch, room, pose, rays)
-    return traced
+    return _trace(shapes, light, dome, patch, room, pose, rays)

@@ -60,8 +60,7 @@ class Part(NamedTuple):
     def distances(self, points: Array) -> Array:
         """Return the distances of points [n 3] to the (bounding) box; 0 inside."""
         outside = np.abs((points - self.center) @ self.axes) - self.half_sizes
-        distances: Array = np.linalg.norm(outside.clip(0), axis=-1)
-        return distances
+        return np.linalg.norm(outside.clip(0), axis=-1)
 
 
 def make_part(kind: int, center: Point, half: Point, look: Look, axes: Array | None = None, taper: float = 0.0) -> Part:

@@ -97,8 +97,7 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
 def field(entry: object, key: str, kind: type[T]) -> T:
     """Return a value of a JSON object as `parsed` converts it, or refuse one that is missing."""
-    value: T = parsed(kind, _entry(entry, key), key)
-    return value
+    return parsed(kind, _entry(entry, key), key)
 
 
 def _entry(entry: object, key: str) -> object:
