@@ -8,6 +8,7 @@ from typing import Any
 from hydra.utils import get_class
 from hydra.utils import instantiate as build
 from lightning import Trainer, seed_everything
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.utilities.model_summary.model_summary import ModelSummary
 from omegaconf import DictConfig, OmegaConf
@@ -104,6 +105,8 @@ def _train(trainer: Trainer, module: Stage, data: SceneDataModule, resumed: str 
     """Train, save the weights, and return all logged figures; refuse a checkpoint of another model."""
     try:
         trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
+    except MisconfigurationException as error:
+        raise CompleteSplatError(f"trainer: {error}") from error
     except RuntimeError as error:
         if resumed is None or "loading state_dict" not in str(error):
             raise

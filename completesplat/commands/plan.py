@@ -198,7 +198,7 @@ def parts_beside_steps(
     passes = config.sampler.steps if "completesplat" in config.model else 1
     every, batches, validation = trainer.val_check_interval, trainer.limit_val_batches, None
     if isinstance(every, int) and isinstance(batches, int):  # else shares of an epoch, or without an end
-        validation = passes * forward * batches * data.evaluation_batch_size / (batch * counts.accumulated * every)
+        validation = passes * forward * batches * data.evaluation_batch_size / (batch * every)
 
     size = sum(counts.memory[kind] for kind in ("weights", "optimizer", "averages"))
     by_steps, by_time = checkpoint.get("every_n_train_steps"), checkpoint.get("every_minutes")

@@ -51,7 +51,7 @@ def step_seed(*place: int) -> int:
 class BadSteps(Callback):
     """Callback that skips optimizer steps whose loss, or norm of all gradients, is not finite.
 
-    A skipped step does not change weights or the optimizer's state. It counts as a step of the run, so the schedule,
+    A skipped step does not change weights or moments. It counts as a step of the run, so the schedule,
     averages and the order of the data continue. All processes skip the same steps. Progress bar and loggers get the
     number of skipped steps as `train/bad_steps`. With 16-mixed, it includes the first ones, which find the loss scale.
 

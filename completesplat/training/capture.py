@@ -123,6 +123,7 @@ class CaptureFit(Stage):
     @torch.no_grad()
     def on_fit_start(self) -> None:
         """Place the first Gaussians, unless a run is continued."""
+        self.refuse_average()
         if changed := [key for key, value in self.data.augment.keywords.items() if value]:
             raise CompleteSplatError(f"data.{changed[0]}: model=capture fits the photos as they are; turn it off")
         sequence = self.sequence("train")

@@ -94,6 +94,8 @@ class Checkpoints(Checkpoint):
             if isinstance(run_logger, ContinuedCSVLogger):
                 run_logger.experiment.goes_on_from = trainer.global_step
         if trainer.is_global_zero:
+            for own in trainer.checkpoint_callbacks:  # folders that a user gave to Lightning's own callback
+                Path(getattr(own, "dirpath", None) or self.folder.parent).mkdir(parents=True, exist_ok=True)
             make_folder(self.folder)  # only here: a run whose folder is removed must not go on
             begun, last = Path(trainer.ckpt_path or ""), self.folder / LAST
             if begun != last and begun.parent == self.folder:

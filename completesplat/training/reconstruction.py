@@ -226,8 +226,9 @@ class ReconstructorOnly(ReconstructionModule):
             self.model.make_room(frames)
 
     def on_fit_start(self) -> None:
-        """Raise CompleteSplatError for several processes, because each would assign the codes to other images."""
+        """Raise CompleteSplatError for averages, and for several processes, which would assign codes differently."""
         super().on_fit_start()
+        self.refuse_average()
         if self.trainer.world_size > 1:
             raise CompleteSplatError("model=reconstructor_only trains in one process: set trainer.devices=1")
 

@@ -177,7 +177,9 @@ class Scorer(LightningModule):
         if loader.refused_depths:
             self.evaluation.missing["depth"] = f"missing: {loader.refused_depths[-1]}"
         self.evaluation.gather()
-        local, self.seconds = dict(self.seconds), defaultdict(list)
+        # The first duration of each process includes work that is done once.
+        local = {name: values[1:] or values for name, values in self.seconds.items()}
+        self.seconds = defaultdict(list)
         for name, values in (item for seconds in gather_values(local) for item in seconds.items()):
             self.seconds[name] += values
         for predictor, scores in self.test_results().items():
@@ -188,8 +190,7 @@ class Scorer(LightningModule):
 
     def test_results(self) -> dict[str, dict[str, Any]]:
         """Return `Evaluation.results` of the last test, with the model's seconds for a scene."""
-        # The first duration includes work that is done once.
-        seconds = {name: statistics.median(values[1:] or values) for name, values in self.seconds.items()}
+        seconds = {name: statistics.median(values) for name, values in self.seconds.items()}
         results = self.evaluation.results()
         results["model"] |= {"upper_bound": self.upper_bound, "fitted_to": self.fitted_to, "seconds": seconds}
         return results

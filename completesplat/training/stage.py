@@ -8,6 +8,7 @@ from typing import Any, Literal, cast
 import torch
 from hydra.utils import instantiate
 from jaxtyping import Float
+from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.plugins import Precision
 from lightning.pytorch.utilities.enums import GradClipAlgorithmType
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
@@ -17,7 +18,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from completesplat.data.loading.distributed import mean_of_processes
-from completesplat.errors import WeightsError
+from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers import Rasterizer
@@ -115,8 +116,14 @@ class Stage(Scorer):
         if self.config is not None:
             checkpoint["hyper_parameters"] = dict(self.config)
 
+    def refuse_average(self) -> None:
+        """Raise CompleteSplatError if weights are averaged, for a model whose number of weights changes in a run."""
+        trainer: Any = self.trainer
+        if any(isinstance(callback, WeightAveraging) for callback in trainer.callbacks):
+            raise CompleteSplatError("callbacks=ema: the number of this model's weights changes; they have no average")
+
     def log_step(self, values: dict[str, Tensor], batch_size: int) -> None:
-        """Log figures of a training step: their means over all processes.
+        """Log figures of a training step: their means over all processes, of the last of accumulated batches.
 
         They are sent in one message, because with Lightning's `sync_dist` processes would wait for each figure. With
         `prog_bar=True`, Lightning would wait for the GPU in every step; `Progress` shows them without.

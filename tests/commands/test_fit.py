@@ -99,6 +99,15 @@ def test_a_run_without_callbacks_or_loggers_is_trained_and_scored(command, toy_r
 
 
 @pytest.mark.slow
+def test_lightnings_own_checkpoints_may_go_to_a_new_folder_and_its_refusals_are_one_line(command, toy_root, tmp_path):
+    given = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "test=false"]
+    target, folder = "lightning.pytorch.callbacks.ModelCheckpoint", tmp_path / "new/folder"
+    command.succeeds("fit", *given, f"+callbacks.own={{_target_:{target},dirpath:{folder},every_n_train_steps:1}}")
+    assert [path.suffix for path in folder.iterdir()] == [".ckpt"]
+    assert "trainer: " in command.refuses("fit", *given, "trainer.limit_val_batches=0.1", "out=other")
+
+
+@pytest.mark.slow
 def test_a_training_without_callbacks_is_planned(command):
     assert command("plan", "experiment=toy_var", "~callbacks", "data.image_size=32").status == 0
 

@@ -123,6 +123,9 @@ def test_data_that_are_here_are_loaded_and_waited_for_if_that_takes_longer(toy_r
     assert beside[0]["checkpoints"] == pytest.approx(saved / 0.5e9 * often, rel=0.01)
     # A forward pass is a third of a step, and 8 batches of 4 scenes are 16 batches of 2.
     assert beside[1]["validation"] == pytest.approx(2 * seconds / 3 * 16 / config.trainer.val_check_interval, rel=0.2)
+    config.trainer.accumulate_grad_batches = 2  # the interval counts batches, of which two make a step now
+    halved = parts_beside_steps(config, count_work(config, 1), 1, 2 * seconds, seconds)
+    assert halved["validation"] == pytest.approx(2 * beside[1]["validation"], rel=0.2)
     del config.callbacks  # as `~callbacks`
     assert parts_beside_steps(config, counts, 2, seconds, seconds)["checkpoints"] == 0
 

@@ -99,6 +99,7 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
     [
         ("optimizer.lr=1", "optimizer.lr=1: CaptureFit does nothing with it; leave it out"),
         ("data.horizontal_flip=true", "data.horizontal_flip: model=capture fits the photos as they are"),
+        ("callbacks=ema", "callbacks=ema: the number of this model's weights changes"),
         ("data.root=.", "has 2 sequences (capture, other); model=capture fits one capture"),
     ],
 )

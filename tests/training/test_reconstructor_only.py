@@ -29,6 +29,11 @@ def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
     assert 0 < strict_json(run / "metrics.json")["test"]["model"]["full"]["novel"]["psnr"] < 100
 
 
+def test_codes_have_no_average(command, toy_root):
+    refused = command.refuses("fit", *SETTINGS, f"data.root={toy_root}", "callbacks=ema")
+    assert "callbacks=ema: the number of this model's weights changes" in refused
+
+
 def test_no_ablation_brings_skips():
     config = compose_config("fit", *SETTINGS, "ablation=skips_first_two")
     assert len(instantiate(config.model, _convert_="all").model.reconstructor.skips) == 0
