@@ -2,7 +2,6 @@
 
 import json
 import logging
-import math
 import os
 import platform
 import shlex
@@ -26,6 +25,7 @@ from completesplat.commands.protocol import git_commit
 from completesplat.errors import CompleteSplatError
 from completesplat.files import UNFINISHED, atomic_path, write_bytes, write_json, writing
 from completesplat.imports import importing, postponing
+from completesplat.results.runs import read_mapping
 from completesplat.settings.checks import check_parts_of_verb, check_values
 from completesplat.settings.composition import shard_folder, use_working_folder
 from completesplat.settings.options import did_you_mean
@@ -161,13 +161,11 @@ def optimized(metric: str | None, out: Path) -> float | None:
     """Return a job's metric for sweepers (NaN: not finite, None: not asked); raise CompleteSplatError if absent."""
     if metric is None:
         return None
-    metrics = json.loads((out / METRICS).read_text())
-    not_finite = {entry.partition(": ")[0] for entry in metrics.get("not_finite", [])}
-    known = [name for name, value in metrics.items() if name in not_finite or isinstance(value, float)]
+    known = {name: value for name, value in read_mapping(out / METRICS).items() if isinstance(value, float)}
     if metric not in known:
         available = f"there are {', '.join(known)}{did_you_mean(metric, known)}"
         raise CompleteSplatError(f"optimized_metric={metric}: no figure in {out / METRICS}, {available}")
-    return math.nan if metric in not_finite else float(metrics[metric])
+    return known[metric]
 
 
 def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) -> str:

@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 DIRECTIONS, SHEET_NAME = 8, 18  # views on a sheet, and characters above a column
 PHOTO_FILE, SCENE_FILE = "photo.png", "scene.json"
-SCENE_FORMAT, UNFINISHED = "completesplat scene 1", ".unfinished"
+UNFINISHED = ".unfinished"  # a file that is there until the others are written
 SPLATS, VIDEOS = "|".join(map(format_suffix, FORMATS)), "|".join(PATHS)
 SCENES, MAPS = rf"sample_\d+({SPLATS})|({VIDEOS})_\d+\.mp4", r"(depth|normals|opacity)_\d+\.png"
 WRITTEN = re.compile(rf"{SCENES}|{MAPS}|sheet\.png|{PHOTO_FILE}|{SCENE_FILE}")
@@ -155,14 +155,7 @@ def write_prediction(
     shots = [replace(x, scene=cleaned(x.scene, f"{settings['image']}: sample {i}")) for i, x in enumerate(shots)]
     scenes, reference = [shot.scene for shot in shots], shots[0].camera
     make_folder(folder)
-    old = sorted(file for file in folder.iterdir() if WRITTEN.fullmatch(file.name))
-    if is_described(folder):
-        logger.info("%s: an earlier prediction is replaced", folder)
-    elif old and not (folder / UNFINISHED).is_file():
-        raise CompleteSplatError(f"{folder}: {old[0].name} is there, which no prediction wrote; give another out=")
-    write_text(folder / UNFINISHED, "")
-    for file in old:
-        file.unlink()
+    _make_room(folder)
     write_png(folder / PHOTO_FILE, Image.fromarray(to_pixels(image)))
     views, depths = [], []
     files = {"photo": PHOTO_FILE}
@@ -186,6 +179,18 @@ def write_prediction(
         recorded["depth_map_ends"] = list(ends)
     write_scene_json(folder / SCENE_FILE, reference, recorded, settings["seed"], {**files, "sheet": "sheet.png"})
     (folder / UNFINISHED).unlink()
+
+
+def _make_room(folder: Path) -> None:
+    """Remove the files of an earlier prediction, finished or not; refuse files with such names of anybody else."""
+    old = sorted(file for file in folder.iterdir() if WRITTEN.fullmatch(file.name))
+    if is_described(folder):
+        logger.info("%s: an earlier prediction is replaced", folder)
+    elif old and not (folder / UNFINISHED).is_file():
+        raise CompleteSplatError(f"{folder}: {old[0].name} is there, which no prediction wrote; give another out=")
+    write_text(folder / UNFINISHED, "")
+    for file in old:
+        file.unlink()
 
 
 def write_fitted_scene(
@@ -337,7 +342,7 @@ def write_scene_json(
 ) -> None:
     """Write a scene's description, `settings` and `files` as JSON; raise ValueError if a number is not finite."""
     scene = {
-        "format": SCENE_FORMAT,
+        "format": "completesplat scene 1",
         "reference_camera": plain_camera(reference),
         "conventions": CONVENTIONS,
         "settings": dict(settings),
@@ -348,14 +353,13 @@ def write_scene_json(
 
 
 def is_described(folder: Path) -> bool:
-    """Return whether a folder has a description by `write_scene_json`; one that is damaged counts."""
+    """Return whether a folder has a description of ours, perhaps a damaged one, and not another program's."""
     file = folder / SCENE_FILE
     try:
-        return file.is_file() and json.loads(file.read_bytes()).get("format") == SCENE_FORMAT
-    except ValueError:
+        content = json.loads(file.read_bytes()) if file.is_file() else None
+    except (ValueError, RecursionError):
         return True
-    except AttributeError:  # no mapping
-        return False
+    return isinstance(content, dict) and "reference_camera" in content
 
 
 def plain_camera(camera: Cameras) -> dict[str, Any]:

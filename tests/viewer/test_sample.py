@@ -42,7 +42,6 @@ def test_a_ply_alone_is_seen_as_a_whole(tmp_path):
     assert ((pixels > 0) & (pixels < torch.tensor([width, height]))).all(-1).float().mean() > 0.85
 
 
-OURS = '"format": "completesplat scene 1"'
 CAMERA = '{"world_to_camera": [[1.0]], "intrinsics": [[1.0]], "image_size": [4, 4]}'
 
 
@@ -50,8 +49,8 @@ CAMERA = '{"world_to_camera": [[1.0]], "intrinsics": [[1.0]], "image_size": [4, 
     ("text", "reason"),
     [
         ("", "not a JSON file"),
-        (f"{{{OURS}}}", "no reference_camera in {'format': 'completesplat scene 1'}"),
-        (f'{{{OURS}, "reference_camera": {CAMERA}, "settings": {{}}}}', "world_to_camera must be 4 x 4 numbers"),
+        ('{"reference_camera": null}', "reference_camera must be of type dict, not None"),
+        (f'{{"reference_camera": {CAMERA}, "settings": {{}}}}', "world_to_camera must be 4 x 4 numbers"),
     ],
 )
 def test_broken_descriptions_and_folders_without_samples_are_refused(tmp_path, text, reason):
