@@ -47,7 +47,6 @@ OF_RUNS = ("image", "out", "shard", "shards", "devices")  # settings on which no
 FAR = 1.5  # ratio of tan(fov / 2), photo to training, from which a warning is given
 UNLIKE = 2.0  # distance from the training images (`distance_to_training`) from which a warning is given
 sha256_of_weights = cache(sha256_of)  # a process has one model, of up to gigabytes
-OF_THE_CENTER = "mask= and box= hide parts of a photo's central square, but its object is shown in another square"
 RESIZING = 0.1  # change of a distance that resizing to another model's size and back may cause
 ELSEWHERE = "for objects weights=splatter_image:objaverse (226 MB), for scenes github.com/apple/ml-sharp"
 
@@ -256,7 +255,7 @@ def _predict(
     photograph = model.read(image, config.fov, config.background == REMOVE)
     visible = visible_part(config, image, model.image_size)
     if visible is not None and photograph.crop != "center":
-        raise CompleteSplatError(f"{printable(image.name)}: {OF_THE_CENTER}")
+        raise CompleteSplatError("mask= and box= are of a photo's central square, but its object is shown in another")
     for warning in photo_warnings(photograph, model, whole=visible is None):
         logger.warning("%s: %s", printable(image.name), warning)
     settings = {name: config[name] for name in ("samples", "seed", "color_fits")}

@@ -52,10 +52,10 @@ def read_gaussians(path: str | Path) -> Gaussians:
         values = read(path.read_bytes())
     except (OSError, EOFError, ValueError, struct.error, zlib.error) as error:
         raise PlyError(f"{path}: damaged, missing, or of another version ({error})") from error
-    *parts, harmonics = (torch.from_numpy(value.astype(np.float32)) for value in values)
-    gaussians = Gaussians(*parts)
-    if harmonics.shape[1]:
-        gaussians = DirectionalGaussians(**vars(gaussians), harmonics=harmonics)
+    tensors = [torch.from_numpy(value.astype(np.float32)) for value in values]
+    gaussians = Gaussians(*tensors[:5])
+    if tensors[5:]:
+        gaussians = DirectionalGaussians(**vars(gaussians), harmonics=tensors[5])
     return cleaned(gaussians, path, bounded)
 
 
@@ -82,7 +82,7 @@ def _read_by_splat_transform(path: Path, kind: str) -> Gaussians:
 def _read_splat(content: bytes) -> list[np.ndarray]:
     records = np.frombuffer(content, RECORD)
     colors, rotations = records["colors"] / 255, records["quaternions"] / 128 - 1
-    return [records["means"], rotations, records["scales"], colors[:, 3], colors[:, :3], np.empty((len(records), 0, 3))]
+    return [records["means"], rotations, records["scales"], colors[:, 3], colors[:, :3]]
 
 
 def _read_spz(content: bytes) -> list[np.ndarray]:
@@ -97,9 +97,8 @@ def _read_spz(content: bytes) -> list[np.ndarray]:
     parts = _unpacked(data, table, streams, sizes[sizes > 0]) if version == 4 else data[16 : 16 + ends[-1]]
     blocks = np.split(np.frombuffer(parts, np.uint8, ends[-1]), ends[:-1])
     places, opacities, colors, scales, rotations = (block.reshape(count, -1) for block in blocks[:5])
-    harmonics = blocks[5].reshape(count, coefficients(degree), 3)[:, : coefficients(LARGEST_DEGREE)] / 128 - 1
-    if degree:
-        harmonics = rotated(torch.from_numpy(harmonics), torch.from_numpy(np.diag(signs * 1.0))).numpy()
+    values = blocks[5].reshape(count, coefficients(degree), 3)[:, : coefficients(LARGEST_DEGREE)]
+    harmonics = torch.from_numpy(values / 128 - 1)
     whole = np.pad(places.reshape(count, 3, 3), ((0, 0), (0, 0), (1, 0)))  # 24 bits in the upper part of 32
     return [
         np.ldexp(whole.view("<i4")[..., 0] >> 8, -bits) * signs,
@@ -107,7 +106,7 @@ def _read_spz(content: bytes) -> list[np.ndarray]:
         np.exp(scales / 16 - 10),
         opacities[:, 0] / 255,
         np.maximum(0.5 + SH_C0 * (colors / 255 - 0.5) / 0.15, 0),
-        harmonics,
+        *([rotated(harmonics, torch.from_numpy(np.diag(signs * 1.0))).numpy()] if degree else []),
     ]
 
 

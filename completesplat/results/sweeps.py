@@ -87,14 +87,11 @@ def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> Entry:
     means = {name: fmean(values) for name, values in scores.items()}
     if predictor != MODEL:
         return Entry(label, means, scenes, predictor, bound, protocol=jobs[0].protocol)
-    deviations = {name: _deviation(values) for name, values in scores.items()} if len(jobs) > 1 else {}
+    several = scores.items() if len(jobs) > 1 else ()
+    # An infinite PSNR has no standard deviation.
+    deviations = {name: stdev(values) if all(map(math.isfinite, values)) else math.nan for name, values in several}
     steps = _common(job.steps for job in jobs)
     return Entry(label, means, scenes, predictor, bound, len(jobs), steps, deviations, jobs[0].protocol)
-
-
-def _deviation(values: Sequence[float]) -> float:
-    # An infinite PSNR has no standard deviation.
-    return stdev(values) if all(map(math.isfinite, values)) else math.nan
 
 
 def _common(values: Iterable[int]) -> int | str | None:
@@ -120,7 +117,8 @@ def summarize(*folders: Path) -> tuple[list[Entry], tables.Table]:
     headings += [tables.score_heading(name, styles[tables.metric_of(name)]) for name in names]
     remarks = [CAPTION if rows else "No job of this sweep has finished.", *_progress_remarks(jobs)]
     remarks += [] if alike else ["Not all jobs were tested alike (data, resolution, scenes), and do not compare."]
-    remarks += [*_row_remarks(rows), *_program_remarks([job.record for job in jobs if job.record])]
+    remarks += [f"{row.label} has seen the views that it is scored on." for row in rows if row.upper_bound]
+    remarks += _program_remarks([job.record for job in jobs if job.record])
     return rows, tables.Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
 
 
@@ -132,14 +130,6 @@ def _progress_remarks(jobs: Sequence[Job]) -> list[str]:
         seed = [f"seed={job.overrides[SEED]}"] if SEED in job.overrides else []
         names.append(printable(job.name) or ", ".join([job.label, *seed]))  # a job has no folder before it starts
     return [*remarks, f"Not finished: {'; '.join(names)}."] if names else remarks
-
-
-def _row_remarks(rows: Sequence[Entry]) -> list[str]:
-    ours = [row for row in rows if row.seeds is not None]
-    mixed = [row for row in ours if isinstance(row.scenes, str)]
-    remarks = [f"{row.label} has seen the views that it is scored on." for row in rows if row.upper_bound]
-    remarks += [f"{row.label}: its jobs were tested on different scenes ({row.scenes})." for row in mixed]
-    return remarks
 
 
 def _program_remarks(records: Sequence[Record]) -> list[str]:

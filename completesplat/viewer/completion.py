@@ -48,7 +48,7 @@ class Completion:
         if self.photograph is None:
             return self.page.tell(CompleteSplatError("load an image first"), client)
         settings = {name: getattr(self.controls, name).value for name in SLIDERS}
-        self.page.worker.submit(SHOWN, partial(self._draw, *self.photograph, settings, client))
+        self.page.submit(SHOWN, client, partial(self._draw, *self.photograph, settings))
 
     def complete(self, image: Path, name: str, client: viser.ClientHandle | None) -> None:
         """Load an image file; raise a `CompleteSplatError` if it is none, or its background cannot be removed."""
@@ -65,9 +65,7 @@ class Completion:
         elif self.controls.live.value and self.photograph is not None:
             self.request(event.client)
 
-    def _draw(
-        self, name: str, photograph: Photograph, settings: dict[str, Any], client: viser.ClientHandle | None
-    ) -> None:
+    def _draw(self, name: str, photograph: Photograph, settings: dict[str, Any]) -> None:
         """Draw samples in the worker's thread, and show them while they form."""
         began = time.monotonic()
         progress, forming = self.controls.progress, self.controls.forming.value
@@ -99,9 +97,9 @@ class Completion:
         try:
             scenes = self.model(photograph, on_step=formed if forming else None, **settings)
             self.page.show(arranged(scenes, finished=True), f"{len(scenes)} drawn in {time.monotonic() - began:.1f} s")
-        except Exception as error:
+        except Exception:
             if self.page.view.samples is not before:
                 self.page.show(before)
-            self.page.tell(error, client)
+            raise
         finally:
             progress.visible = False

@@ -193,20 +193,14 @@ class Page:
         name = self.opening.chosen.value
         if name in self.scenes:
             self.opening.chosen.options = (*self.scenes,)
-            self.worker.submit(SHOWN, partial(self._open_for, event.client, self.scenes[name], name))
-
-    def _open_for(self, client: viser.ClientHandle | None, path: Path, name: str) -> None:
-        try:
-            self.open(path, name)
-        except Exception as error:
-            self.tell(error, client)
+            self.submit(SHOWN, event.client, partial(self.open, self.scenes[name], name))
 
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
         """Show an uploaded scene, or complete an uploaded image, when the scene that is being drawn is finished."""
         file = self.opening.upload.value
         name, content = printable(file.name), file.content
         file.content = b""  # which the button would keep until the next upload
-        self.worker.submit(SHOWN, partial(self._open_upload, event.client, name, content))
+        self.submit(SHOWN, event.client, partial(self._open_upload, event.client, name, content))
 
     def _open_upload(self, client: viser.ClientHandle | None, name: str, content: bytes) -> None:
         """Open an uploaded file, whose name is never used as a path."""
@@ -223,9 +217,7 @@ class Page:
                 else:
                     self.complete(path, name, client)
             except CompleteSplatError as error:
-                self.tell(CompleteSplatError(str(error).replace(str(path), name)), client)
-            except Exception as error:
-                self.tell(error, client)
+                raise CompleteSplatError(str(error).replace(str(path), name)) from error
 
     def _let_choose_another(self, name: str) -> None:
         """Name an uploaded scene in the choice, so that each of `scenes` can be chosen next."""
@@ -243,6 +235,17 @@ class Page:
         row = panel.thumbnail_row(self._thumbnails, self.view.chosen) if self._thumbnails else ""
         if self.looking.thumbnails.content != row:
             self.looking.thumbnails.content = row
+
+    def submit(self, kind: Hashable, client: viser.ClientHandle | None, job: Task) -> None:
+        """Let the worker do a job (`Worker.submit`) whose errors go to one browser (None: to all)."""
+
+        def answered() -> None:
+            try:
+                job()
+            except Exception as error:
+                self.tell(error, client)
+
+        self.worker.submit(kind, answered)
 
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
         """Show an error in one browser or in all, and keep it; log it as well if it is a fault of the program."""
@@ -288,16 +291,13 @@ class Page:
 
         def save() -> None:
             show_status(self.server, f"saving {kind}")
-            try:
-                files = self.saver.save(kind, shown)
-            except Exception as error:
-                return self.tell(error, client)
+            files = self.saver.save(kind, shown)
             show_status(self.server, "")
             for file in files:
                 client.send_file_download(file.name, file.read_bytes())
             client.add_notification("Saved", f"{', '.join(file.name for file in files)} in {self.saver.folder}")
 
-        self.worker.submit(object(), save)  # each click counts
+        self.submit(object(), client, save)  # each click counts
 
 
 def write_viewer_page(server: viser.ViserServer, path: Path) -> Path:

@@ -308,7 +308,7 @@ def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
 
 
 def test_a_hidden_part_of_the_central_square_does_not_go_with_an_object_that_is_larger_than_it(predict, tmp_path):
-    for top, status, message in ((40, 0, ""), (0, 2, "box= hide parts of a photo's central square, but its object")):
+    for top, status, message in ((40, 0, ""), (0, 2, "box= are of a photo's central square, but its object is")):
         cut_out = Image.new("RGBA", (32, 96))
         cut_out.paste("blue", (10, top, 22, 56))
         cut_out.save(tmp_path / "a.png")
