@@ -14,7 +14,8 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from completesplat.errors import CompleteSplatError
+from completesplat.data.validation import read_json
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
 from completesplat.export.formats import FORMATS, write_format
 from completesplat.export.formats import suffix as format_suffix
@@ -356,8 +357,8 @@ def is_described(folder: Path) -> bool:
     """Return whether a folder has a description of ours, perhaps a damaged one, and not another program's."""
     file = folder / SCENE_FILE
     try:
-        content = json.loads(file.read_bytes()) if file.is_file() else None
-    except (ValueError, RecursionError):
+        content = read_json(file) if file.is_file() else None
+    except DataError:
         return True
     return isinstance(content, dict) and "reference_camera" in content
 

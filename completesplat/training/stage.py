@@ -118,8 +118,7 @@ class Stage(Scorer):
 
     def refuse_average(self) -> None:
         """Raise CompleteSplatError if weights are averaged, for a model whose number of weights changes in a run."""
-        callbacks = self.trainer.callbacks  # type: ignore[attr-defined]
-        if any(isinstance(callback, WeightAveraging) for callback in callbacks):
+        if any(isinstance(callback, WeightAveraging) for callback in self.trainer.callbacks):  # type: ignore[attr-defined]
             raise CompleteSplatError("callbacks=ema: the number of this model's weights changes; they have no average")
 
     def log_step(self, values: dict[str, Tensor], batch_size: int) -> None:
