@@ -146,7 +146,8 @@ def refused_licences(names: Iterable[str]) -> dict[str, set[str]]:
 
 
 def test_everything_that_the_wheel_brings_has_a_licence_that_goes_with_its_own() -> None:
-    lines = [line for name, extra in EXTRAS.items() if name != "dev" for line in extra]
+    """Not the tools of those who develop it, which are only run: tests, notebooks and the site's pages."""
+    lines = [line for name, extra in EXTRAS.items() if name not in ("dev", "site") for line in extra]
     needed = tree([*PROJECT["dependencies"], *lines])
     assert len(needed) > 50
     assert {"torch", "numpy", "urllib3"} <= needed  # the last one by others only
