@@ -29,7 +29,6 @@ from completesplat.ply_files import LONGEST_HEADER, PACKED
 
 HEADER = struct.Struct("<4sIIBBBBI")  # magic, version, count, degree, fractional bits, flags, streams, their table
 WIDTHS = {2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}  # bytes of a Gaussian in each part but harmonics
-DEGREES = 4  # of harmonics in a file
 EXTENDED, COORDINATES, RIGHT_UP_BACK = 2, 0xADBE0003, 4  # flag, type of an extension, its default
 OUR_AXES = np.array([1, -1, 1])  # right, down, forward
 LARGEST_RATIO = 40  # of what a file unpacks to; splat-transform's have 2
@@ -90,7 +89,7 @@ def _read_spz(content: bytes) -> list[np.ndarray]:
     data = content if content.startswith(b"NGSP") else GzipFile(fileobj=BytesIO(content)).read(most)
     magic, version, count, degree, bits, flags, streams, table = HEADER.unpack_from(data)
     ends = count * np.cumsum([*WIDTHS.get(version, ()), 3 * coefficients(degree)])
-    if magic != b"NGSP" or version not in WIDTHS or degree > DEGREES or ends[-1] > most:
+    if magic != b"NGSP" or version not in WIDTHS or degree > 4 or ends[-1] > most:
         raise ValueError(f"version {version}, {count} Gaussians, harmonics of degree {degree}")
     signs = _signs(data[32:table] if version == 4 and flags & EXTENDED else b"")
     sizes = np.diff(ends, prepend=0)

@@ -190,6 +190,7 @@ def deep_grey(image: Image.Image, tiff_tags: Mapping[int, object]) -> np.ndarray
 def label_font(size: int) -> ImageFont.FreeTypeFont:
     """Return the font of labels, of a size in pixels. It is DejaVu Sans, because Pillow's own font lacks accents."""
     import matplotlib  # which takes a tenth of a second
+
     return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")), size)
 
 
