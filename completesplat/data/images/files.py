@@ -4,6 +4,7 @@ import io
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Literal
 
@@ -189,9 +190,8 @@ def deep_grey(image: Image.Image, tiff_tags: Mapping[int, object]) -> np.ndarray
 
 def label_font(size: int) -> ImageFont.FreeTypeFont:
     """Return the font of labels, of a size in pixels. It is DejaVu Sans, because Pillow's own font lacks accents."""
-    import matplotlib  # which takes a tenth of a second
-
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")), size)
+    font = distribution("matplotlib").locate_file("matplotlib/mpl-data/fonts/ttf/DejaVuSans.ttf")  # without its import
+    return ImageFont.truetype(str(font), size)
 
 
 def image_bytes(image: Image.Image, kind: str, **options: int | bytes) -> bytes:
