@@ -253,9 +253,7 @@ def _predict(
     if config.background == REMOVE:
         begin("removing the background", advance=0)
     photograph = model.read(image, config.fov, config.background == REMOVE)
-    visible = visible_part(config, image, model.image_size)
-    if visible is not None and photograph.crop != "center":
-        raise CompleteSplatError("mask= and box= are of a photo's central square, but its object is shown in another")
+    visible = visible_part(config, image, photograph)
     for warning in photo_warnings(photograph, model, whole=visible is None):
         logger.warning("%s: %s", printable(image.name), warning)
     settings = {name: config[name] for name in ("samples", "seed", "color_fits")}
@@ -329,10 +327,13 @@ def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str
     )
 
 
-def visible_part(config: DictConfig, image: Path, size: int) -> Float[Tensor, "1 size size"] | None:
+def visible_part(config: DictConfig, image: Path, photograph: Photograph) -> Float[Tensor, "1 size size"] | None:
     """Return 0 where `mask` or `box` hides the photo, else 1; None without both. Raise CompleteSplatError if unfit."""
     if config.mask is not None and config.box is not None:
         raise CompleteSplatError("give mask=FILE or box=[x0,y0,x1,y1], not both")
-    if config.mask is not None:
-        return outside_of_mask(image, Path(config.mask), size)
-    return None if config.box is None else outside_of_box(image, list(config.box), size)
+    if (part := config.box if config.mask is None else config.mask) is None:
+        return None
+    if photograph.crop != "center":
+        raise CompleteSplatError("mask= and box= are of a photo's central square, but its object is shown in another")
+    size = photograph.image.shape[-1]
+    return outside_of_box(image, list(part), size) if config.mask is None else outside_of_mask(image, Path(part), size)

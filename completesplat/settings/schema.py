@@ -298,8 +298,7 @@ def _in_union(members: Sequence[object], value: object) -> list[Violation]:
     attempts = [violations(member, value) for member in members]
     if [] in attempts:
         return []
-    others = [described(member) for member in members if typing.get_origin(member) is Literal]
-    others += ["null"] if NoneType in members else []
+    others = [described(x) or "null" for x in members if x is NoneType or typing.get_origin(x) is Literal]
     return [unfit._replace(reason=", or ".join([unfit.reason, *others])) for unfit in attempts[0]]
 
 

@@ -10,6 +10,7 @@ from plyfile import PlyData
 from support import python, strict_json
 
 from completesplat.commands.predict import visible_part
+from completesplat.data.images.photograph import read_photograph
 from completesplat.errors import CompleteSplatError
 
 FEW = ["samples=2", "frames=4", "steps=2", "color_fits=1"]
@@ -117,6 +118,7 @@ def test_pixels_in_a_box_or_a_mask_have_no_influence(predict, tmp_path):
 
 def test_what_hides_nothing_is_refused(tmp_path):
     Image.new("RGB", (32, 32)).save(tmp_path / "a.png")
+    photograph = read_photograph(tmp_path / "a.png", 32)
     for hidden, message in (
         ({"box": [0, 0, 1]}, "box=[0, 0, 1]: give [x0,y0,x1,y1]"),
         ({"box": [0.5, 0, 0.5, 1]}, "needs 0 <= x0 < x1 <= 1"),
@@ -124,4 +126,4 @@ def test_what_hides_nothing_is_refused(tmp_path):
         ({"mask": "nowhere.png", "box": [0.5, 0, 1, 1]}, "not both"),
     ):
         with pytest.raises(CompleteSplatError, match=re.escape(message)):
-            visible_part(OmegaConf.create({"box": None, "mask": None} | hidden), tmp_path / "a.png", 32)
+            visible_part(OmegaConf.create({"box": None, "mask": None} | hidden), tmp_path / "a.png", photograph)
