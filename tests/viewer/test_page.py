@@ -315,13 +315,19 @@ def test_a_refusal_goes_to_its_browser_and_changes_nothing(completion, monkeypat
     assert other.messages == []
 
 
-def test_the_page_answers_while_the_model_works(completion, model, monkeypatch):
-    entered, release = threading.Event(), threading.Event()
-    forward = model.denoiser.forward
+def drawing(completion: Completion, monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Load a photo, and draw it again until the event is set."""
+    entered, release, denoiser = threading.Event(), threading.Event(), completion.model.denoiser
+    forward = denoiser.forward
     load(completion.page)
-    monkeypatch.setattr(model.denoiser, "forward", lambda *a: (entered.set(), release.wait(LIMIT), forward(*a))[-1])
+    monkeypatch.setattr(denoiser, "forward", lambda *a: (entered.set(), release.wait(LIMIT), forward(*a))[-1])
     press(completion.page, completion.controls.draw, wait=False)
     assert entered.wait(LIMIT)
+    return release
+
+
+def test_the_page_answers_while_the_model_works(completion, monkeypatch):
+    release = drawing(completion, monkeypatch)
     completion.page.looking.layers[0].value = False
     assert not nodes(completion.page)["/sample_0/layer_0"].visible
     assert completion.controls.progress.visible
@@ -351,22 +357,16 @@ def test_a_drawing_that_fails_half_way_leaves_the_samples_before(completion, mod
     assert [id(sample) for sample in after] == [id(sample) for sample in before]
 
 
-def test_samples_stand_upright_after_a_scene_with_another_direction_up(completion, tmp_path):
+def test_samples_stand_upright_after_a_scene_with_another_direction_up(completion):
     load(completion.page)
     own = completion.page.view.up.tolist()
-    write_ply(tmp_path / "a.ply", balls_sample().gaussians)
     completion.page.view.set_up((1.0, 0.0, 0.0))
     press(completion.page, completion.controls.draw)
     assert completion.page.view.up.tolist() == own == completion.model.up.tolist()
 
 
-def test_an_upload_is_opened_after_the_drawing_that_it_waits_for(completion, model, monkeypatch, tmp_path):
-    entered, release = threading.Event(), threading.Event()
-    forward = model.denoiser.forward
-    load(completion.page)
-    monkeypatch.setattr(model.denoiser, "forward", lambda *a: (entered.set(), release.wait(LIMIT), forward(*a))[-1])
-    press(completion.page, completion.controls.draw, wait=False)
-    assert entered.wait(LIMIT)
+def test_an_upload_is_opened_after_the_drawing_that_it_waits_for(completion, monkeypatch, tmp_path):
+    release = drawing(completion, monkeypatch)
     write_ply(tmp_path / "a.ply", balls_sample().gaussians)
     upload = completion.page.opening.upload
     upload._impl.value = SimpleNamespace(name="a.ply", content=(tmp_path / "a.ply").read_bytes())
