@@ -28,7 +28,10 @@ class DataError(CompleteSplatError):
         self, reason: str, file: str | None = None, sequence: str | None = None, frame: int | None = None
     ) -> None:
         super().__init__(reason, file, sequence, frame)
-        self.reason, self.file, self.sequence, self.frame = reason, file, sequence, frame
+        self.reason = reason
+        self.file = file
+        self.sequence = sequence
+        self.frame = frame
 
     def __str__(self) -> str:
         frame = None if self.frame is None else f"frame {self.frame}"

@@ -19,7 +19,8 @@ UNUSABLE = {errno.EIO, errno.EROFS, errno.EACCES, errno.ESTALE, errno.ENODEV}
 BAD_NAME = {errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM}
 PROBE_BYTES = 2**16
 LONGEST = 100  # bytes of UTF-8
-MOST_SHOWN, SHORT = 500, 120  # characters of a message, and of a value in it
+MOST_SHOWN = 500
+SHORT = 120  # characters of a message, and of a value in it
 SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")  # files of Gaussians that are read
 # Control characters, line breaks, changes of direction, and the surrogates that stand for bytes that are not UTF-8.
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -204,9 +205,11 @@ def folder_names(stems: Iterable[str]) -> list[str]:
     names: list[str] = []
     taken: set[str] = set()
     for stem in stems:
-        name, number = safe_name(stem), 2
+        name = safe_name(stem)
+        number = 2
         while (key := unicodedata.normalize("NFC", name).casefold()) in taken:
-            name, number = safe_name(stem, f"_{number}"), number + 1
+            name = safe_name(stem, f"_{number}")
+            number = number + 1
         taken.add(key)
         names.append(name)
     return names

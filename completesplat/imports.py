@@ -22,7 +22,8 @@ def importing() -> Iterator[None]:
 
     The objects that exist after the first import of torch are frozen: the collector does not examine them again.
     """
-    before, enabled = "torch" in sys.modules, gc.isenabled()
+    before = "torch" in sys.modules
+    enabled = gc.isenabled()
     gc.disable()
     try:
         yield
@@ -42,7 +43,8 @@ def postponing() -> Iterator[None]:
     The first use of a stand-in imports the real module. Afterwards `sys.modules` holds the real modules or none.
     Only for commands that compile no network: nothing is marked for torch.compile (`allow_in_graph`, `disable`).
     """
-    finder, stand_ins = _Submodules(), {name: _StandIn(name) for name in POSTPONED}
+    finder = _Submodules()
+    stand_ins = {name: _StandIn(name) for name in POSTPONED}
     vars(stand_ins["torch._dynamo"]).update(allow_in_graph=_unmarked, disable=_unmarked)
     sys.modules.update({name: stand_in for name, stand_in in stand_ins.items() if name not in sys.modules})
     sys.meta_path.append(finder)

@@ -14,7 +14,8 @@ import numpy as np
 from completesplat.errors import PlyError
 
 PACKED = "packed_position"  # a property of the vertices in compressed files
-LONGEST_HEADER, LONGEST_COUNT = 1 << 16, 15  # bytes, digits
+LONGEST_HEADER = 1 << 16
+LONGEST_COUNT = 15  # bytes, digits
 HEADER = re.compile(rb"ply\s*\n(.*?)(?<=\n)end_header[ \t\r]*\n", re.DOTALL)
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 TYPES = {
@@ -123,7 +124,8 @@ def _with_property(element: Element, name: str, kind: str) -> Element:
 def _from_bytes(file: BinaryIO, elements: Sequence[Element], index: int, order: str) -> np.ndarray:
     sizes = [element.records * element.dtype(order).itemsize for element in elements]
     start = file.tell()
-    actual, least = file.seek(0, os.SEEK_END), start + sum(sizes)
+    actual = file.seek(0, os.SEEK_END)
+    least = start + sum(sizes)
     if actual < least or (actual > least and not any(element.lists for element in elements)):
         raise PlyError(f"the header declares {least} bytes, the file has {actual}")
     file.seek(start + sum(sizes[:index]))
@@ -131,7 +133,8 @@ def _from_bytes(file: BinaryIO, elements: Sequence[Element], index: int, order: 
 
 
 def _from_text(file: BinaryIO, elements: Sequence[Element], index: int) -> np.ndarray:
-    dtype, count = elements[index].dtype("="), elements[index].records
+    dtype = elements[index].dtype("=")
+    count = elements[index].records
     try:
         lines = [line for line in file.read().decode("ascii").split("\n") if line.strip()]
         declared = sum(element.records for element in elements)

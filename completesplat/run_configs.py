@@ -85,7 +85,8 @@ def read_weights(file: Path, trust: bool) -> tuple[dict[str, Any], dict[str, Ten
     folder = path.resolve().parent
     architecture = check_names(architecture, path, folder.parent if folder.name == RUN_WEIGHTS else folder, trust)
     check_architecture(architecture, path)
-    architecture, tensors = stored_config(architecture), load_file(file)
+    architecture = stored_config(architecture)
+    tensors = load_file(file)
     check_sizes(architecture, tensors, (file.name, CONFIG_FILE))
     return architecture, tensors
 
@@ -97,13 +98,15 @@ def read_run(checkpoint: Path, trust: bool) -> tuple[dict[str, Any], dict[str, T
         WeightsError: the model makes no scene from a photo, its config is refused, or the checkpoint is not its own.
     """
     path, config = read_run_config(checkpoint)
-    model, target = config["model"], printable(config["model"].get("_target_"), SHORT)
+    model = config["model"]
+    target = printable(config["model"].get("_target_"), SHORT)
     stage = target.rpartition(".")[2]
     if stage not in STAGES:
         fitted = path.parent / SCENES
         advice = f"; those that it fitted are in {fitted}" if fitted.is_dir() else ""
         raise WeightsError(f"{path} names {target}: a run of {stage} makes no scene of a photograph{advice}")
-    prefix, part = f"{STAGES[stage]}.", model.get(STAGES[stage])
+    prefix = f"{STAGES[stage]}."
+    part = model.get(STAGES[stage])
     one_answer = stage == "ReconstructionModule"
     settings = dict(part) if isinstance(part, Mapping) else {}
     architecture = {key: x for key, x in settings.items() if key not in ("_target_", "_recursive_")}
@@ -111,7 +114,8 @@ def read_run(checkpoint: Path, trust: bool) -> tuple[dict[str, Any], dict[str, T
         architecture = {"network": part, "image_size": config["data"].get("image_size")}
     architecture = stored_config(check_names(architecture, path, path.resolve().parent, trust))
     check_architecture(architecture, path)
-    contents, name = read_checkpoint(checkpoint), "network." if one_answer else ""
+    contents = read_checkpoint(checkpoint)
+    name = "network." if one_answer else ""
     tensors = {name + k.removeprefix(prefix): x for k, x in contents["state_dict"].items() if k.startswith(prefix)}
     check_sizes(architecture, tensors, (checkpoint.name, RUN_CONFIG_FILE))
     return architecture, tensors | camera_tensors(contents.get(CAMERA, {})) if one_answer else tensors

@@ -109,7 +109,8 @@ class SceneModel(nn.Module):
         """Return scenes [batch * samples] fitted to what is visible of their images."""
         if not color_fits:
             return scenes
-        background, parts = 0.5 if self.background is None else self.background, []
+        background = 0.5 if self.background is None else self.background
+        parts = []
         for i in range(len(scenes.means)):  # one after the other, for the memory
             photo = slice(j := i * len(images) // len(scenes.means), j + 1)
             mask = None if visible is None else visible[photo]
@@ -149,7 +150,8 @@ class SceneModel(nn.Module):
             raise CompleteSplatError(message)
         check_settings(self.generate, settings)
         photograph = image if isinstance(image, Photograph) else self.read(image)
-        device, shape = self.up.device, (1, self.image_size, self.image_size)
+        device = self.up.device
+        shape = (1, self.image_size, self.image_size)
         if visible is not None and (visible.shape != shape or not ((visible >= 0) & (visible <= 1)).all()):
             raise CompleteSplatError(f"visible: needs values from 0 to 1 in shape {list(shape)}")
         scenes = self.eval().generate(
@@ -188,7 +190,8 @@ class SceneModel(nn.Module):
         """
         if not self.reconstruction_model.sees_views:
             raise WeightsError("these weights reconstruct from one image: they were trained with posterior=image")
-        batch, depth_range = views.to(self.up.device)[None], self.depth_range[None]
+        batch = views.to(self.up.device)[None]
+        depth_range = self.depth_range[None]
         reconstruction: Reconstruction = self.eval().reconstruction_model(batch.images[:, 0], batch, depth_range)
         return reconstruction.splatter_image.gaussians(batch.cameras[:, 0], depth_range)[0]
 
@@ -201,7 +204,8 @@ class SceneModel(nn.Module):
         Raises:
             CompleteSplatError: the axes are parallel, or meet behind the first camera.
         """
-        center, first = nearest_to_axes(cameras), cameras[0].world_to_camera
+        center = nearest_to_axes(cameras)
+        first = cameras[0].world_to_camera
         depth = 0.0 if center is None else transform_points(first, center.float()[None])[0, 2].item()
         if depth <= 0:
             raise CompleteSplatError("the cameras do not look at one place: where the scene lies cannot be told")
@@ -286,7 +290,8 @@ def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str
     configs = shipped_configs()
     largest = max((config["image_size"] for config in configs.values()), default=1)
     square = read_photograph(image, largest, remove_background=remove_background, whole_object=True).image
-    distances, logarithms = dict[str, float](), list[float]()
+    distances = dict[str, float]()
+    logarithms = list[float]()
     for name, config in configs.items():
         if not _shows(config["training"].get("background"), square):
             continue

@@ -48,7 +48,8 @@ def ended_by_signals() -> Iterator[None]:
         for number, handler in before.items():
             signal.signal(number, handler)
         if ours:
-            _received, _kept = None, False
+            _received = None
+            _kept = False
 
 
 def received() -> int | None:

@@ -135,7 +135,8 @@ class SplatterImage(TensorDataclass):
             cameras: the reference cameras [*batch]; only their intrinsics matter, and the result is in their frames.
             depth_range: near and far along the optical axis, in scene units.
         """
-        parts, settings = self.split(), self.parameterization
+        parts = self.split()
+        settings = self.parameterization
         near, far = (x[..., None, None, None] for x in depth_range.unbind(-1))
         depth = LAYER_DEPTHS[settings.layer_depths](parts["depth"].squeeze(-3), near, far)
         rays = rearrange(pixel_rays(cameras), "... height width xyz -> ... 1 xyz height width")
@@ -187,7 +188,8 @@ def initialize_head(head: nn.Conv2d, parameterization: Parameterization) -> None
         behind = layer > 0 and parameterization.layer_depths == "incremental"
         starts["depth"] = math.log(parameterization.layer_step) if behind else first
         for name, group in parameterization.groups.items():
-            rows, row = slice(row, row + group.channels), row + group.channels
+            rows = slice(row, row + group.channels)
+            row = row + group.channels
             bound = math.sqrt(3 * _upstream_variance(group) / inputs)
             nn.init.uniform_(head.weight[rows], -bound, bound)
             nn.init.constant_(head.bias[rows], starts.get(name, group.bias))
@@ -195,7 +197,8 @@ def initialize_head(head: nn.Conv2d, parameterization: Parameterization) -> None
 
 def _upstream_variance(group: Group) -> float:
     """Return the variance of upstream's raw values for inputs of mean square 1: inputs times weight variance, twice."""
-    inputs, outputs = 128 * 9, CHANNELS * 9
+    inputs = 128 * 9
+    outputs = CHANNELS * 9
     first = inputs * 0.2**2 * 2 / (inputs + outputs)
     second = CHANNELS * group.gain**2 * 2 / (CHANNELS + group.channels)
     return first * second

@@ -80,7 +80,8 @@ class Encoder(nn.Module):
 
     def encode(self, values: Float[Tensor, "batch channel height width"]) -> tuple[Posterior, Features]:
         """Encode values around zero without rescaling them; `forward` describes the result."""
-        network, run = self.network, recompute if self.gradient_checkpointing else nn.Module.__call__
+        network = self.network
+        run = recompute if self.gradient_checkpointing else nn.Module.__call__
         features = self.features(values, len(network.down_blocks))
         hidden = run(network.mid_block, features[-1])
         hidden = network.conv_act(network.conv_norm_out(hidden))

@@ -51,7 +51,8 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
     """
     part = "conditioning" if reconstructor is None else "autoreconstructor"
     file = _vae_file(source, part)
-    place, config_file = file.parent if file.name in WEIGHTS_FILES else file, file.with_name(CONFIG_FILE)
+    place = file.parent if file.name in WEIGHTS_FILES else file
+    config_file = file.with_name(CONFIG_FILE)
     try:
         config = dict(json.loads(config_file.read_text())) if config_file.is_file() else {}
         weights = _read_weights(file)
@@ -81,7 +82,8 @@ def _without_head(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def _other_kind(config: Mapping[str, object], encoder: Encoder) -> str | None:
     """Return how a VAE differs from ours in what no tensor's shape shows, if it does."""
-    groups, activation = config.get("norm_num_groups", 32), config.get("act_fn", "silu")
+    groups = config.get("norm_num_groups", 32)
+    activation = config.get("act_fn", "silu")
     assert isinstance(encoder.network.conv_norm_out, nn.GroupNorm)
     if groups != encoder.network.conv_norm_out.num_groups:
         return f"its group normalisation has {groups} groups, not {encoder.network.conv_norm_out.num_groups}"
@@ -100,7 +102,8 @@ def _needed_settings(config: Mapping[str, object], part: str) -> str:
 
 def _vae_file(source: str, part: str) -> Path:
     """Return the file of the VAE's tensors; download it from the hub if `source` is not a file or folder."""
-    local, is_id = Path(source).expanduser(), MODEL_ID.fullmatch(source) is not None
+    local = Path(source).expanduser()
+    is_id = MODEL_ID.fullmatch(source) is not None
     hub_id = source if is_id and not local.exists() else "CompVis/stable-diffusion-v1-4"
     advice = (
         f"run `hf download {hub_id} --local-dir DIR` with network access (add `--include 'vae/*'` for the VAE of a "

@@ -66,8 +66,10 @@ def sweep(views: Views, depth_range: DepthRange, planes: int) -> Float[Tensor, "
         For views that look along the ray, and for views that look against it: the mean colour (-1 to 1; 0 where no view
         sees the point), and the mean cosine between the reference's ray and theirs.
     """
-    reference, others = views[:, 0], views[:, 1:]
-    near, far = depth_range[:, :1], depth_range[:, 1:]
+    reference = views[:, 0]
+    others = views[:, 1:]
+    near = depth_range[:, :1]
+    far = depth_range[:, 1:]
     share = torch.linspace(0, 1, planes, device=near.device)
     depth = 1 / (1 / near + share * (1 / far - 1 / near))
     batch, count, _, height, width = others.images.shape

@@ -22,13 +22,16 @@ from completesplat.scene import Views
 from completesplat.settings.schema import Positive, Range
 from completesplat.tensors import as_float64
 
-POSITION_RATE, POSITION_DECAY = 1.6e-4, 0.01
+POSITION_RATE = 1.6e-4
+POSITION_DECAY = 0.01
 RATES = {"log_scales": 5e-3, "quaternions": 1e-3, "logits": 5e-2, "harmonics": 2.5e-3}
 """3DGS's rates for 30,000 steps (graphdeco-inria/gaussian-splatting, `arguments/__init__.py`): the rate of the
 positions is relative to the scene's extent and decays exponentially to a hundredth."""
 
-DEAD_OPACITY, MOST_COPIES = 0.005, 51  # as in the authors' code and gsplat
-NOISE, NOISE_STEEPNESS = 5e5, 100.0
+DEAD_OPACITY = 0.005
+MOST_COPIES = 51  # as in the authors' code and gsplat
+NOISE = 5e5
+NOISE_STEEPNESS = 100.0
 NEIGHBOURS = 3
 Translucent = Annotated[float, Range(0.01, 0.99)]  # 0 and 1 have no finite logits
 Count = Annotated[int, Range(NEIGHBOURS + 1, 10**7)]  # of Gaussians; 3DGS's largest scenes have six million
@@ -148,7 +151,8 @@ def fit_gaussians(
         for step in range(settings.steps):
             chosen = torch.randperm(views.images.shape[1], generator=generator)[: settings.views]
             # Indexing copies the views, so autograd can use them even if they were made in inference mode.
-            truth, gaussians = views[:, chosen.to(views.images.device)], raw.gaussians()
+            truth = views[:, chosen.to(views.images.device)]
+            gaussians = raw.gaussians()
             images = rasterizer(gaussians, truth.cameras).over(background)
             total, _ = loss(Prediction(images, gaussians, None), truth, step)
             optimizer.zero_grad()
@@ -182,7 +186,8 @@ def scale_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"])
 
     Their double sum is written as one sum, by C(0, k) + ... + C(n - 1, k) = C(n, k + 1).
     """
-    alpha, n = as_float64(opacities), as_float64(copies)[:, None]
+    alpha = as_float64(opacities)
+    n = as_float64(copies)[:, None]
     o = opacity_of_copies(alpha, copies.to(alpha.device))[:, None]
     j = torch.arange(1, int(copies.max()) + 1, dtype=torch.float64, device=o.device)
     logarithm = torch.lgamma(n + 1) - torch.lgamma(j + 1) - torch.lgamma((n - j).clamp(min=0) + 1)
@@ -209,7 +214,8 @@ def relocate(raw: Mapping[str, Tensor], count: int, new_count: int) -> Int64[Ten
     sources = torch.multinomial(opacities.where(~dead, 0), len(vacant), replacement=True)
     copies = sources.bincount(minlength=count) + 1
     parents = (copies > 1).nonzero()[:, 0]
-    number, opacity = copies[parents].clamp(max=MOST_COPIES), opacities[parents].clamp(max=1 - 1e-6)
+    number = copies[parents].clamp(max=MOST_COPIES)
+    opacity = opacities[parents].clamp(max=1 - 1e-6)
     raw["log_scales"][parents] += scale_of_copies(opacity, number).log()[:, None]
     logits[parents] = opacity_of_copies(opacity, number).clamp(min=DEAD_OPACITY).logit()
     for tensor in raw.values():

@@ -56,7 +56,8 @@ def project_to_splatter_image(
         flat[place] = values.flatten(0, 1)[source]
         return flat.view(*grid, -1).movedim(-1, 2)
 
-    smallest, largest = math.log(parameterization.smallest_scale), math.log(parameterization.largest_scale)
+    smallest = math.log(parameterization.smallest_scale)
+    largest = math.log(parameterization.largest_scale)
     means = placed(gaussians.means, 0.0)
     filled = placed(torch.ones_like(gaussians.opacities)[..., None], 0.0).bool()
     near, far = (x[:, None, None, None] for x in depth_range.unbind(-1))
@@ -94,7 +95,9 @@ def _places(gaussians: Gaussians, cameras: Cameras, layers: int) -> tuple[Int64[
     scene = source // gaussians.count
     pixel = row.flatten()[source].long() * width + column.flatten()[source].long()
     key, order = (scene * height * width + pixel).sort(stable=True)
-    source, scene, pixel = source[order], scene[order], pixel[order]
+    source = source[order]
+    scene = scene[order]
+    pixel = pixel[order]
     # Number of earlier Gaussians in the same pixel.
     layer = torch.arange(len(key), device=key.device) - torch.searchsorted(key, key)
     selected = layer < layers
@@ -133,7 +136,8 @@ class SparseVAE(nn.Module):
         super().__init__()
         if len(reconstructor.skips) > 0:
             raise CompleteSplatError("a VAE of Splatter Images has no skips: set its reconstructor's skip_levels=[]")
-        layers, channels = reconstructor.parameterization.layers, reconstructor.parameterization.layer_channels
+        layers = reconstructor.parameterization.layers
+        channels = reconstructor.parameterization.layer_channels
         self.encoder = encoder(in_channels=layers * (channels + 1))
         self.reconstructor = reconstructor
         reconstructor.network.conv_out.reset_parameters()
@@ -180,5 +184,6 @@ class SparseVAE(nn.Module):
         places = mask.sum().clamp(min=1)
         groups = SplatterImage(squared, truth.parameterization).split()
         errors = {name: group.sum() / (places * group.shape[2]) for name, group in groups.items()}
-        logits, opacities = predicted.split()["opacity"], truth.split()["opacity"].sigmoid()
+        logits = predicted.split()["opacity"]
+        opacities = truth.split()["opacity"].sigmoid()
         return errors | {"opacity": nn.functional.binary_cross_entropy_with_logits(logits, opacities)}

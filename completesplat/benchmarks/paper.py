@@ -198,7 +198,8 @@ def works_of(module: Stage, scenes: SceneBatch, precision: str, samples: int) ->
 
     if isinstance(module, LatentDiffusion):
         return {"sample": draw, "samples": partial(draw, samples), "stage2_step": step}
-    gaussians, camera = draw().map(Tensor.float), scenes.reference.cameras[0]
+    gaussians = draw().map(Tensor.float)
+    camera = scenes.reference.cameras[0]
     pivot = gaussians.means[0].mean(0)
     cameras = orbit(camera, pivot, pivot.new_tensor([0.0, -1.0, 0.0]), VIEWS).map(lambda tensor: tensor[None])
 

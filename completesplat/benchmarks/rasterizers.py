@@ -75,7 +75,8 @@ def working_backends(names: Sequence[str], constants: RenderingConstants) -> tup
     Raises:
         CompleteSplatError: a name is not in `BACKENDS`.
     """
-    backends, absent = [], {}
+    backends = []
+    absent = {}
     for name in names:
         if name not in BACKENDS:
             raise CompleteSplatError(f"backends: {name!r} does not exist; choose from {', '.join(BACKENDS)}")

@@ -42,7 +42,8 @@ def launch(verb: str, arguments: list[str]) -> None:
     # Lightning starts a further process of the job for each device.
     if arguments and arguments[0].startswith(jobs.PROCESS_OF_JOB):
         return _join_job(verb, arguments[0])
-    program, original = sys.argv[0], arguments
+    program = sys.argv[0]
+    original = arguments
     arguments = behind_dashes(arguments)
     if any(flag in arguments for flag in help.FLAGS) or (verb == "bench" and not arguments):
         return print(help.help_page(verb, arguments))

@@ -79,7 +79,8 @@ def prepare(
     if Path(data.root).resolve().is_relative_to(out.resolve()):
         raise CompleteSplatError(f"out={out}: the data to be prepared lie there; choose another out=DIR")
     policy = on_bad, max_bad_fraction
-    sources, settings = _sources(data, splits, policy), data.packed_settings()
+    sources = _sources(data, splits, policy)
+    settings = data.packed_settings()
     writing.prepare(sources, settings, out, codec, sequences_per_shard, workers, policy)
 
 
@@ -126,7 +127,8 @@ def _sources(data: Any, splits: Sequence[str], policy: tuple[str, float] = ("ski
     """Return the sources of the splits that exist; by default each collects the errors in its files."""
     data.policy = policy
     data.prepare_data()
-    sources, missing = {}, []
+    sources = {}
+    missing = []
     for split in splits:
         try:
             sources[split] = data.source(split)

@@ -167,7 +167,8 @@ def run(config: DictConfig, out: Path) -> None:
     checks = {"packages": check_packages, "extras": check_extras, "imports": check_imports, "device": check_device}
     checks |= {"weights": check_weights, "tools": lambda: check_tools(Path.cwd())}
     table = Table("part", "what", "here", "which, or why not", title="completesplat doctor", title_justify="left")
-    rows, broken = [], []
+    rows = []
+    broken = []
     for part, check in checks.items():
         for finding in findings_of(check):
             rows.append({"part": part, **finding._asdict()})

@@ -57,7 +57,8 @@ def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
     if evaluation["data_set"] not in (None, data_set.partition("/")[0]):
         message = f"is of {evaluation['data_set']}, this run's data are {data_set}: use evaluation=images"
         raise CompleteSplatError(f"{chosen} {message}")
-    resolution, size = evaluation["resolution"], data.image_size
+    resolution = evaluation["resolution"]
+    size = data.image_size
     if resolution is None or resolution == size:
         return data
     if resolution < size:
@@ -169,7 +170,8 @@ def run_hidden_modes(
     if tested.scenes is not None:
         tested.files.find([scene.scene.names[0] for scene in scenes], samples)
     progress = partial(track, description="Hidden modes", console=Console(stderr=True))
-    methods, on_device = predictors(module, samples, evaluation["batch"]), [scene.to(device) for scene in scenes]
+    methods = predictors(module, samples, evaluation["batch"])
+    on_device = [scene.to(device) for scene in scenes]
     sheet_sizes = evaluation["shown_scenes"], evaluation["shown_samples"]
     measured = measure(methods, on_device, samples, evaluation["seed"], *sheet_sizes, progress)
     results = measured.results(samples)

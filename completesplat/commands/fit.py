@@ -52,7 +52,8 @@ def instantiate(config: DictConfig) -> tuple[SceneDataModule, Scorer]:
     checks.check_parts(config)
     checks.check_image_size(config)
     checks.check_optimizer(config.optimizer)
-    data, module = build(config.data, _convert_="all"), build(config.model, _convert_="all")
+    data = build(config.data, _convert_="all")
+    module = build(config.model, _convert_="all")
     if config.test:
         set_scoring(module, config.evaluation)
     if isinstance(module, Stage):
@@ -70,7 +71,8 @@ def run(config: DictConfig, out: Path) -> None:
     data, module = instantiate(config)
     # A test that cannot work is refused now, not after the training.
     tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
-    callbacks, loggers = built_parts(config.get("callbacks")), built_parts(config.get("logger"))
+    callbacks = built_parts(config.get("callbacks"))
+    loggers = built_parts(config.get("logger"))
     trainer = build(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if tested is not None:
@@ -134,7 +136,8 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
 
 def refuse_without_effect(config: DictConfig, out: Path) -> None:
     """Raise CompleteSplatError for a setting of a command, not of a sweep, that its model does not use."""
-    stage, given = get_class(config.model._target_), read_record(out).get("overrides", [])
+    stage = get_class(config.model._target_)
+    given = read_record(out).get("overrides", [])
     unused: tuple[str, ...] = getattr(stage, "without_effect", ())
     if any((parent / PLAN).is_file() for parent in out.parents):
         return

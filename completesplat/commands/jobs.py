@@ -33,7 +33,9 @@ from completesplat.signals import Interrupted, ended_by_signals
 from completesplat.version import __version__
 from completesplat.weights import RUN_CHECKPOINT
 
-CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
+CONFIG = "config.yaml"
+RECORD = "run.json"
+METRICS = "metrics.json"
 LAST = RUN_CHECKPOINT
 LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
@@ -170,7 +172,8 @@ def optimized(metric: str | None, out: Path) -> float | None:
 
 def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) -> str:
     """Return one line: the signal that ended a job, its checkpoint, and the command to continue the job or sweep."""
-    hydra_config, begun = HydraConfig.get(), (out / LAST).is_file()
+    hydra_config = HydraConfig.get()
+    begun = (out / LAST).is_file()
     sweep = hydra_config.mode == RunMode.MULTIRUN
     replaced = ("out=", "ckpt_path=") if begun and not sweep else ("out=",)
     again = ["completesplat", verb, *(argument for argument in given if not argument.lstrip("-").startswith(replaced))]
@@ -242,7 +245,8 @@ def _refuse_earlier_end(out: Path, ends: Mapping[str, Any], earlier: Mapping[str
     steps = json.loads((out / METRICS).read_text())["steps"]
     if 0 <= ends["trainer.max_steps"] <= steps:
         raise CompleteSplatError(f"trainer.max_steps={ends['trainer.max_steps']}: {out} has {steps} steps; give more")
-    epochs, before = ends["trainer.max_epochs"], earlier["trainer.max_epochs"]
+    epochs = ends["trainer.max_epochs"]
+    before = earlier["trainer.max_epochs"]
     unlimited = (None, -1)
     if epochs not in unlimited and (before in unlimited or epochs < before):
         raise CompleteSplatError(f"trainer.max_epochs={epochs} may end before the run in {out}: choose another out=DIR")
@@ -286,7 +290,8 @@ def _written(out: Path) -> set[tuple[int, int]]:
 
 def _record(out: Path, command: list[str], overrides: list[str], config: Mapping[str, object]) -> Path | None:
     """Write `run.json` with times, command and earlier ends; rename earlier results, and return their new name."""
-    path, now = out / RECORD, time.strftime("%Y-%m-%dT%H:%M:%S%z")
+    path = out / RECORD
+    now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
     record: dict[str, Any] = {"version": __version__, "commit": git_commit(), "command": command}
     record |= {"overrides": overrides, "started": now}
     renamed = None
@@ -314,13 +319,16 @@ def _for_other_processes(arguments: list[str]) -> Iterator[None]:
     Hydra is active; so both are replaced. At the end Lightning's variables and process group are removed: with them,
     the next job of a sweep would wait for this job's processes instead of starting its own.
     """
-    program_arguments, hydra_config = sys.argv, HydraConfig.instance().cfg
+    program_arguments = sys.argv
+    hydra_config = HydraConfig.instance().cfg
     variables = {name: os.environ.get(name) for name in VARIABLES_OF_PROCESSES}
-    sys.argv, HydraConfig.instance().cfg = arguments, None
+    sys.argv = arguments
+    HydraConfig.instance().cfg = None
     try:
         yield
     finally:
-        sys.argv, HydraConfig.instance().cfg = program_arguments, hydra_config
+        sys.argv = program_arguments
+        HydraConfig.instance().cfg = hydra_config
         torch = sys.modules.get("torch")
         if torch is not None and torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()

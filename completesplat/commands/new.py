@@ -21,7 +21,8 @@ FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)  # line of a template that name
 
 def run(config: DictConfig) -> None:
     """Write the part's files into the working folder; print their names and the commands that test and use them."""
-    kind, name = str(config.kind), str(config.name)
+    kind = str(config.kind)
+    name = str(config.name)
     files = new_files(kind, name)
     for path, text in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)

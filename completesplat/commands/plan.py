@@ -38,8 +38,11 @@ from completesplat.training.steps import MEBIBYTE, Training, peak_megabytes, syn
 logger = logging.getLogger(__name__)
 HERE = "this"
 MOST_TIMED = 1e9  # bytes that a timed step may take on a CPU
-UNTIMED_STEPS, TIMED_STEPS, TIMED_BATCHES = 2, 5, 5
-BYTES, DAY = 1e9, 24 * 3600
+UNTIMED_STEPS = 2
+TIMED_STEPS = 5
+TIMED_BATCHES = 5
+BYTES = 1e9
+DAY = 24 * 3600
 REMARKS = (
     "An operation takes the longest of its FLOPs, its reads and writes, and its start; the rasterizer a time for each "
     "Gaussian and view. Not counted: exchange of gradients between GPUs, images drawn during training, the test.",
@@ -118,12 +121,18 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
     if config.gpu != HERE and config.gpu not in config.gpus:
         names = [*config.gpus, HERE]
         raise CompleteSplatError(f"gpu={config.gpu}: there are {', '.join(names)}{did_you_mean(config.gpu, names)}")
-    data, accumulated = config.data, config.trainer.accumulate_grad_batches
+    data = config.data
+    accumulated = config.trainer.accumulate_grad_batches
     batch = batch_per_process(data.batch_size, config.devices, accumulated)
     there = sequences_there(data)
-    sequences, frames = there or data.get("scenes", config.sequences), data.get("frames", config.frames)
-    steps, counts, limit = steps_of(config, sequences), count_work(config, batch), memory_limit(config)
-    flops, measured, fits = counts.flops * config.devices, None, counts.peak <= limit
+    sequences = there or data.get("scenes", config.sequences)
+    frames = data.get("frames", config.frames)
+    steps = steps_of(config, sequences)
+    counts = count_work(config, batch)
+    limit = memory_limit(config)
+    flops = counts.flops * config.devices
+    measured = None
+    fits = counts.peak <= limit
     if config.gpu == HERE:
         seconds, measured = measure_steps(config, counts, batch)
         step = {"steps as timed here": seconds * accumulated}
@@ -131,12 +140,15 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
         speeds = speeds_of_gpu(config)
         drawing = counts.drawn * counts.accumulated * speeds.drawing
         step = {**seconds_of(counts.operations, speeds), "rasterizer": drawing}
-    seconds, loading = sum(step.values()), loading_seconds(config) if there else None
+    seconds = sum(step.values())
+    loading = loading_seconds(config) if there else None
     parts = {**step, **parts_beside_steps(config, counts, batch, seconds, loading)}
-    total, views = sum(filter(None, parts.values())), 1 if data.latent_cache is not None else 1 + data.targets
+    total = sum(filter(None, parts.values()))
+    views = 1 if data.latent_cache is not None else 1 + data.targets
     rate = data.batch_size * views / seconds
     processes = math.ceil(rate / config.loading_rate if loading is None else data.batch_size / seconds * loading)
-    hours, images = steps * total * config.devices / 3600, sequences * frames
+    hours = steps * total * config.devices / 3600
+    images = sequences * frames
     stored = None if counts.latent_bytes is None else counts.latent_bytes * images / BYTES
     paper = OmegaConf.select(config, f"paper.{config.evaluation.data_set}.seconds_a_step")
     remarks = [*([] if fits else advice(config, counts, batch, limit)), *REMARKS]
@@ -160,7 +172,8 @@ def plan_of(config: DictConfig) -> dict[str, Any]:
 
 def speeds_of_gpu(config: DictConfig) -> Speeds:
     """Return the speeds of a GPU of the table; it draws Gaussians in proportion to its FLOPs in float32."""
-    gpu, table = config.gpus[config.gpu], config.gpus
+    gpu = config.gpus[config.gpu]
+    table = config.gpus
     flops = gpu["float32" if precision(config).startswith("32") else "bfloat16"] * 1e12 * config.share
     drawing = config.gaussian_ns * 1e-9 * table.h200.float32 / gpu.float32
     return Speeds(flops, gpu.bandwidth * 1e12 * config.bandwidth_share, config.operation_us * 1e-6, drawing)
@@ -189,19 +202,24 @@ def parts_beside_steps(
         seconds: of a step.
         loading: seconds in which one process loads a scene; None: unknown.
     """
-    data, trainer, checkpoint = config.data, config.trainer, config.get("callbacks", {}).get("checkpoint") or {}
+    data = config.data
+    trainer = config.trainer
+    checkpoint = config.get("callbacks", {}).get("checkpoint") or {}
     workers = min(MOST_WORKERS, usable_cores()) if data.workers is None else data.workers
     load = None if loading is None else loading * data.batch_size / config.devices / max(workers, 1)
     waiting = load if load is None or workers == 0 else max(0.0, load - seconds)
 
     forward = seconds * sum(operation.flops for operation in counts.forward) * counts.accumulated / counts.flops
     passes = config.sampler.steps if "completesplat" in config.model else 1
-    every, batches, validation = trainer.val_check_interval, trainer.limit_val_batches, None
+    every = trainer.val_check_interval
+    batches = trainer.limit_val_batches
+    validation = None
     if isinstance(every, int) and isinstance(batches, int):  # else shares of an epoch, or without an end
         validation = passes * forward * batches * data.evaluation_batch_size / (batch * every)
 
     size = sum(counts.memory[kind] for kind in ("weights", "optimizer", "averages"))
-    by_steps, by_time = checkpoint.get("every_n_train_steps"), checkpoint.get("every_minutes")
+    by_steps = checkpoint.get("every_n_train_steps")
+    by_time = checkpoint.get("every_minutes")
     often = (1 / by_steps if by_steps else 0.0) + (seconds / (60 * by_time) if by_time else 0.0)
     writing = size / (config.checkpoint_rate * BYTES) * often
     return {"waiting for data": waiting, "validation": validation, "checkpoints": writing}
@@ -242,7 +260,8 @@ def precision(config: DictConfig) -> str:
 
 def steps_of(config: DictConfig, sequences: int) -> int:
     """Return the optimizer steps of the training; raise CompleteSplatError if it has no end."""
-    trainer, data = config.trainer, config.data
+    trainer = config.trainer
+    data = config.data
     epochs = trainer.get("max_epochs")
     limits = [] if trainer.max_steps < 0 else [trainer.max_steps]
     if epochs is not None and epochs >= 0:
@@ -275,7 +294,8 @@ def count_work(config: DictConfig, batch: int, **changes: Any) -> StepCounts:
     callbacks = config.get("callbacks", {}).values()
     targets = [get_class(callback._target_) for callback in callbacks if callback is not None]
     averaged = any(issubclass(target, WeightAveraging) for target in targets)
-    data, make = config.data, partial(build, copied.model, _convert_="all")
+    data = config.data
+    make = partial(build, copied.model, _convert_="all")
     sizes = (data.image_size, batch, data.targets, precision(config), config.trainer.accumulate_grad_batches)
     counts = count_step(make, *sizes, data.latent_cache is not None, gpu)
     weights = counts.memory["weights"] if averaged else 0
@@ -339,7 +359,8 @@ def measure_steps(config: DictConfig, counts: StepCounts, batch: int) -> tuple[f
     inputs: Batch = synthetic_batch(config.data.image_size, scenes, config.data.targets).to(device)
     if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch) and config.data.latent_cache is not None:
         inputs = with_latents(module, inputs)
-    training, seconds = Training(module, precision(config)), []
+    training = Training(module, precision(config))
+    seconds = []
 
     def step() -> None:
         start = synchronized_time()

@@ -67,10 +67,12 @@ def run(config: DictConfig, out: Path) -> None:
     share_of(images, config.shard, config.shards)  # refuses a shard that does not exist
     if config.cameras is not None:
         return predict_from_views(config, images, wanted, out)
-    start, threads = time.perf_counter(), max(1, torch.get_num_threads() // config.devices)
+    start = time.perf_counter()
+    threads = max(1, torch.get_num_threads() // config.devices)
     share = partial(predict_share, config, images, wanted, out, threads)
     results = list(map_in_processes(share, range(config.devices), config.devices))
-    count, failed = sum(count for count, _ in results), [name for _, names in results for name in names]
+    count = sum(count for count, _ in results)
+    failed = [name for _, names in results for name in names]
     seconds = time.perf_counter() - start
     if count > 1:
         print(f"{count} photos in {seconds:.0f} s, {60 * count / seconds:.1f} a minute (devices={config.devices})")
@@ -92,7 +94,8 @@ def predict_share(
         if torch.cuda.is_available():
             torch.cuda.set_device(process % torch.cuda.device_count())
     folders = (out / name for name in folder_names(image.stem for image in images))
-    pairs, count = [*zip(images, folders, strict=True)], config.shards * config.devices
+    pairs = [*zip(images, folders, strict=True)]
+    count = config.shards * config.devices
     photos = share_of(pairs, config.shard + config.shards * process, count)
     if not photos:
         return 0, []
@@ -124,7 +127,8 @@ def made_from(config: DictConfig, model: SceneModel, image: Path) -> str:
 
 def output_files(config: DictConfig) -> OutputFiles:
     """Return the outputs for each image; raise CompleteSplatError for none, or a missing program."""
-    formats, videos = _names(config.formats), _names(config.video)
+    formats = _names(config.formats)
+    videos = _names(config.video)
     if not formats and not videos:
         raise CompleteSplatError(f"formats=[] video=[]: choose a format ({', '.join(FORMATS)}) or a video")
     settings = {name: config[name] for name in ("frames", "maps", "screen_space_dilation")}
@@ -151,7 +155,8 @@ def predict_images(
         CompleteSplatError: the only image failed.
         DiskError: the disk is full; the remaining images are not predicted.
     """
-    console, failed = Console(), []
+    console = Console()
+    failed = []
     _warn_of_hidden_parts(config, model)
     rasterizer = instantiate(config.rasterizer, _convert_="all")
     wanted = replace(wanted, background=shown_background(config.background, model))
@@ -159,7 +164,8 @@ def predict_images(
         steps = 1 + config.samples * (len(wanted.formats) + len(wanted.videos))
         task = bar.add_task("", total=len(photos) * steps)
         for index, (image, folder) in enumerate(photos):
-            name, start = printable(image.name), time.perf_counter()
+            name = printable(image.name)
+            start = time.perf_counter()
             begin = partial(_begin, bar, task, name)
             predict = partial(_predict, config, model, rasterizer, wanted, image, folder, begin)
             if not _succeeds(predict, image, is_only=len(photos) == 1 == config.devices):
@@ -235,7 +241,8 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Outpu
         "depth_range": model.depth_range.tolist(),
     }
     wanted = replace(wanted, background=shown_background(config.background, model))
-    rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / safe_name(images[0].stem)
+    rasterizer = instantiate(config.rasterizer, _convert_="all")
+    folder = out / safe_name(images[0].stem)
     shot = Shot(scene, views.cameras[0], model.up.cpu())
     write_prediction(folder, views.images[0], [shot], rasterizer, wanted, recorded, partial(print, flush=True))
     print(f"one scene of {len(images)} images, at the posterior's mean: {folder.name}/")
@@ -282,7 +289,8 @@ def _predict(
     if config.background == REMOVE:
         recorded["background"] = REMOVE
     visible_image = photograph.image if visible is None else photograph.image * visible
-    camera, up = model.camera(photograph).to("cpu"), model.up.cpu()
+    camera = model.camera(photograph).to("cpu")
+    up = model.up.cpu()
     if model.background is not None:  # images of objects, whose centre is in the middle of the depth range
         wanted = replace(wanted, pivot_depth=model.middle_depth(model.depth_range_of(photograph)))
     shots = [Shot(scene.to("cpu"), camera, up) for scene in scenes]

@@ -44,7 +44,8 @@ def protocol(evaluation: Config, module: Any, data: Any, results: dict[str, Any]
     """Describe what was measured and how, in a test by a config of `conf/evaluation/` with results in `out`."""
     from completesplat.metrics.scoring import BEST_RULES
 
-    scored, model = module.evaluation, results["model"]
+    scored = module.evaluation
+    model = results["model"]
     described = {
         "name": evaluation["name"],
         "method": module.method,

@@ -146,7 +146,8 @@ def likeliest_weights(images: Sequence[Path], remove_background: bool) -> tuple[
     """
     if not shipped():
         raise WeightsError("weights=auto: this package has no weights; give weights=DIR")
-    sums, read = Counter[str](), list[str]()
+    sums = Counter[str]()
+    read = list[str]()
     for image in images[:: math.ceil(len(images) / LOOKED_AT) or 1]:
         with suppress(ImageError, OSError):  # which ends the prediction of this image alone, when its turn comes
             sums.update({name: x.probability for name, x in match_shipped(image, remove_background).items()})
@@ -171,7 +172,8 @@ def open_generator(config: Any, images: Sequence[Path], announced: bool = True) 
         WeightsError: as `from_pretrained`.
         CompleteSplatError: a sampler is given for a model that draws no samples.
     """
-    reason, say = "", print if announced else logger.debug
+    reason = ""
+    say = print if announced else logger.debug
     if config.weights == AUTO:
         config.weights, reason = likeliest_weights(images, config.background == REMOVE)
     model = CompleteSplat.from_pretrained(config.weights, config.trust)

@@ -39,7 +39,9 @@ def run(config: DictConfig, out: Path) -> None:
     _check_asked(config)
     own_files = (config.image, config.scene) != (None, None) or config.weights not in (AUTO, *shipped())
     server = start_server(0 if config.export is not None else config.port)
-    address, page, step = f"{server.address} (Ctrl-C ends it)", None, None
+    address = f"{server.address} (Ctrl-C ends it)"
+    page = None
+    step = None
     try:
         if config.export is None and not own_files:
             print(address, flush=True)
@@ -110,7 +112,9 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
         from completesplat.viewer.splat_view import SplatView
 
         check_parts(config)
-    model, scenes, status = None, {}, ""
+    model = None
+    scenes = {}
+    status = ""
     if config.watch is not None:
         status, samples, up = newest_scenes(Path(config.watch))
     elif config.scene is not None:
@@ -119,7 +123,8 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
         samples, up = read_scene(path)
     else:
         model = open_generator(config, [] if config.image is None else [Path(config.image)])
-        samples, up = [], tuple(model.up.tolist())
+        samples = []
+        up = tuple(model.up.tolist())
     remove = config.background == REMOVE
     background = shown_background(config.background, model)
     show_background(server, background)

@@ -75,7 +75,11 @@ class HiddenModeScenes:
         self, store: SceneStore, record: Callable[[str], Path], chances: Mapping[str, float], views: int, spread: int
     ) -> None:
         assert isinstance(store.source, CO3DSource)
-        self.store, self.record, self.chances, self.views, self.spread = store, record, chances, views, spread
+        self.store = store
+        self.record = record
+        self.chances = chances
+        self.views = views
+        self.spread = spread
         self.modes = [replace(store, source=store.source.with_images(partial(in_mode, mode=mode))) for mode in chances]
 
     def __len__(self) -> int:
@@ -101,11 +105,13 @@ class HiddenModeScenes:
             raise DataError("no view shows enough of what the reference image hides", sequence=name)
         targets = sorted({*selected, *evaluation_views(len(sequence.frames), self.spread)[1]})
         scene = with_true_depths(self.store.scene(sequence, 0, targets), sequence, 0, targets)
-        front, others = scene.reference, scene.targets
+        front = scene.reference
+        others = scene.targets
         assert front.depths is not None
         assert others.depths is not None
         unseen, _ = hidden_from(front.cameras, front.depths, others.cameras, others.depths)
-        views, region = list(map(targets.index, selected)), regions[selected]
+        views = list(map(targets.index, selected))
+        region = regions[selected]
         # Depth maps leave out edges; but the reference view does not show what differs between the modes.
         unseen[views] |= region
         true_mode, probabilities = self._modes_of(name)
@@ -122,7 +128,8 @@ class HiddenModeScenes:
 
     def _modes_of(self, name: str) -> tuple[int, Float[Tensor, " mode"]]:
         """Return the index of a scene's true mode, and the probabilities of all modes."""
-        record, modes = self.record(name), list(self.chances)
+        record = self.record(name)
+        modes = list(self.chances)
         with errors_at(record):
             content = read_json(record)
             hidden = field(content, "hidden", str)

@@ -63,7 +63,10 @@ class SequenceSource(ABC):
     """
 
     def __init__(self, names: list[str], listed: int, refused: list[DataError], left_out: dict[str, list[str]]) -> None:
-        self.names, self.listed, self.refused, self.left_out = names, listed, refused, left_out
+        self.names = names
+        self.listed = listed
+        self.refused = refused
+        self.left_out = left_out
 
     @abstractmethod
     def read(self, name: str) -> PosedSequence:

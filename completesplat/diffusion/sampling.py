@@ -24,7 +24,8 @@ logger = logging.getLogger(__name__)
 
 SMALL = 20_000_000
 """Parameters of a denoiser below which samples are drawn side by side (notebooks/experiments.md)."""
-PART, LARGEST_PART = 4, 10
+PART = 4
+LARGEST_PART = 10
 """Fewest and most samples that a thread draws at a time with a small denoiser; a thread decodes `PART` at a time."""
 
 _callers: list[int] = []  # for each call of `one_thread_each` that has not ended, torch's threads before the first
@@ -90,7 +91,8 @@ class Sampler:
         Raises:
             CompleteSplatError: the scheduler cannot make this number of steps.
         """
-        scheduler, most = copy.deepcopy(self.scheduler), self.training_timesteps
+        scheduler = copy.deepcopy(self.scheduler)
+        most = self.training_timesteps
         steps = self.steps if steps is None else steps
         if not 1 <= steps <= most:
             raise CompleteSplatError(f"steps={steps}: must lie between 1 and {most}")
@@ -189,7 +191,8 @@ def in_parts(draw: Callable[[slice], T], count: int, most: int | None = None, th
         torch.cuda.OutOfMemoryError: a single sample does not fit.
     """
     parts: list[T] = []
-    start, size = 0, min(count if most is None else most, count)
+    start = 0
+    size = min(count if most is None else most, count)
     if threads > 1 and size < count:
         with ThreadPoolExecutor(threads) as pool:
             slices = [slice(first, min(first + size, count)) for first in range(0, count, size)]
@@ -211,7 +214,8 @@ def in_parts(draw: Callable[[slice], T], count: int, most: int | None = None, th
 
 def _with_modes_of_this_thread(draw: Callable[[slice], T]) -> Callable[[slice], T]:
     """Return a function that another thread can call: torch keeps gradients, inference and autocast for each thread."""
-    grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+    grad = torch.is_grad_enabled()
+    inference = torch.is_inference_mode_enabled()
     cast = torch.get_autocast_dtype("cpu"), torch.is_autocast_enabled("cpu")
 
     def in_modes(part: slice) -> T:

@@ -113,7 +113,8 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> int:
     """Write one unbatched set of Gaussians in its order, as `write_ply` does; clamp colours to [0, 1]."""
     stored = cleaned(gaussians, path).detach()
     records = np.zeros(stored.count, RECORD)
-    records["means"], records["scales"] = stored.means.cpu(), stored.scales.cpu()
+    records["means"] = stored.means.cpu()
+    records["scales"] = stored.scales.cpu()
     records["colors"] = round_to_uint8(torch.cat([stored.colors, stored.opacities[:, None]], dim=-1) * 255)
     records["quaternions"] = round_to_uint8(normalize_quaternion(stored.quaternions) * 128 + 128)
     write_bytes(path, records.tobytes())
@@ -159,7 +160,8 @@ def write_mesh(path: Path, mesh: Mesh, comments: Sequence[str] = ()) -> None:
 
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     """Return arrays [gaussian, component] by attribute name of the glTF primitive."""
-    opacities, colors = gaussians.opacities.clamp(0, 1)[:, None], gaussians.colors.clamp(0, 1)
+    opacities = gaussians.opacities.clamp(0, 1)[:, None]
+    colors = gaussians.colors.clamp(0, 1)
     splats = {
         "ROTATION": normalize_quaternion(gaussians.quaternions).roll(-1, dims=-1),  # x, y, z, w
         "SCALE": gaussians.scales,

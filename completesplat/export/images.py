@@ -18,8 +18,11 @@ Maps = Float[Tensor, "*batch 1 height width"]
 Colors = Float[Tensor, "*batch 3 height width"]
 
 READABLE_SIDE = 144
-GAP, LINE, MARGIN = 6, 20, 12
-INK, PAPER = "black", "white"
+GAP = 6
+LINE = 20
+MARGIN = 12
+INK = "black"
+PAPER = "white"
 NOTHING = 0.5
 # From far to near. Lightness rises steadily, so that a greyscale copy shows the same order.
 STOPS = [
@@ -92,7 +95,8 @@ def image_sheet(headings: Sequence[str] | None, rows: Sheet, title: str | None =
     lefts = [MARGIN + column * (width + GAP) for column in range(len(headings) + 1)]
     tops = [int(heading_top) + 2 * LINE + row * (height + LINE + GAP) for row in range(len(rows) + 1)]
     sheet = Image.new("RGB", (lefts[-1] - GAP + MARGIN, tops[-1] - LINE - GAP + MARGIN), PAPER)
-    draw, font = ImageDraw.Draw(sheet), label_font(12)
+    draw = ImageDraw.Draw(sheet)
+    font = label_font(12)
     if title is not None:
         draw.text((MARGIN, MARGIN), title, INK, label_font(15))
     for heading, left in zip(headings, lefts, strict=False):
@@ -120,7 +124,8 @@ def color_depth(depth: Maps) -> tuple[Colors, tuple[float, float]]:
         return torch.full_like(depth, NOTHING).expand(*depth.shape[:-3], 3, *depth.shape[-2:]), (0.0, 0.0)
     ordered = depth[seen].sort().values
     stray = len(ordered) // 50
-    near, far = ordered[stray], ordered[-1 - stray]
+    near = ordered[stray]
+    far = ordered[-1 - stray]
     inverse = 1 / torch.where(seen, depth, far)
     span = (1 / near - 1 / far).clamp(min=1e-12)
     colors = ramp((inverse - 1 / far) / span)

@@ -15,7 +15,8 @@ from completesplat.geometry.cameras import Cameras, look_at, pixel_centers, proj
 from completesplat.rasterizers import Rasterizer
 
 VOXELS = 128  # along the longest side of the box
-VIEWS, SIDE = 64, 256
+VIEWS = 64
+SIDE = 256
 TRUNCATION = 4.0  # voxels
 REACH = 1.25  # radius of the ball, over half the width that the photo shows at the pivot
 
@@ -63,7 +64,8 @@ def mesh_of(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras, pivot:
         raise CompleteSplatError("mesh: no surface in the middle of the photo")
     seen = unproject(cameras, pixel_centers(SIDE, SIDE, maps.device).flatten(0, 1), depths)[depths > 0]
     voxel = max((seen.amax(0) - seen.amin(0)).max().item(), 1e-3 * radius) / VOXELS
-    low, high = seen.amin(0) - 2 * voxel, seen.amax(0) + 2 * voxel
+    low = seen.amin(0) - 2 * voxel
+    high = seen.amax(0) + 2 * voxel
     axes = [torch.arange(low[i].item(), high[i].item(), voxel, device=maps.device) for i in range(3)]
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
     field = signed_distances(grid.flatten(0, 2), cameras, maps[:, :1], TRUNCATION * voxel).view(grid.shape[:3])
@@ -78,11 +80,13 @@ def mesh_of(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras, pivot:
 def cameras_around(center: Float[Tensor, "3"], radius: float, tangent: float) -> Cameras:
     """Return cameras that see a whole ball, evenly spread around it (Fibonacci's lattice)."""
     index = torch.arange(VIEWS, device=center.device) + 0.5
-    height, angle = 1 - 2 * index / VIEWS, index * math.pi * (3 - math.sqrt(5))
+    height = 1 - 2 * index / VIEWS
+    angle = index * math.pi * (3 - math.sqrt(5))
     ring = (1 - height**2).sqrt()
     distance = radius * math.sqrt(1 + tangent**-2)  # radius / sin(fov / 2)
     eyes = center + distance * torch.stack([ring * angle.cos(), height, ring * angle.sin()], dim=-1)
-    focal, half = SIDE / 2 / tangent, SIDE / 2
+    focal = SIDE / 2 / tangent
+    half = SIDE / 2
     intrinsics = center.new_tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]]).expand(VIEWS, 3, 3)
     return Cameras(look_at(eyes, center, center.new_tensor([0, -1, 0])), intrinsics, (SIDE, SIDE))
 
@@ -97,11 +101,13 @@ def looked_up(points: Points, cameras: Cameras, maps: Maps) -> Iterator[tuple[Te
 
 def signed_distances(points: Points, cameras: Cameras, depths: Maps, truncation: float) -> Float[Tensor, " point"]:
     """Return mean signed distances to the surfaces in units of the truncation, from -1 (inside, unseen) to 1."""
-    total, weights = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
+    total = torch.zeros_like(points[:, 0])
+    weights = torch.zeros_like(points[:, 0])
     for (depth,), ahead in looked_up(points, cameras, depths):
         distance = ((torch.where(depth > 0, depth, torch.inf) - ahead) / truncation).clamp(max=1)
         weight = (1 + distance).clamp(0, 1)  # behind a surface, less is known
-        total, weights = total + weight * distance.clamp(min=-1), weights + weight
+        total = total + weight * distance.clamp(min=-1)
+        weights = weights + weight
     return torch.where(weights > 0, total / weights.clamp(min=1e-6), -1)
 
 
@@ -123,9 +129,11 @@ def surface_of(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Faces, Points
 
 def vertex_colors(vertices: Points, normals: Points, cameras: Cameras, maps: Maps, behind: float) -> Points:
     """Return mean colours over views, by the squared cosine between normal and ray; hidden vertices hardly count."""
-    total, weights = torch.zeros_like(vertices), torch.zeros_like(vertices[:, :1])
+    total = torch.zeros_like(vertices)
+    weights = torch.zeros_like(vertices[:, :1])
     for center, ((depth, *color), ahead) in zip(cameras.centers, looked_up(vertices, cameras, maps), strict=True):
         cosine = torch.nn.functional.cosine_similarity(center - vertices, normals, dim=-1).clamp(min=1e-3)
         weight = (cosine.square() * ((depth > 0) & (ahead < depth + behind)).float().clamp(min=1e-6))[:, None]
-        total, weights = total + weight * torch.stack(color, dim=-1), weights + weight
+        total = total + weight * torch.stack(color, dim=-1)
+        weights = weights + weight
     return (total / weights).clamp(0, 1)

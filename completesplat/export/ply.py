@@ -20,8 +20,11 @@ from completesplat.ply_files import read_vertices, vertex_header
 
 SMALLEST_ALPHA = 1e-6
 AXES_COMMENT = "coordinates as given, none turned; camera frames have +x right, +y down, +z forward (OpenCV)"
-MEANS, NORMALS, COLORS = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
-SCALES, QUATERNIONS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
+MEANS = ("x", "y", "z")
+NORMALS = ("nx", "ny", "nz")
+COLORS = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALES = ("scale_0", "scale_1", "scale_2")
+QUATERNIONS = ("rot_0", "rot_1", "rot_2", "rot_3")
 WRITTEN = (*MEANS, *NORMALS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
 REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
 

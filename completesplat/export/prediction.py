@@ -34,11 +34,15 @@ from completesplat.settings.schema import CameraPath, Format
 
 logger = logging.getLogger(__name__)
 
-DIRECTIONS, SHEET_NAME = 8, 18  # views on a sheet, and characters above a column
-PHOTO_FILE, SCENE_FILE = "photo.png", "scene.json"
+DIRECTIONS = 8
+SHEET_NAME = 18  # views on a sheet, and characters above a column
+PHOTO_FILE = "photo.png"
+SCENE_FILE = "scene.json"
 UNFINISHED = ".unfinished"  # a file that is there until the others are written
-SPLATS, VIDEOS = "|".join(map(format_suffix, FORMATS)), "|".join(PATHS)
-SCENES, MAPS = rf"sample_\d+({SPLATS})|({VIDEOS})_\d+\.mp4", r"(depth|normals|opacity)_\d+\.png"
+SPLATS = "|".join(map(format_suffix, FORMATS))
+VIDEOS = "|".join(PATHS)
+SCENES = rf"sample_\d+({SPLATS})|({VIDEOS})_\d+\.mp4"
+MAPS = r"(depth|normals|opacity)_\d+\.png"
 WRITTEN = re.compile(rf"{SCENES}|{MAPS}|sheet\.png|{PHOTO_FILE}|{SCENE_FILE}")
 FARTHEST = 1000.0  # scene radii from the origin, about, where float32 is still finer than a hundredth of a pixel
 CONVENTIONS = {
@@ -154,16 +158,19 @@ def write_prediction(
     """
     # Refuse samples without intact Gaussians before anything is written.
     shots = [replace(x, scene=cleaned(x.scene, f"{settings['image']}: sample {i}")) for i, x in enumerate(shots)]
-    scenes, reference = [shot.scene for shot in shots], shots[0].camera
+    scenes = [shot.scene for shot in shots]
+    reference = shots[0].camera
     make_folder(folder)
     _make_room(folder)
     write_png(folder / PHOTO_FILE, Image.fromarray(to_pixels(image)))
-    views, depths = [], []
+    views = []
+    depths = []
     files = {"photo": PHOTO_FILE}
     for i, shot in enumerate(shots):
         # Scenes do not depend on hidden pixels, of which the digest `made_from` does.
         comments = [*(f"{name} {value}" for name, value in settings.items() if name != "made_from"), f"sample {i}"]
-        name, number = f"sample_{i:02}", f"_{i:02}"
+        name = f"sample_{i:02}"
+        number = f"_{i:02}"
         around, depth, written = write_scene(folder, name, number, shot, rasterizer, wanted, comments, on_file)
         views.append(around)
         depths.append(depth)
@@ -251,7 +258,8 @@ def write_scene(
     Returns:
         Views around the scene, the first view's depth, and file names by purpose.
     """
-    scene, reference = shot.scene, shot.camera
+    scene = shot.scene
+    reference = shot.camera
     pivot = seen_center(rasterizer, scene, reference, wanted.pivot_depth)
     dilated = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
     stored, camera = shot.units.stored(dilated, reference)

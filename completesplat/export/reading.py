@@ -29,7 +29,9 @@ from completesplat.ply_files import LONGEST_HEADER, PACKED
 
 HEADER = struct.Struct("<4sIIBBBBI")  # magic, version, count, degree, fractional bits, flags, streams, their table
 WIDTHS = {2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}  # bytes of a Gaussian in each part but harmonics
-EXTENDED, COORDINATES, RIGHT_UP_BACK = 2, 0xADBE0003, 4  # flag, type of an extension, its default
+EXTENDED = 2
+COORDINATES = 0xADBE0003
+RIGHT_UP_BACK = 4  # flag, type of an extension, its default
 OUR_AXES = np.array([1, -1, 1])  # right, down, forward
 LARGEST_RATIO = 40  # of what a file unpacks to; splat-transform's have 2
 
@@ -80,7 +82,8 @@ def _read_by_splat_transform(path: Path, kind: str) -> Gaussians:
 
 def _read_splat(content: bytes) -> list[np.ndarray]:
     records = np.frombuffer(content, RECORD)
-    colors, rotations = records["colors"] / 255, records["quaternions"] / 128 - 1
+    colors = records["colors"] / 255
+    rotations = records["quaternions"] / 128 - 1
     return [records["means"], rotations, records["scales"], colors[:, 3], colors[:, :3]]
 
 
@@ -114,7 +117,8 @@ def _signs(extensions: bytes) -> np.ndarray:
     system = 0
     while len(extensions) >= 12:
         kind, size, value = struct.unpack_from("<III", extensions)
-        system, extensions = value if kind == COORDINATES else system, extensions[8 + size :]
+        system = value if kind == COORDINATES else system
+        extensions = extensions[8 + size :]
     if system > 8:
         raise ValueError(f"coordinate system {system}")
     right_up_front = (system or RIGHT_UP_BACK) - 1 >> np.arange(3) & 1
@@ -134,11 +138,15 @@ def _unpacked(data: bytes, table: int, streams: int, sizes: np.ndarray) -> bytes
 def _quaternions(packed: UInt8[np.ndarray, "gaussian bytes"]) -> Float[np.ndarray, "gaussian 4"]:
     """Unpack x, y, z of a byte each, or two bits that name the largest of x, y, z, w and ten for each other."""
     if packed.shape[1] == 3:
-        fourth, three = np.full((len(packed), 1), 3), packed / 127.5 - 1
+        fourth = np.full((len(packed), 1), 3)
+        three = packed / 127.5 - 1
     else:
         word = packed.view("<u4")
-        fourth, fields = word >> 30, word >> np.array([20, 10, 0], np.uint32)
+        fourth = word >> 30
+        fields = word >> np.array([20, 10, 0], np.uint32)
         three = np.where(fields & 512, -1, 1) * (fields & 511) * (math.sqrt(0.5) / 511)
-    others, quaternions = np.arange(4) != fourth, np.empty((len(packed), 4))
-    quaternions[others], quaternions[~others] = three.ravel(), np.sqrt(np.maximum(0, 1 - (three**2).sum(-1)))
+    others = np.arange(4) != fourth
+    quaternions = np.empty((len(packed), 4))
+    quaternions[others] = three.ravel()
+    quaternions[~others] = np.sqrt(np.maximum(0, 1 - (three**2).sum(-1)))
     return np.roll(quaternions, 1, axis=-1)

@@ -27,7 +27,8 @@ from completesplat.geometry.cameras import Cameras, transform_points
 PROGRAM = "splat-transform"
 PACKAGE = "@playcanvas/splat-transform@2.7.1"
 LIMIT_SECONDS = 600
-WIDEST_WINDOW, LARGEST_FOV = 20 / 9, 120.0  # phones' windows
+WIDEST_WINDOW = 20 / 9
+LARGEST_FOV = 120.0  # phones' windows
 CONTROLS = b"<style>#controlsWrap.faded-out { visibility: visible; opacity: 1 }</style>"
 IN_A_ROOM = b"const isObjectExperience = !bbox.containsPoint(resetCamera.position);"
 
@@ -100,7 +101,8 @@ def write_turning_page(path: Path, gaussians: Gaussians, view: PageView) -> None
     """Write a page with the upright scene, seen from the front and turning until a person touches it."""
     turn = upright_rotation(view.up)
     with tempfile.TemporaryDirectory() as folder:
-        scene, settings = Path(folder) / "scene.ply", Path(folder) / "settings.json"
+        scene = Path(folder) / "scene.ply"
+        settings = Path(folder) / "settings.json"
         write_ply(scene, gaussians.transform(turn))
         settings.write_text(json.dumps(viewer_settings(view, turn)))
         html = Path(folder) / "page.html"

@@ -38,7 +38,8 @@ def render_views(
     rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras, background: float
 ) -> tuple[Frames, DepthMaps]:
     """Return images of one unbatched scene from several cameras, and expected depths (0 where nothing is seen)."""
-    images, depths = [], []
+    images = []
+    depths = []
     for start in range(0, len(cameras.world_to_camera), CHUNK):
         rendering = rasterizer(gaussians[None], cameras[start : start + CHUNK][None])
         images.append(rendering.over(background)[0])
@@ -77,9 +78,12 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
 
 def _is_whole(path: Path) -> bool:
     """Return whether an `.mp4` ends where its last box does, and has an index of its frames (ISO/IEC 14496-12, 4.2)."""
-    content, at, kinds = path.read_bytes(), 0, set()
+    content = path.read_bytes()
+    at = 0
+    kinds = set()
     while at + 8 <= len(content):
-        length, kind = int.from_bytes(content[at : at + 4]), content[at + 4 : at + 8]
+        length = int.from_bytes(content[at : at + 4])
+        kind = content[at + 4 : at + 8]
         length = int.from_bytes(content[at + 8 : at + 16]) if length == 1 else length
         if length < 8:
             return False

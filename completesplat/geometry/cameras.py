@@ -58,7 +58,9 @@ def invert_rigid(matrix: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4
 
 def _rigid(rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3 1"]) -> Tensor:
     matrix = rotation.new_zeros(*rotation.shape[:-2], 4, 4)
-    matrix[..., :3, :3], matrix[..., :3, 3:], matrix[..., 3, 3] = rotation, translation, 1
+    matrix[..., :3, :3] = rotation
+    matrix[..., :3, 3:] = translation
+    matrix[..., 3, 3] = 1
     return matrix
 
 
@@ -111,7 +113,8 @@ def pinhole(fov_degrees: float, size: int) -> Float[Tensor, "3 3"]:
 
 def nearest_to_axes(cameras: Cameras, least_spread: float = PARALLEL) -> Float[Tensor, "3"] | None:
     """Return the point (float64) nearest to all optical axes (least squares); None if the axes are too parallel."""
-    axes, centers = cameras.camera_to_world[:, :3, 2].double(), cameras.centers.double()
+    axes = cameras.camera_to_world[:, :3, 2].double()
+    centers = cameras.centers.double()
     across = torch.eye(3, dtype=axes.dtype, device=axes.device) - axes[:, :, None] * axes[:, None]
     mean = across.mean(0)
     if torch.linalg.eigvalsh(mean)[0] < least_spread:
@@ -144,7 +147,8 @@ def look_at(eye: Vectors, target: Vectors, up: Vectors) -> Float[Tensor, "*batch
     """Return `world_to_camera` of a camera at `eye` with `target` in the image's centre and `up` pointing up."""
     eye, target, up = torch.broadcast_tensors(eye, target, up)  # type: ignore[no-untyped-call]
     forward = torch.nn.functional.normalize(target - eye, dim=-1)
-    aside, other = torch.linalg.cross(forward, up), torch.linalg.cross(forward, up.roll(1, -1))
+    aside = torch.linalg.cross(forward, up)
+    other = torch.linalg.cross(forward, up.roll(1, -1))
     straight = aside.norm(dim=-1, keepdim=True) < 1e-6 * up.norm(dim=-1, keepdim=True)  # along `up`
     right = torch.nn.functional.normalize(torch.where(straight, other, aside), dim=-1)
     down = torch.linalg.cross(forward, right)

@@ -40,7 +40,9 @@ def harmonics(directions: Directions, degree: int) -> Float[Tensor, "*batch coef
         terms += [-mixed * x * z, difference * (x * x - y * y)]
     if degree > 2:
         outer, mixed, inner, zonal, difference = SH_C3
-        xx, yy, zz = x * x, y * y, z * z
+        xx = x * x
+        yy = y * y
+        zz = z * z
         terms += [-outer * y * (3 * xx - yy), mixed * x * y * z, -inner * y * (4 * zz - xx - yy)]
         terms += [zonal * z * (2 * zz - 3 * xx - 3 * yy), -inner * x * (4 * zz - xx - yy)]
         terms += [difference * z * (xx - yy), -outer * x * (xx - 3 * yy)]
@@ -57,7 +59,8 @@ def rotated(
     """
     degree = degree_of(values.shape[-2])
     directions, inverse = _fit(degree)
-    directions, inverse = directions.to(values), inverse.to(values)
+    directions = directions.to(values)
+    inverse = inverse.to(values)
     change = inverse @ harmonics(directions @ rotation, degree)
     return change[..., None, :, :] @ values
 

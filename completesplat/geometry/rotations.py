@@ -39,12 +39,17 @@ def matrix_to_quaternion(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "
     The largest of the four components is found first and the others are divided by it, which keeps full
     precision for every rotation (Shepperd, "Quaternion from rotation matrix", 1978).
     """
-    m, diagonal = matrix, torch.diagonal(matrix, dim1=-2, dim2=-1)
+    m = matrix
+    diagonal = torch.diagonal(matrix, dim1=-2, dim2=-1)
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
     # Four times the squared component, for w, x, y, z.
     squares = torch.cat([1 + trace[..., None], 1 + 2 * diagonal - trace[..., None]], dim=-1)
-    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
-    xy, xz, yz = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    wx = m[..., 2, 1] - m[..., 1, 2]
+    wy = m[..., 0, 2] - m[..., 2, 0]
+    wz = m[..., 1, 0] - m[..., 0, 1]
+    xy = m[..., 1, 0] + m[..., 0, 1]
+    xz = m[..., 0, 2] + m[..., 2, 0]
+    yz = m[..., 1, 2] + m[..., 2, 1]
     ww, xx, yy, zz = squares.unbind(-1)
     rows = [[ww, wx, wy, wz], [wx, xx, xy, xz], [wy, xy, yy, yz], [wz, xz, yz, zz]]
     candidates = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
@@ -59,6 +64,8 @@ def quaternion_multiply(
     """Return the Hamilton product: the rotation `right` followed by the rotation `left`."""
     w1, x1, y1, z1 = left.unbind(-1)
     w2, x2, y2, z2 = right.unbind(-1)
-    w, x = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2, w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2
-    y, z = w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2, w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2
+    w = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2
+    x = w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2
+    y = w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2
+    z = w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2
     return torch.stack([w, x, y, z], dim=-1)

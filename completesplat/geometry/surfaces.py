@@ -26,7 +26,8 @@ def normals_from_depth(depth: DepthMaps, cameras: Cameras) -> VectorMaps:
     """
     known = depth.isfinite() & (depth > 0)
     points = torch.where(known, depth, 0) * pixel_rays(cameras).movedim(-1, -3)
-    right, down = _difference(points, known, -1), _difference(points, known, -2)
+    right = _difference(points, known, -1)
+    down = _difference(points, known, -2)
     # Rows run downwards: right x down would point away from the camera.
     normals = torch.nn.functional.normalize(torch.linalg.cross(down, right, dim=-3), dim=-3, eps=1e-30)
     return torch.where(known, normals, 0)

@@ -27,7 +27,8 @@ def orbit(reference: Cameras, pivot: Vector, up: Vector, frames: int, degrees: f
     axis = torch.nn.functional.normalize(up, dim=-1)
     angles = _full_turn(frames, up) * (degrees / 360)
     arm = reference.centers - pivot
-    cos, sin = angles.cos()[:, None], angles.sin()[:, None]
+    cos = angles.cos()[:, None]
+    sin = angles.sin()[:, None]
     # Rodrigues' formula for the rotation of the arm about the axis.
     eyes = arm * cos + torch.linalg.cross(axis, arm) * sin + axis * (axis @ arm) * (1 - cos) + pivot
     return _looking_at(reference, eyes, pivot, axis)

@@ -6,7 +6,8 @@ from completesplat.errors import needing
 from completesplat.losses.lpips import Activations, PerceptualDistance, PerceptualTerm
 
 # The network takes colours as (255 x - 127) / 128 for x in [0, 1] (`efficientnet_lite_builder.py` of tensorflow/tpu).
-SHIFT, SCALE = (-1 / 255,) * 3, (256 / 255,) * 3
+SHIFT = (-1 / 255,) * 3
+SCALE = (256 / 255,) * 3
 # Layers up to the last block at 1/2, 1/4, 1/8, 1/16 and 1/32 of the images' size: channels of its output.
 STAGES = {4: 16, 6: 24, 8: 40, 14: 112, 19: 320}
 

@@ -30,7 +30,8 @@ class Activations(nn.Module):
 
     def __init__(self, layers: Iterable[nn.Module], ends: Collection[int]) -> None:
         super().__init__()
-        self.features, self.ends = nn.Sequential(*layers), ends
+        self.features = nn.Sequential(*layers)
+        self.ends = ends
 
     def forward(self, images: Images) -> list[Float[Tensor, "image _ _ _"]]:
         outputs = []
@@ -48,7 +49,8 @@ def vgg16() -> Activations:
     The outputs are those of each block before pooling: relu1_2, relu2_2, relu3_3, relu4_3, relu5_3.
     """
     layers: list[nn.Module] = []
-    ends, last = [], 3
+    ends = []
+    last = 3
     for block in BLOCKS:
         for channels in block:
             layers += [nn.Conv2d(last, channels, 3, padding=1), nn.ReLU()]

@@ -8,7 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 # Wang et al. 2004, Section III.B and III.C: window of 11 pixels, sigma 1.5, K1 = 0.01, K2 = 0.03, for values in [0, 1].
-RADIUS, SIGMA, C1, C2 = 5, 1.5, 0.01**2, 0.03**2
+RADIUS = 5
+SIGMA = 1.5
+C1 = 0.01**2
+C2 = 0.03**2
 VALUES_AT_ONCE = 2**17  # on a CPU, so that intermediate results stay in its cache
 
 Images = Float[Tensor, "image channel height width"]
@@ -35,7 +38,8 @@ class _Similarity(torch.autograd.Function):
         products = torch.stack([first, second, first * second, first * first])
         products[3].addcmul_(second, second)
         mean1, mean2, b, d = rows @ (products @ columns.T)
-        a, c = mean1 * mean2, (mean1 * mean1).addcmul_(mean2, mean2)
+        a = mean1 * mean2
+        c = (mean1 * mean1).addcmul_(mean2, mean2)
         b.sub_(a).mul_(2).add_(C2)
         d.sub_(c).add_(C2)
         a.mul_(2).add_(C1)
@@ -49,7 +53,8 @@ class _Similarity(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         first, second, mean1, mean2, a, b, c, d, values = ctx.saved_tensors
         rows, columns = (blur_matrix(size, first.dtype, first.device) for size in first.shape[-2:])
-        of_b, of_value = (2 * gradient).div_(c).div_(d), gradient * values
+        of_b = (2 * gradient).div_(c).div_(d)
+        of_value = gradient * values
         of_square = (of_value / d).neg_()
         of_mean = ((b - a) * of_b).mul_(mean2).addcmul_(mean1, (of_value / c).add_(of_square), value=-2)
         blurred = rows.T @ (torch.stack([of_mean, of_b.mul_(a), of_square]) @ columns)

@@ -102,5 +102,6 @@ class KullbackLeibler:
     """
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
-        posterior, values = prediction.posterior, prediction.images[0, 0].numel()
+        posterior = prediction.posterior
+        values = prediction.images[0, 0].numel()
         return posterior.kl().mean() / values if posterior is not None else prediction.images.new_zeros(())

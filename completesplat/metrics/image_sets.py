@@ -67,7 +67,8 @@ class ImageSets:
         """
         figures: dict[str, float] = {}
         for index, metric in enumerate(self.metrics):
-            predicted, true = self.described[owner, region, index], self.described[self.TRUE, region, index]
+            predicted = self.described[owner, region, index]
+            true = self.described[self.TRUE, region, index]
             if predicted:
                 names = sorted(predicted)
                 true_set = torch.cat([true[name] for name in names])
@@ -89,7 +90,8 @@ class Inception:
     regions = ("full", "object")
 
     def __init__(self, network: torch.jit.ScriptModule, subset_size: int = 1000) -> None:
-        self.network, self.subset_size = network.eval(), subset_size
+        self.network = network.eval()
+        self.subset_size = subset_size
 
     @torch.no_grad()
     def describe(self, images: Images) -> Descriptors:
@@ -146,7 +148,8 @@ def frechet_distance(first: FirstSet, second: SecondSet) -> float:
     identity = nn.Identity()
     identity.num_features = first.shape[1]  # type: ignore[assignment]
     # The sets are complete; among several processes torchmetrics would wait for the others' sets and add them.
-    first, second = as_float64(first), as_float64(second)
+    first = as_float64(first)
+    second = as_float64(second)
     metric = FrechetInceptionDistance(identity, sync_on_compute=False).to(first.device)
     metric.update(first, real=True)
     metric.update(second, real=False)
@@ -163,7 +166,8 @@ def kernel_distance(
     """
     from torchmetrics.image.kid import poly_mmd
 
-    first, second = as_float64(first), as_float64(second)
+    first = as_float64(first)
+    second = as_float64(second)
     size = min(subset_size, len(first), len(second))
     generator = torch.Generator().manual_seed(seed)
     values = []

@@ -18,7 +18,8 @@ TrueValues = Float[Tensor, " value"]
 
 def energy_score(samples: SampledValues, truth: TrueValues) -> float:
     """Return E |x - y| - E |x - x'| / 2 for samples x, x' and truth y; distances are root mean squares of values."""
-    samples, truth = as_float64(samples), as_float64(truth)
+    samples = as_float64(samples)
+    truth = as_float64(truth)
     count, size = samples.shape
     spread = torch.pdist(samples).sum() * 2 / (count * (count - 1))
     error = torch.linalg.vector_norm(samples - truth, dim=1).mean()
@@ -27,7 +28,8 @@ def energy_score(samples: SampledValues, truth: TrueValues) -> float:
 
 def crps(samples: SampledValues, truth: TrueValues) -> float:
     """Return the continuous ranked probability score of each single value, averaged over the values."""
-    samples, truth = as_float64(samples), as_float64(truth)
+    samples = as_float64(samples)
+    truth = as_float64(truth)
     count = len(samples)
     # The sum of |x - x'| over all pairs, from the sorted values.
     weights = 2 * torch.arange(count, device=samples.device) - count + 1

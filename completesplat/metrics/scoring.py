@@ -23,7 +23,10 @@ Scores = dict[tuple[str, str, str], float]
 DepthMaps = Float[Tensor, "image 1 height width"]
 SampledViews = Float[Tensor, "sample view 3 height width"]
 REGIONS = ("full", "object")
-MODEL, BEST, BEST_BY_METRIC, MEAN = "model", "best_of_k", "best_of_k_by_metric", "mean_of_k"
+MODEL = "model"
+BEST = "best_of_k"
+BEST_BY_METRIC = "best_of_k_by_metric"
+MEAN = "mean_of_k"
 BEST_RULES = {
     BEST: "of each region one sample for all metrics: that with the best `criterion` there, in novel views",
     BEST_BY_METRIC: "of each region and metric another sample: the best by it, in novel views; no metrics of sets",
@@ -60,7 +63,9 @@ class Evaluation:
         candidates = list((sets or {}).values())
         absent = [metric for metric in (*given.values(), *candidates) if isinstance(metric, MissingMetrics)]
         self.missing = {name: str(metric) for metric in absent for name in metric.names}
-        self.samples, self.criterion, self.seed = samples, criterion, seed
+        self.samples = samples
+        self.criterion = criterion
+        self.seed = seed
         self.first_novel = 1
         """Views before the novel ones: 1, the reference that the model is given, or 0, if it is given none."""
         self._check_settings()
@@ -116,7 +121,9 @@ class Evaluation:
         self.scores[MODEL][name] |= proper
         with torch.autocast(images.device.type, enabled=False):
             noisy = noisy_mean(images.float(), self.scene_seed(name))[:, 1:]
-            metric, true, counted = self.metrics[self.criterion], truth.images[1:], _counted(truth[1:], "full")
+            metric = self.metrics[self.criterion]
+            true = truth.images[1:]
+            counted = _counted(truth[1:], "full")
             by_noise = [values_of(metric, noise, true, counted).mean().item() for noise in noisy]
         by = [scores["full", "novel", self.criterion] for scores in each]
         higher = bool(self.styles[self.criterion].higher_is_better)
@@ -140,9 +147,11 @@ class Evaluation:
 
     def score(self, images: Float[Tensor, "view 3 height width"], truth: Views) -> Scores:
         """Score one prediction (values in [0, 1]) of one scene: means over the novel views, and their `sharpness`."""
-        scores, first = Scores(), self.first_novel
+        scores = Scores()
+        first = self.first_novel
         for region in REGIONS:
-            predicted, true = _region(images, truth, region), _region(truth.images, truth, region)
+            predicted = _region(images, truth, region)
+            true = _region(truth.images, truth, region)
             counted = _counted(truth, region)
             for name, metric in self.metrics.items():
                 with torch.autocast(images.device.type, enabled=False):  # metrics compute in float32
@@ -246,7 +255,8 @@ def novel_values(images: SampledViews, truth: Views) -> dict[str, tuple[SampledV
 
     Regions are all pixels (`full`) and, if true depth is known, those that the reference view does not show (`hidden`).
     """
-    novel, masks = truth[1:], {"full": torch.ones_like(truth.masks[1:, 0], dtype=torch.bool)}
+    novel = truth[1:]
+    masks = {"full": torch.ones_like(truth.masks[1:, 0], dtype=torch.bool)}
     if truth.depths is not None and truth.depths.shape[-2:] == images.shape[-2:]:
         hidden, _ = hidden_from(truth.cameras[0], truth.depths[0], novel.cameras, truth.depths[1:])
         masks |= {"hidden": hidden} if hidden.any() else {}
@@ -281,8 +291,10 @@ def depth_errors(
     """
     errors: list[dict[str, float] | None] = []
     for estimate, depth, counted in zip(predicted, true, valid & true.isfinite() & (true > 0), strict=True):
-        p, t = estimate[counted], depth[counted]
-        ratio, difference = torch.maximum(p / t, t / p), p - t
+        p = estimate[counted]
+        t = depth[counted]
+        ratio = torch.maximum(p / t, t / p)
+        difference = p - t
         measured = {
             "abs_rel": (difference.abs() / t).mean().item(),
             "rmse": difference.square().mean().sqrt().item(),
@@ -304,7 +316,8 @@ def expected_best_curve(scores: Sequence[float], higher_is_better: bool = True) 
     Raises:
         ValueError: there are no scores, or one is not a number.
     """
-    worst_first, k = _worst_first(scores, higher_is_better), len(scores)
+    worst_first = _worst_first(scores, higher_is_better)
+    k = len(scores)
     return [sum(comb(i, j) * score for i, score in enumerate(worst_first)) / comb(k, j + 1) for j in range(k)]
 
 

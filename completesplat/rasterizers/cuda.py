@@ -21,7 +21,8 @@ WARP = 32
 # Beyond this depth, the reciprocal of the cubed depth, a factor of gsplat's gradients, underflows float32. At 1e17,
 # gradients through the depth image become NaN, because gsplat multiplies coordinates before it divides them.
 FARTHEST = 1e12
-SMALLEST_BLUR, SMALLEST_NEAR_PLANE = 1e-5, 1e-6
+SMALLEST_BLUR = 1e-5
+SMALLEST_NEAR_PLANE = 1e-6
 COMPILED = ("max_alpha", "min_alpha", "min_transmittance", "frustum_margin")  # the defaults are those of the kernels
 
 

@@ -45,17 +45,20 @@ def fit_front(
     """
     with torch.inference_mode(False), torch.enable_grad():
         # Autograd cannot use tensors that were made in inference mode, but it can use copies.
-        fixed, views = gaussians.map(torch.clone).detach(), cameras.map(lambda x: x[:, None].clone())
+        fixed = gaussians.map(torch.clone).detach()
+        views = cameras.map(lambda x: x[:, None].clone())
         image = images[:, None].clone()
         mask = torch.ones_like(image) if visible is None else visible[:, None].expand_as(image).clone()
         moves = [torch.zeros_like(getattr(fixed, name), requires_grad=True) for name in RATES]
         means, squares = ([torch.zeros_like(move) for move in moves] for _ in range(2))
-        best, least = gaussians, math.inf
+        best = gaussians
+        least = math.inf
         for number in range(1, rounds + 2):
             moved = _moved(fixed, *moves)
             error = ((rasterizer(moved, views).over(background) - image) * mask).square().sum() / 2
             if error.item() < least:
-                best, least = moved.detach(), error.item()
+                best = moved.detach()
+                least = error.item()
             if number > rounds or least <= ENOUGH * mask.sum().item() / 2:
                 break
             grads = torch.autograd.grad(error, moves)

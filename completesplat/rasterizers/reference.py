@@ -75,7 +75,10 @@ def project_gaussians(
     points = transform_points(camera.world_to_camera, gaussians.means)
     x, y, z = points.unbind(-1)
     k = camera.intrinsics
-    fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
+    fx = k[0, 0]
+    fy = k[1, 1]
+    cx = k[0, 2]
+    cy = k[1, 2]
     centers = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
 
     height, width = camera.image_size
@@ -100,7 +103,9 @@ def alphas_at(
     covariances: Float[Tensor, "gaussian 2 2"], opacities: Float[Tensor, " gaussian"], constants: RenderingConstants,
 ) -> Alphas:  # fmt: skip
     """Return min(max_alpha, opacity * exp(-d^T Sigma^-1 d / 2)) for every pair, zero below min_alpha."""
-    a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
+    a = covariances[:, 0, 0]
+    b = covariances[:, 0, 1]
+    c = covariances[:, 1, 1]
     # The determinant of M + blur * 1 is at least blur * (trace of M + blur) for a covariance M; the difference of
     # products loses that to rounding when a Gaussian is large and flat.
     determinant = torch.maximum(a * c - b * b, constants.blur * (a + c - constants.blur)).clamp(min=1e-10)

@@ -108,7 +108,8 @@ def _proof(constants: RenderingConstants | None) -> Path:
 def _image_and_gradient(rasterizer: Rasterizer) -> tuple[torch.Tensor, torch.Tensor]:
     """Render a Gaussian off the centre of a 6 x 5 image; return the image and a gradient of the mean."""
     mean = torch.tensor([[[0.05, -0.02, 2.0]]], requires_grad=True)
-    quaternion, scale = torch.tensor([[[1.0, 0.2, -0.1, 0.3]]]), torch.tensor([[[0.3, 0.2, 0.1]]])
+    quaternion = torch.tensor([[[1.0, 0.2, -0.1, 0.3]]])
+    scale = torch.tensor([[[0.3, 0.2, 0.1]]])
     gaussians = Gaussians(mean, quaternion, scale, torch.tensor([[0.8]]), torch.tensor([[[0.9, 0.5, 0.1]]]))
     cameras = Cameras(torch.eye(4)[None, None], pinhole(40.0, 6)[None, None], (5, 6))
     color = rasterizer(gaussians, cameras).color

@@ -49,7 +49,8 @@ class TiledRasterizer:
 def _check(gaussians: Gaussians, cameras: Cameras) -> None:
     # The kernels do not check bounds: an array that is too small would be read beyond its end.
     for name, widths in WIDTHS.items():
-        shape, actual = [len(cameras.world_to_camera), gaussians.count, *widths], list(getattr(gaussians, name).shape)
+        shape = [len(cameras.world_to_camera), gaussians.count, *widths]
+        actual = list(getattr(gaussians, name).shape)
         if actual != shape:
             raise CompleteSplatError(f"{name} should have the shape {shape}, not {actual}")
     require_float32("tiled", gaussians, cameras, torch.device("cpu"))
@@ -67,7 +68,8 @@ def pack_cameras(cameras: Cameras, frustum_margin: float) -> np.ndarray:
     packed[..., layout.TRANSLATION : layout.TRANSLATION + 3] = matrices[..., :3, 3]
     height, width = cameras.image_size
     for axis, extent in ((0, width), (1, height)):
-        focal, principal = intrinsics[..., axis, axis], intrinsics[..., axis, 2]
+        focal = intrinsics[..., axis, axis]
+        principal = intrinsics[..., axis, 2]
         beyond = frustum_margin * 0.5 * extent / focal
         packed[..., layout.FOCAL_X + axis] = focal
         packed[..., layout.PRINCIPAL_X + axis] = principal

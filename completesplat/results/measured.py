@@ -27,7 +27,9 @@ from completesplat.results.tables import (
     shown_scores,
 )
 
-BEST_OF_K, BEST_BY_METRIC, MEAN_OF_K = "best_of_k", "best_of_k_by_metric", "mean_of_k"
+BEST_OF_K = "best_of_k"
+BEST_BY_METRIC = "best_of_k_by_metric"
+MEAN_OF_K = "mean_of_k"
 OURS = "completesplat: "  # not "ours", because the paper gives its rows that name
 COST = {"inference": "inference", "rendering": "rendering"}
 LEADING = {"method": "method", "speed": "rendering speed", **COST, "seeds": "seeds", "scenes": "scenes"}
@@ -168,11 +170,13 @@ def entries_of(runs: Iterable[ResultsFile]) -> list[Entry]:
 
 
 def _entry(run: ResultsFile, predictor: str, scores: FlatScores) -> Entry:
-    protocol, label = run.protocol, predictor.replace("_", " ")
+    protocol = run.protocol
+    label = predictor.replace("_", " ")
     entry = Entry(label, scores, protocol["scenes"], predictor, bool(scores.get(UPPER_BOUND)), protocol=protocol)
     if entry.ours:
         samples = protocol.get("samples", 1)
-        oracle, criterion = f", {samples}-best oracle by", str(protocol.get("criterion")).upper()
+        oracle = f", {samples}-best oracle by"
+        criterion = str(protocol.get("criterion")).upper()
         kinds = {BEST_OF_K: f"{oracle} {criterion}", BEST_BY_METRIC: f"{oracle} each metric"}
         kinds[MEAN_OF_K] = f", mean of {samples} samples"
         kinds[MODEL] = ", single sample" if protocol.get("sampler") or samples != 1 else ""
@@ -201,7 +205,8 @@ def score_tables(entries: Sequence[Entry]) -> list[Table]:
 
 
 def _score_table(name: str, entries: Sequence[Entry]) -> Table:
-    protocol, notes = entries[0].protocol, Notes()
+    protocol = entries[0].protocol
+    notes = Notes()
     # Our models first; a naive predictor has the same scores in all runs of a protocol, so it is shown once.
     naive: dict[object, Entry] = {}
     for entry in entries:
@@ -233,7 +238,8 @@ def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = M
         results: the protocol (without it, metrics of the user's own are left out), and `Evaluation.results`.
         model: the label of the predictor that is the model.
     """
-    protocol, measured = results.get(PROTOCOL, {}), {name: x for name, x in results.items() if name != PROTOCOL}
+    protocol = results.get(PROTOCOL, {})
+    measured = {name: x for name, x in results.items() if name != PROTOCOL}
     records = {model if name == MODEL else name: flat_scores(entry) for name, entry in measured.items()}
     first = next(iter(records.values()))
     entries = []
@@ -269,7 +275,8 @@ def mode_tables(runs: Sequence[ResultsFile]) -> list[Table]:
 
 
 def _mode_table(name: str, runs: Sequence[ResultsFile]) -> Table:
-    notes, records = Notes(), dict[object, dict[str, object]]()
+    notes = Notes()
+    records = dict[object, dict[str, object]]()
     for run in runs:
         note = notes.number(f"{run.name}: {protocol_line(run.protocol)}.")
         for method, scores in run.entries.items():

@@ -61,7 +61,8 @@ def comparison_table(table: PublishedTable, entries: Sequence[measured.Entry]) -
 
     Times are of one sequence, warm, for the complete pipeline.
     """
-    notes, keys = tables.Notes(), ["method"]
+    notes = tables.Notes()
+    keys = ["method"]
     is_ablation = bool(table.get("options"))
     if not is_ablation:
         columns = {*measured.OF_RUNS, *(column.key for column in table.columns)}
@@ -144,7 +145,8 @@ def published_tables(tree: RunTree | None) -> list[tables.Table]:
     sweeps = _ablation_sweeps(tree)
     listed = {folder / job.name for folder, tested in sweeps.items() for job in tested}
     single = measured.entries_of(run for run in tree.scores if run.folder not in listed)
-    made, placed = [], []
+    made = []
+    placed = []
     for table in read_tables():
         entries = []
         if table.get("options"):

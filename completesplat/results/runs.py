@@ -19,10 +19,14 @@ from yaml import YAMLError
 from completesplat.errors import CompleteSplatError
 from completesplat.files import printable
 
-SCORES, MODES = "metrics.json", "hidden_modes.json"
-RECORD, CONFIG, PLAN = "run.json", "config.yaml", "multirun.yaml"
+SCORES = "metrics.json"
+MODES = "hidden_modes.json"
+RECORD = "run.json"
+CONFIG = "config.yaml"
+PLAN = "multirun.yaml"
 PROTOCOL = "protocol"  # key of the entry that says how results were measured; the others are predictors
-MODEL, UPPER_BOUND = "model", "upper_bound"
+MODEL = "model"
+UPPER_BOUND = "upper_bound"
 """Name of the predictor that is the run's model; key that marks a predictor that saw the views of its scores."""
 SEED = "seed"
 HOW = "make them with `completesplat test ckpt=RUN/checkpoints/last.ckpt out=DIR`"
@@ -108,7 +112,9 @@ def find_results(folder: Path) -> RunTree:
     """Search a folder and everything below it, except hidden folders."""
     if not folder.is_dir():
         raise CompleteSplatError(f"runs={folder}: no such folder")
-    tree, results, visited = RunTree(folder), list[Path](), set[str]()
+    tree = RunTree(folder)
+    results = list[Path]()
+    visited = set[str]()
     for place, folders, names in os.walk(folder, followlinks=True):
         if (real := os.path.realpath(place)) in visited:
             folders.clear()
@@ -265,7 +271,8 @@ def _pairs(overrides: Sequence[str]) -> dict[str, str]:
 
 
 def _job(folder: Path, name: str) -> Job:
-    record, metrics = read_record(folder), read_mapping(folder / SCORES)
+    record = read_record(folder)
+    metrics = read_mapping(folder / SCORES)
     try:
         config = cast(Mapping[str, object], OmegaConf.to_container(OmegaConf.load(folder / CONFIG)))
     except (OmegaConfBaseException, YAMLError, OSError, ValueError):  # its writer was killed
@@ -275,7 +282,8 @@ def _job(folder: Path, name: str) -> Job:
     tested = metrics if PROTOCOL in metrics else _mapping(metrics.get("test"))
     entries = {name: entry for name, entry in tested.items() if name != PROTOCOL and isinstance(entry, Mapping)}
     test = {name: flat_scores(entry) for name, entry in entries.items()}
-    steps, protocol = cast(int, metrics.get("steps", 0)), cast(Protocol, _mapping(tested.get(PROTOCOL)))
+    steps = cast(int, metrics.get("steps", 0))
+    protocol = cast(Protocol, _mapping(tested.get(PROTOCOL)))
     return Job(name, _pairs(record["overrides"]), config, record, bool(metrics), steps, test, protocol)
 
 

@@ -25,7 +25,9 @@ SSIM_NOTE = "SSIM: mean over all pixels, images mirrored at their border (skimag
 """Note below tables with SSIM; the border has 37 % of the pixels of a 48 x 48 image, 15 % of a 128 x 128 one."""
 SHARPNESS_NOTE = "Sharpness: gradient energy of the novel views over the truth's; a blur has less than 1."
 
-BEST, SECOND, UNMARKED = "best", "second", ""
+BEST = "best"
+SECOND = "second"
+UNMARKED = ""
 MARKED_MARKDOWN = {BEST: "**{}**", SECOND: "<ins>{}</ins>", UNMARKED: "{}"}
 MARKED_LATEX = {BEST: r"\textbf{%s}", SECOND: r"\underline{%s}", UNMARKED: "%s"}
 MARKED_TERMINAL = {BEST: "bold", SECOND: "underline", UNMARKED: ""}
@@ -36,7 +38,8 @@ ESCAPES = str.maketrans(
 )
 LINE = re.compile(r".+")
 WORD = re.compile(r"\S+(?: [↑↓])?")  # a column is at least as wide, so that none breaks
-ABSENT, BLANK = "-", "(blank)"
+ABSENT = "-"
+BLANK = "(blank)"
 LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK}: left blank in the paper."
 
 PLAIN = (type(None), str, bool, int, float)  # types of values that a table can show
@@ -148,7 +151,8 @@ class Table:
         from rich.text import Text
 
         columns = [[x.joined("\n"), *(row.cells[i].text for row in self.rows)] for i, x in enumerate(self.headings)]
-        room, most = options.max_width - 1, options.max_width // 2 - 4  # without borders; two columns always fit
+        room = options.max_width - 1
+        most = options.max_width // 2 - 4  # without borders; two columns always fit
         lines = [_longest(LINE, column) for column in columns]
         words = [min(most, _longest(WORD, column)) for column in columns]
         parts = _side_by_side(words, room)

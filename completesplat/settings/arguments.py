@@ -20,7 +20,8 @@ ALONE = (
     *("--shell-completion", "-sc", "--config-path", "-cp", "--experimental-rerun"),
 )
 """Hydra's other flags."""
-INFO, CFG = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"), ("job", "hydra", "all")
+INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+CFG = ("job", "hydra", "all")
 CHOICES = {"--info": INFO, "-i": INFO, "--cfg": CFG, "-c": CFG}
 DASHES = (
     "settings are key=value without dashes, such as out=DIR, and files are given by their names: "
@@ -51,7 +52,9 @@ def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     `--export FILE`, which is not Hydra's, becomes the setting `export='FILE'`, and `--key=value` becomes `key=value`,
     because W&B's agents give settings so.
     """
-    flags, others, remaining = [], [], iter(arguments)
+    flags = []
+    others = []
+    remaining = iter(arguments)
     for argument in remaining:
         name, equals, value = argument.partition("=")
         if not name.startswith("-"):
@@ -88,7 +91,8 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
     if verb in WORDS:
         others = _with_words(verb, others)
     elif verb in TASKS and others and "=" not in others[0]:
-        task, words = f"{verb} {others[0]}", others[1:]
+        task = f"{verb} {others[0]}"
+        words = others[1:]
         others = [f"{verb}_task={others[0]}", *(_with_words(task, words) if task in WORDS else words)]
     settings = [_with_file(argument) for argument in others]
     for argument in settings:

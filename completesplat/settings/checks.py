@@ -96,7 +96,8 @@ def part_arguments(config: Container) -> tuple[Mapping[str, object], bool]:
 
 def _origin(config: Container, name: Any, place: str) -> str:
     """Return the setting to which a place refers for its value, or the place itself."""
-    root, raw = config._get_root(), config._get_node(name)
+    root = config._get_root()
+    raw = config._get_node(name)
     while isinstance(raw, Node) and (reference := REFERENCE.fullmatch(str(raw._value()))) is not None:
         place = reference[1]
         above, _, last = place.rpartition(".")

@@ -127,7 +127,8 @@ def _unknown_setting(verb: str, key: str, arguments: Sequence[str]) -> str:
 
 def _nearest(verb: str, key: str, names: Sequence[str]) -> str:
     """Return an ending for a message about an unknown key: settings near its last name, or found by words."""
-    top, last = key.partition(".")[0], key.rpartition(".")[2]
+    top = key.partition(".")[0]
+    last = key.rpartition(".")[2]
     lasts = {name: name.rpartition(".")[2] for name in names}
     known = set(lasts.values())
     close = [last] if last in known else get_close_matches(last, known, cutoff=LEAST_LIKE)

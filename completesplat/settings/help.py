@@ -13,7 +13,8 @@ from completesplat.errors import CompleteSplatError
 from completesplat.settings import options as conf
 from completesplat.settings.schema import VERBS, arguments_of, described, hints_of
 
-WIDTH, COLUMN = 120, 24
+WIDTH = 120
+COLUMN = 24
 REMARK = "the paper"
 FLAGS = ("--help", "-h")
 NEEDED = "???"
@@ -63,7 +64,8 @@ def _body(verb: str, task: str | None) -> Iterator[str]:
 
 def search_page(verb: str, task: str | None, words: Sequence[str]) -> str:
     """Return the help text of the settings that `search_settings` finds; raise CompleteSplatError if there are none."""
-    hints, rows = _hints(verb, task), []
+    hints = _hints(verb, task)
+    rows = []
     for setting, part, option in conf.search_settings(verb, task, words):
         key, text = _part_line(setting, part) if part else _line(setting, hints.get(setting.key), {}, verb)
         rows.append((key, text + option))

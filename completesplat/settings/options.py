@@ -98,7 +98,8 @@ def parse(text: str) -> ConfFile:
 
     root = yaml.compose(text, Loader=LOADER) or yaml.compose("{}", Loader=LOADER)  # an empty file has no root
     entries = {key.value: value for key, value in root.value}
-    choices, bases = [], []
+    choices = []
+    bases = []
     for entry in entries["defaults"].value if "defaults" in entries else []:
         if isinstance(entry, yaml.MappingNode):
             ((name, option),) = entry.value

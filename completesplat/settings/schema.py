@@ -247,7 +247,8 @@ def arguments_of(target: Callable[..., object] | type) -> tuple[dict[str, object
 
 def _named_arguments(function: Callable[..., object]) -> tuple[dict[str, object], bool]:
     """Return annotations of a function's arguments by name, and whether it has a `**` that takes any others."""
-    hints, parameters = hints_of(function), inspect.signature(function).parameters.values()
+    hints = hints_of(function)
+    parameters = inspect.signature(function).parameters.values()
     named = {param.name for param in parameters if param.kind in (param.POSITIONAL_OR_KEYWORD, param.KEYWORD_ONLY)}
     unpacked = hints.keys() - {param.name for param in parameters} - {"return"}
     others = [hints.get(param.name) for param in parameters if param.kind is param.VAR_KEYWORD]
@@ -262,7 +263,8 @@ def start_weights(kind: object) -> Mapping[str, str]:
 
 def violations(annotation: object, value: object) -> list[Violation]:
     """Return the parts of a value that do not fit an annotation, with the reasons."""
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    arguments = typing.get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
         return violations(kind, value) or [Violation("", value, x) for rule in rules if (x := rule.refusal(value))]
@@ -322,7 +324,8 @@ def _in_mapping(annotation: object, value: object) -> list[Violation]:
 
 def described(annotation: object) -> str:
     """Describe the values that an annotation allows in a few words; return an empty text if unknown."""
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    arguments = typing.get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
         ranges = [rule.words() for rule in rules if isinstance(rule, Range)]

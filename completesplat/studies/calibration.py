@@ -82,7 +82,9 @@ def plot_calibration(rows: Sequence[Row], path: Path, title: str) -> None:
     """Write a PNG with three panels for each region: ranks, spread against error, and energy by number of samples."""
     with written_figure(path, title, (13, 0.5 + 3.7 * len(rows))) as figure:
         for (ranks, bins, energy), row in zip(figure.subplots(len(rows), 3, squeeze=False), rows, strict=True):
-            name, count, end = f"novel views, {row['region']}", len(row["ranks"]), 1.05 * max(map(max, row["bins"]))
+            name = f"novel views, {row['region']}"
+            count = len(row["ranks"])
+            end = 1.05 * max(map(max, row["bins"]))
             ranks.bar(range(count), row["ranks"])
             ranks.axhline(1 / count, color="crimson", label="calibrated")
             ranks.set(title=f"{name}: ranks of the truth", xlabel="samples below the truth", ylabel="share of values")

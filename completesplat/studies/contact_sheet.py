@@ -18,8 +18,10 @@ from completesplat.errors import DataError
 from completesplat.export.images import INK, MARGIN, PAPER, SheetCell, image_sheet, write_png
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, project, transform_points
 
-CELL, FEWEST_CELLS = 216, 3  # pixels of an image; the title needs the width of three
-GREY, MASK = (190, 190, 190), (255, 220, 0)
+CELL = 216
+FEWEST_CELLS = 3  # pixels of an image; the title needs the width of three
+GREY = (190, 190, 190)
+MASK = (255, 220, 0)
 CROSS_COLORS = ((220, 30, 30), (20, 150, 20), (40, 80, 255))
 LEGEND = """A cross marks one point of each scene and must stay at it in all frames;
 red: to the first camera's right, green: up, blue: ahead; yellow: mask."""
@@ -28,7 +30,8 @@ red: to the first camera's right, green: up, blue: ahead; yellow: mask."""
 ARM = 0.3
 # Root mean squares. Cameras look at one point if their optical axes spread by at least LEAST_SPREAD and miss it by at
 # most LARGEST_MISS of its depth.
-LEAST_SPREAD, LARGEST_MISS = 0.2, 0.2
+LEAST_SPREAD = 0.2
+LARGEST_MISS = 0.2
 # Parts of lines that are nearer to a camera's plane are not drawn (as a share of an arm's length).
 NEAREST = 0.05
 
@@ -89,7 +92,8 @@ def _common_point(cameras: Cameras) -> Float[Tensor, "3"] | None:
     point = nearest_to_axes(cameras, LEAST_SPREAD**2)
     if point is None:
         return None
-    forward, point = cameras.world_to_camera[:, 2, :3], point.to(cameras.centers)
+    forward = cameras.world_to_camera[:, 2, :3]
+    point = point.to(cameras.centers)
     depths = ((point - cameras.centers) * forward).sum(dim=-1)
     misses = (point - cameras.centers - depths[:, None] * forward).square().sum(dim=-1)
     met = (depths > 0).all() and misses.mean().sqrt() < LARGEST_MISS * depths.mean()
@@ -113,7 +117,8 @@ def _row(sequence: PosedSequence, images: int) -> Image.Image:
     cells: list[SheetCell | None] = [_image_cell(sequence, index, cross) for index in chosen]
     width = max(images, FEWEST_CELLS)
     cells += [None] * (width - len(chosen))
-    (near, far), (focal, *_) = sequence.depth_ranges[0].tolist(), sequence.cameras.intrinsics[0, 0].tolist()
+    near, far = sequence.depth_ranges[0].tolist()
+    focal, *_ = sequence.cameras.intrinsics[0, 0].tolist()
     fov = math.degrees(2 * math.atan(sequence.cameras.image_size[1] / 2 / focal))
     numbers = f"{len(sequence.frames)} cameras, field of view {fov:.1f}°, near {near:.3g}, far {far:.3g}"
     return image_sheet([f"{sequence.name}: {numbers}", *[""] * (width - 1)], [cells])
@@ -129,7 +134,8 @@ def _image_cell(sequence: PosedSequence, index: int, cross: Cross) -> SheetCell:
         ImageDraw.Draw(cell).text((MARGIN, CELL // 2), error.kind, INK, label_font(12))
         return SheetCell(_tensor(cell), label)
     cell = _with_outline(frame)
-    camera, draw = sequence.cameras[index], ImageDraw.Draw(cell)
+    camera = sequence.cameras[index]
+    draw = ImageDraw.Draw(cell)
     nearest = NEAREST * cross.arms.norm(dim=-1)[0].item()
     arms = visible_segments(camera, cross.ends(), nearest)
     for arm, ends in arms:

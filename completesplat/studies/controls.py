@@ -41,7 +41,8 @@ def controls_rows(
 
     def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> Row:
         images = renderer(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
-        reference, targets = scene.reference, scene.targets[0]
+        reference = scene.reference
+        targets = scene.targets[0]
         seen = near_reference(reference.cameras[0], targets.cameras, near_degrees)
         return {
             "reference_psnr": psnr(images[:, 0], reference.images.expand_as(images[:, 0])).mean().item(),
@@ -100,7 +101,8 @@ def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> 
                     panel.annotate(f"{weight:g}", (x, y), (4, -9), textcoords="offset points", fontsize=7, color="0.35")
             for row in drawn:
                 if row["paper"]:
-                    place, name = (row["diversity"], row[key]), f"({row['skip_weight']:g}, {row['guidance_weight']:g})"
+                    place = (row["diversity"], row[key])
+                    name = f"({row['skip_weight']:g}, {row['guidance_weight']:g})"
                     panel.plot(*place, "o", markersize=13, fillstyle="none", color="crimson")
                     panel.annotate(name, place, (9, 9), textcoords="offset points", color="crimson")
             panel.set(xlabel="diversity: difference of two samples in novel views (RMS)", ylabel=label)

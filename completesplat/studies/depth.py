@@ -43,7 +43,8 @@ def depth_rows(
 
 def deviations(depth: Float[Tensor, "sample view 1 height width"], scene: SceneBatch, far_degrees: float) -> Row:
     """Return the figures of `depth_rows` for one scene (a batch of one), given depths of all its views."""
-    maps, masks = deviation(depth), scene.all_views().masks[0]
+    maps = deviation(depth)
+    masks = scene.all_views().masks[0]
     far = 1 + torch.nonzero(~near_reference(scene.reference.cameras[0], scene.targets.cameras[0], far_degrees))[:, 0]
     figures: Row = {}
     for name, views in (("reference", far.new_zeros(1)), ("far", far)):
@@ -71,8 +72,10 @@ def depth_strips(
     rows = []
     for scene in scenes:
         rendering = renderer.render(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
-        far, true = farthest(scene), scene.all_views()
-        depth, images = rendering.surface_depth(), renderer.over_background(rendering)[:, far]
+        far = farthest(scene)
+        true = scene.all_views()
+        depth = rendering.surface_depth()
+        images = renderer.over_background(rendering)[:, far]
         depths, (nearest, deepest) = color_depth(depth[:shown, far])
         normals = color_normals(normals_from_depth(depth[:shown, far], true.cameras[0, far]))
         row = strip(true.images[0, [0, far]], f"{scene.names[0]}: input, far view")

@@ -19,7 +19,9 @@ Rows = list[dict[str, str | float | None]]
 BEHIND = 100.0  # degrees between the optical axes of a view from behind and of the reference
 VIEWS_OF_A_STEP = 8
 # Learning rates of Adam.
-RAW_RATE, DECODER_RATE, LATENT_RATE = 0.03, 2e-3, 0.1
+RAW_RATE = 0.03
+DECODER_RATE = 2e-3
+LATENT_RATE = 0.1
 
 
 def ladder_rows(renderer: SampleRenderer, scenes: Scenes, fits: int, tick: OnProgress) -> Rows:
@@ -40,12 +42,15 @@ def ladder_rows(renderer: SampleRenderer, scenes: Scenes, fits: int, tick: OnPro
 
 def _rungs(renderer: SampleRenderer, scene: SceneBatch, fits: int) -> Iterator[tuple[str, Gaussians]]:
     """Yield the name and the Gaussians [sample] of each rung of one scene (a batch of one)."""
-    stage1, inputs = renderer.model.autoreconstructor, (scene.reference.cameras, scene.depth_range)
-    images, views = scene.reference.images, scene.all_views()
+    stage1 = renderer.model.autoreconstructor
+    inputs = (scene.reference.cameras, scene.depth_range)
+    images = scene.reference.images
+    views = scene.all_views()
     with torch.no_grad():
         alone, features = stage1.posterior(images)
         seeing, _ = stage1.posterior(images, views, scene.depth_range)
-    latent, decoder = seeing.mode(), deepcopy(stage1.reconstructor).requires_grad_()
+    latent = seeing.mode()
+    decoder = deepcopy(stage1.reconstructor).requires_grad_()
     start = stage1.reconstructor(latent, features).map(Tensor.detach)
     free_raw, free_latent = (tensor.clone().requires_grad_() for tensor in (start.raw, latent))
 

@@ -95,7 +95,8 @@ def predictors(module: Scorer, samples: int, batch: int) -> dict[str, Predictor]
         methods |= decoding_methods(network, samples, batch, getattr(module, "masked", False))
 
     def render(method: Method, scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
-        gaussians, cameras = method(scene, other, seed), scene.targets.cameras[0]
+        gaussians = method(scene, other, seed)
+        cameras = scene.targets.cameras[0]
         parts = [gaussians[i : i + batch] for i in range(0, len(gaussians.means), batch)]
         renders = torch.cat([module.render_from(part, cameras).over(module.background) for part in parts])
         return renders.clamp(0, 1).expand(samples, -1, -1, -1, -1)
@@ -121,19 +122,23 @@ class ModeMeasurements:
 
     def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
         """Add the scores of renders of the views that show the modes."""
-        pixels, modes = region_pixels(images, scene.region), region_pixels(scene.truths, scene.region)
+        pixels = region_pixels(images, scene.region)
+        modes = region_pixels(scene.truths, scene.region)
         figures: dict[str, float | None] = dict(scores(pixels, modes, scene.probabilities))
         alike = self.classes.setdefault(method, {}).setdefault(tuple(scene.probabilities.tolist()), [])
         alike.append(classify(pixels, modes, scene.probabilities))
-        unseen, truth = scene.unseen[list(scene.views)], scene.truths[scene.true_mode]
+        unseen = scene.unseen[list(scene.views)]
+        truth = scene.truths[scene.true_mode]
         for name, region in zip(REGIONS, (unseen, ~unseen), strict=True):
-            drawn, true = (region_pixels(images, region).flatten(1), region_pixels(truth[None], region)[0].flatten())
+            drawn = region_pixels(images, region).flatten(1)
+            true = region_pixels(truth[None], region)[0].flatten()
             figures[f"energy_{name}"] = energy_score(drawn, true) if region.any() else None
         self.scores.setdefault(method, []).append(figures)
 
     def show(self, images: Renders, scene: HiddenModes, count: int) -> None:
         """Keep the input, every mode, and some samples with their modes, in the view that shows the modes best."""
-        pixels, modes = region_pixels(images[:count], scene.region), region_pixels(scene.truths, scene.region)
+        pixels = region_pixels(images[:count], scene.region)
+        modes = region_pixels(scene.truths, scene.region)
         labels = [f"{name} (true)" if mode == scene.true_mode else name for mode, name in enumerate(scene.modes)]
         classes = classify(pixels, modes, scene.probabilities).tolist()
         labels += ["rejected" if mode == REJECTED else scene.modes[mode] for mode in classes]
@@ -156,7 +161,8 @@ class ModeMeasurements:
         rows: dict[str, list[dict[str, object]]] = {}
         for method, kinds in self.classes.items():
             for probabilities, parts in kinds.items():
-                classes, p = torch.cat(parts), torch.tensor(probabilities)
+                classes = torch.cat(parts)
+                p = torch.tensor(probabilities)
                 counts = torch.stack([(classes == mode).sum() for mode in range(len(p))])
                 shares = counts / counts.sum().clamp(min=1)
                 row = {
@@ -209,7 +215,8 @@ def measure(
 
 def usable_scenes(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenModes], list[str]]:
     """Return the usable ones of the first `count` scenes (None: all), and the reasons why others are not."""
-    selected, skipped = [], []
+    selected = []
+    skipped = []
     for index in range(len(scenes) if count is None else min(count, len(scenes))):
         try:
             selected.append(scenes[index])

@@ -68,7 +68,8 @@ def show_statistics(results: dict[str, Any]) -> None:
 
 
 def _measure(sequence: PosedSequence) -> Row:
-    cameras, count = sequence.cameras, float(len(sequence.frames))
+    cameras = sequence.cameras
+    count = float(len(sequence.frames))
     extent = _largest_distance(cameras.centers)
     # Half the angle from the length of the chord, because the arc cosine is inaccurate for small angles.
     chord = _largest_distance(cameras.world_to_camera[:, 2, :3])
@@ -92,7 +93,8 @@ def _range(values: Float[Tensor, " _"]) -> tuple[float, float, float]:
 
 def _fields_of_view(intrinsics: Float[Tensor, "view 3 3"], width: int) -> Float[Tensor, " view"]:
     """Return the horizontal angles in degrees between the left and the right edge."""
-    focal, center = intrinsics[:, 0, 0], intrinsics[:, 0, 2]
+    focal = intrinsics[:, 0, 0]
+    center = intrinsics[:, 0, 2]
     return (torch.atan(center / focal) + torch.atan((width - center) / focal)).rad2deg()
 
 
@@ -120,7 +122,8 @@ def _histogram(key: str, rows: dict[str, list[Row]]) -> dict[str, Any]:
     else:
         low, high = (together.min(), together.max()) if len(together) else (0.0, 1.0)
         if high - low <= SMALLEST_SPAN * high:
-            low, high = 0.5 * low, 1.5 * high or 1.0
+            low = 0.5 * low
+            high = 1.5 * high or 1.0
         edges = np.linspace(low, high, BINS + 1)
     counts = {split: np.histogram(members, edges)[0].tolist() for split, members in values.items()}
     return {"edges": edges.tolist(), "counts": counts}

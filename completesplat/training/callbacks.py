@@ -73,7 +73,8 @@ class BadSteps(Callback):
         return {"total": self.total, "in_a_row": self.in_a_row}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        self.total, self.in_a_row = state_dict["total"], state_dict["in_a_row"]
+        self.total = state_dict["total"]
+        self.in_a_row = state_dict["in_a_row"]
 
     def on_before_backward(self, trainer: Trainer, pl_module: LightningModule, loss: Tensor) -> None:
         self.losses.append(loss.detach())  # several losses if gradients are accumulated
@@ -101,12 +102,14 @@ class BadSteps(Callback):
         pl_module.log(BAD_STEPS, torch.tensor(float(self.total)), batch_size=1)
 
     def _count(self, bad: bool) -> bool:
-        self.total, self.in_a_row = self.total + bad, (self.in_a_row + 1) * bad
+        self.total += bad
+        self.in_a_row = (self.in_a_row + 1) * bad
         return bad
 
     def _count_last(self) -> None:
         if self.last is not None:
-            (bad, computed), self.last = self.last, None
+            bad, computed = self.last
+            self.last = None
             computed.synchronize()
             self._count(bool(bad))
 
@@ -268,7 +271,8 @@ class Throughput(Callback):
         if self.begun is not None:
             self.batches.append(self.ended - self.begun)
             self.scenes += len(batch.names)
-        stepped, self.step = trainer.global_step != self.step, trainer.global_step
+        stepped = trainer.global_step != self.step
+        self.step = trainer.global_step
         interval = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if not stepped or not interval or trainer.global_step % interval or not self.batches:
             return

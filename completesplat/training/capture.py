@@ -129,9 +129,11 @@ class CaptureFit(Stage):
         sequence = self.sequence("train")
         if self.count:
             return
-        generator, settings = torch.Generator().manual_seed(0), self.fitting
+        generator = torch.Generator().manual_seed(0)
+        settings = self.fitting
         scene = stack([self.data.store("train").scene(sequence, 0, range(1, len(sequence.frames)))]).to(self.device)
-        views, most = self.in_world(scene, "train"), min(settings.initial, settings.most)
+        views = self.in_world(scene, "train")
+        most = min(settings.initial, settings.most)
         if sequence.points is None or len(sequence.points) <= fitting.NEIGHBOURS:
             points = fitting.initial_gaussians(views, scene.depth_range, most, settings.opacity, generator).means[0]
         else:
@@ -144,11 +146,14 @@ class CaptureFit(Stage):
     def on_train_batch_start(self, batch: Batch, index: int) -> None:
         """Move dead Gaussians, add new ones, and disturb transparent ones, before all steps but the first."""
         super().on_train_batch_start(batch, index)
-        step, total, settings = self.global_step, self.trainer.estimated_stepping_batches, self.fitting
+        step = self.global_step
+        total = self.trainer.estimated_stepping_batches
+        settings = self.fitting
         if step == 0 or index % self.trainer.accumulate_grad_batches:
             return
         (optimizer,) = self.trainer.optimizers
-        count, rate = int(self.count), optimizer.param_groups[0]["lr"] / settings.position_rate
+        count = int(self.count)
+        rate = optimizer.param_groups[0]["lr"] / settings.position_rate
         self.raw["means"][:count] += fitting.position_noise(self.gaussians(), rate)
         if step % settings.refine_every == 0 and step < REFINED_SHARE * total:
             grown = max(count, min(settings.most, int(count * (1 + settings.growth))))
@@ -159,7 +164,9 @@ class CaptureFit(Stage):
             self.count.fill_(grown if len(changed) else count)
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
-        gaussians, views, settings = self.gaussians(), self.in_world(scenes, "train"), self.fitting
+        gaussians = self.gaussians()
+        views = self.in_world(scenes, "train")
+        settings = self.fitting
         images = self.render(gaussians[None], views.cameras)
         total, terms = self.loss(Prediction(images, gaussians[None], None), views, self.global_step)
         total = total + settings.opacity_weight * gaussians.opacities.mean()
@@ -171,7 +178,8 @@ class CaptureFit(Stage):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Build Adam with 3DGS's rates and epsilon; the rate of the positions decays to a hundredth."""
-        depth_ranges, settings = self.sequence("train").depth_ranges, self.fitting
+        depth_ranges = self.sequence("train").depth_ranges
+        settings = self.fitting
         rates = settings.position_rate, settings.opacity_rate, settings.other_rates
         optimizer = fitting.adam(dict(self.raw.items()), depth_ranges, *rates)
         steps = max(1, self.trainer.estimated_stepping_batches)
@@ -185,13 +193,15 @@ class CaptureFit(Stage):
     def on_test_start(self) -> None:
         """Note for tables what the Gaussians were fitted to."""
         fitted, held_out = (self.sequence(split).photos for split in ("train", "test"))
-        photos, rule = len(fitted) + len(held_out), self.data.describe()["split"]
+        photos = len(fitted) + len(held_out)
+        rule = self.data.describe()["split"]
         self.fitted_to = f"{len(fitted)} of {photos} photos; {rule}: {', '.join(held_out)}"
         super().on_test_start()
 
     def test_results(self) -> dict[str, dict[str, Any]]:
         """Return the scores, with the names of the photos; warn if the photos' mean scores as well."""
-        results, parts = super().test_results(), {"fitted": "train", "held_out": "test"}
+        results = super().test_results()
+        parts = {"fitted": "train", "held_out": "test"}
         results["model"]["photos"] = {part: list(self.sequence(split).photos) for part, split in parts.items()}
         fitted, mean = (results[name]["full"]["novel"].get("psnr", math.nan) for name in ("model", "mean_image"))
         if fitted <= mean:
@@ -203,14 +213,19 @@ class CaptureFit(Stage):
         """Write the scene, the held-out frames beside their renders, videos and other formats."""
         if self.scene_folder is None:
             return
-        sequence, scene, wanted = self.sequence("test"), self.gaussians().detach(), self.wanted
+        sequence = self.sequence("test")
+        scene = self.gaussians().detach()
+        wanted = self.wanted
         poses = cameras.world_to_camera @ sequence.cameras.world_to_camera[0].to(cameras.world_to_camera)
-        placed, up = replace(cameras, world_to_camera=poses), normalize(-poses[:, 1, :3].mean(0), dim=-1)
+        placed = replace(cameras, world_to_camera=poses)
+        up = normalize(-poses[:, 1, :3].mean(0), dim=-1)
         self.scene_folder.mkdir(parents=True, exist_ok=True)
         reference, targets = self.data.evaluation_views(sequence, "test")
         photos = tuple(sequence.photos[index] for index in (reference, *targets))
         shot = Shot(scene, placed[0], up, FileUnits(sequence.scale, sequence.origin), photos)
-        files, comments, on_file = dict[str, str](), [f"scene {name}"], partial(logger.info, "writing %s")
+        files = dict[str, str]()
+        comments = [f"scene {name}"]
+        on_file = partial(logger.info, "writing %s")
         for part in (replace(wanted, formats=()), *(replace(wanted, formats=[x], videos=()) for x in wanted.formats)):
             try:
                 files |= write_scene(self.scene_folder, "scene", "", shot, self.rasterizer, part, comments, on_file)[-1]

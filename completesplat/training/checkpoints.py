@@ -24,7 +24,8 @@ from completesplat.training.loggers import ContinuedCSVLogger
 from completesplat.training.stopping import agreed_signal, end_training
 from completesplat.weights.checkpoint_reading import check_whole, not_finite, read_checkpoint
 
-LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
+LAST = "last.ckpt"
+PREVIOUS = "previous.ckpt"
 FIGURES = "figures"
 
 logger = logging.getLogger(__name__)
@@ -97,14 +98,16 @@ class Checkpoints(Checkpoint):
             for own in trainer.checkpoint_callbacks:  # folders that a user gave to Lightning's own callback
                 Path(getattr(own, "dirpath", None) or self.folder.parent).mkdir(parents=True, exist_ok=True)
             make_folder(self.folder)  # only here: a run whose folder is removed must not go on
-            begun, last = Path(trainer.ckpt_path or ""), self.folder / LAST
+            begun = Path(trainer.ckpt_path or "")
+            last = self.folder / LAST
             if begun != last and begun.parent == self.folder:
                 link(begun, last)  # replace a damaged file, which must not become `previous.ckpt`
         keep_signals(True)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
         # Several batches share an optimizer step if gradients are accumulated; checkpoints lack accumulated gradients.
-        stepped, self.step = trainer.global_step != self.step, trainer.global_step
+        stepped = trainer.global_step != self.step
+        self.step = trainer.global_step
         if stepped:
             self.end_of_step = {"epoch": trainer.current_epoch, "fit_loop": deepcopy(trainer.fit_loop.state_dict())}
             self.signal = agreed_signal(trainer)

@@ -48,7 +48,8 @@ def fingerprint(module: nn.Module) -> str:
 
 def fingerprints(model: VariationalAutoReconstructor, conditioning: nn.Module | None) -> tuple[str, str | None]:
     """Return the fingerprint of all weights that latents depend on, and that of a frozen conditioning, else None."""
-    encoder, views = model.encoder, model.view_encoder
+    encoder = model.encoder
+    views = model.view_encoder
     latents = fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
     return latents, fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
 
@@ -96,7 +97,8 @@ class FrameEncoder:
     @torch.no_grad()
     def __call__(self, scenes: SceneBatch) -> Rows:
         """Encode the reference images of scenes; return the rows "mean", "log_variance" and "condition"."""
-        scenes, network = scenes.to(self.device), self.autoreconstructor
+        scenes = scenes.to(self.device)
+        network = self.autoreconstructor
         images = scenes.reference.images
         views = scenes.all_views() if network.sees_views else None
         posterior, _ = network.posterior(images, views, scenes.depth_range)
@@ -111,14 +113,17 @@ class FrameEncoder:
     def origin(self, data: SceneDataModule, frames: int | None, views: int) -> Origin:
         """Return what determines the content of a cache of the training data."""
         encoder, features = fingerprints(self.autoreconstructor, self.conditioning)
-        fingerprint, settings = data.source("train").fingerprint(), data.packed_settings()
+        fingerprint = data.source("train").fingerprint()
+        settings = data.packed_settings()
         return Origin(encoder, features, fingerprint, settings, data.image_size, frames, views, self.precision)
 
 
 def moment_sums(mean: Moments, log_variance: Moments) -> Sums:
     """Return each channel's number of elements and expected sums of h and h^2, in float64, without sampling h."""
-    mean, variance = mean.astype(np.float64), np.exp(log_variance.astype(np.float64))
-    total, squares = mean.sum((0, 2, 3)), (np.square(mean) + variance).sum((0, 2, 3))
+    mean = mean.astype(np.float64)
+    variance = np.exp(log_variance.astype(np.float64))
+    total = mean.sum((0, 2, 3))
+    squares = (np.square(mean) + variance).sum((0, 2, 3))
     return np.stack([np.full_like(total, mean[:, 0].size), total, squares])
 
 
@@ -232,7 +237,8 @@ def _encoded_batches(
 
 def _check_space(frames: int, sequences: int, bytes_per_frame: int, out: Path) -> None:
     """Log the size of the future store; raise DataError if the disk has less space."""
-    size, free = frames * bytes_per_frame, shutil.disk_usage(out).free
+    size = frames * bytes_per_frame
+    free = shutil.disk_usage(out).free
     contents = f"{counted(frames, 'frame')} of {counted(sequences, 'sequence')}"
     needed = f"about {decimal(size)} for {contents}; {decimal(free)} are free"
     if size > free:

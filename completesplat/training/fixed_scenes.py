@@ -150,7 +150,8 @@ def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBat
     make_folder(folder)
     entries = []
     for index, name in enumerate(scenes.names):
-        scene, camera = gaussians[index].to("cpu", torch.float32), scenes.reference.cameras[index].to("cpu")
+        scene = gaussians[index].to("cpu", torch.float32)
+        camera = scenes.reference.cameras[index].to("cpu")
         selected = scene[storable(scene)]
         if selected.count:
             file = f"scene_{index}.ply"
@@ -195,7 +196,8 @@ def layer_figures(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, float]:
     Keys are `layers/opacity_1`, ... and `layers/behind_2`, ... (in scene units along the reference's optical axis). A
     layer whose opacity goes to zero is dead: it adds no hidden surfaces.
     """
-    size, on_object = scenes.reference.images.shape[-2:], scenes.reference.masks[:, 0]
+    size = scenes.reference.images.shape[-2:]
+    on_object = scenes.reference.masks[:, 0]
     if gaussians.count % size.numel():
         return {}  # no layers, but Gaussians that were fitted to a capture
     layers = gaussians.map(lambda tensor: tensor.view(len(tensor), -1, *size, *tensor.shape[2:]))  # by pixels
@@ -263,7 +265,8 @@ class SceneDrawings:
     depth: Float[Tensor, "1 view 1 height width"]
 
     def scores(self) -> dict[str, float]:
-        images, true = self.samples[:, 1:], self.true[1:]
+        images = self.samples[:, 1:]
+        true = self.true[1:]
         scores = {
             "psnr": psnr(images.flatten(0, 1), true.expand_as(images).flatten(0, 1)).mean().item(),
             "psnr_of_mean": psnr(images.mean(0), true).mean().item(),

@@ -35,7 +35,9 @@ class DiffusionScorer(Scorer):
     """
 
     draws_samples = True
-    skip_weight, guidance_weight, color_fits = 1.0, 0.0, 0
+    skip_weight = 1.0
+    guidance_weight = 0.0
+    color_fits = 0
 
     def __init__(self, completesplat: CompleteSplat, **rendering: Any) -> None:
         super().__init__(**rendering)
@@ -143,7 +145,8 @@ class LatentDiffusion(DiffusionScorer, Stage):
         """
         if self.checkpoint is None and self.trainer.ckpt_path is None:
             self._refuse_random_parts()
-        parts, data = self.completesplat, self.data
+        parts = self.completesplat
+        data = self.data
         cache = None if data.latent_cache is None else data.cached_latents
         if cache is not None:
             check_cache(cache, parts.autoreconstructor, parts.conditioning)
@@ -188,7 +191,8 @@ class LatentDiffusion(DiffusionScorer, Stage):
                 )
             drawn.append(latent.cpu().double())
         latents = torch.cat(gather_values(torch.cat(drawn) if drawn else torch.zeros(1, 1, 1, 1)))
-        mean, std = latents.mean((0, 2, 3)), latents.std((0, 2, 3), correction=0)
+        mean = latents.mean((0, 2, 3))
+        std = latents.std((0, 2, 3), correction=0)
         if not (std > 0).all():
             raise CompleteSplatError("the latents do not vary: no training images, or an encoder that ignores them")
         moments = (mean.tolist(), std.tolist()) if cache is None else (cache.mean, cache.std)

@@ -64,7 +64,8 @@ class MetricsFile(ExperimentWriter):
         """
         if not self.metrics:
             return
-        new, text = set().union(*self.metrics) - set(self.metrics_keys), io.StringIO(newline="")
+        new = set().union(*self.metrics) - set(self.metrics_keys)
+        text = io.StringIO(newline="")
         if new or not self.begun:
             old = self._rows_to_keep()
             self.metrics_keys = sorted(new.union(self.metrics_keys, *old))
@@ -76,7 +77,8 @@ class MetricsFile(ExperimentWriter):
             csv.DictWriter(text, self.metrics_keys).writerows(self.metrics)
             with writing(self.path), self.path.open("a", newline="") as file:
                 file.write(text.getvalue())
-        self.metrics, self.begun = [], True
+        self.metrics = []
+        self.begun = True
 
     def _rows_to_keep(self) -> list[dict[str, str]]:
         if not self.path.is_file():

@@ -60,7 +60,8 @@ class PerScene(Scorer):
         """Write the scene, or log a warning if it has nothing that can be written."""
         if self.scenes_folder is None:
             return
-        folder, seed = self.scenes_folder / safe_name(name), self.evaluation.scene_seed(name)
+        folder = self.scenes_folder / safe_name(name)
+        seed = self.evaluation.scene_seed(name)
         try:
             make_folder(self.scenes_folder)
             make_folder(folder)
@@ -71,7 +72,8 @@ class PerScene(Scorer):
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Fit each scene to its reference and all its targets."""
-        views, settings = scenes.all_views(), (self.background, self.loss, self.fitting)
+        views = scenes.all_views()
+        settings = (self.background, self.loss, self.fitting)
         generator = torch.Generator().manual_seed(seed)
         with torch.autocast(self.device.type, enabled=False):
             return fit_gaussians(views, scenes.depth_range, self.rasterizer, *settings, generator)
@@ -95,7 +97,8 @@ class Preoptimized(PerScene):
 
     def splatter_image(self, scenes: SceneBatch, seed: int = 0) -> SplatterImage:
         """Return each scene's fitted Gaussians in the pixels of its reference view."""
-        gaussians, cameras = self.fitted(scenes, seed), scenes.reference.cameras
+        gaussians = self.fitted(scenes, seed)
+        cameras = scenes.reference.cameras
         image, empty = project_to_splatter_image(gaussians, cameras, scenes.depth_range, self.parameterization)
         self._empty |= dict(zip(scenes.names, empty.float().mean(dim=(1, 2)).tolist(), strict=True))
         return image

@@ -219,7 +219,8 @@ class ReconstructorOnly(ReconstructionModule):
     def setup(self, stage: str) -> None:
         """Allocate a code for each training image, unless a checkpoint has codes."""
         if stage == "fit" and not len(self.model.codes):
-            source, frames = self.data.source("train"), 0
+            source = self.data.source("train")
+            frames = 0
             for name in source.names:
                 with suppress(DataError):
                     frames += len(source.read(name).frames)

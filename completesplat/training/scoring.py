@@ -35,7 +35,8 @@ from completesplat.weights import sha256_of
 
 Result = TypeVar("Result")
 Renders = Float[Tensor, "batch view 3 height width"]
-FILES, LEAST_IN_FRONT = "sample_*.ply", 0.1  # of a scene's Gaussians: with less, the axes are wrong
+FILES = "sample_*.ply"
+LEAST_IN_FRONT = 0.1  # of a scene's Gaussians: with less, the axes are wrong
 FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 
 
@@ -132,11 +133,13 @@ class Scorer(LightningModule):
             self.evaluation.missing["mean_image"] = "missing: these data have no training images"
 
     def test_step(self, scenes: SceneBatch, index: int) -> None:
-        evaluation, names = self.evaluation, scenes.names
+        evaluation = self.evaluation
+        names = scenes.names
         seen = scenes if scenes.seen is None else scenes.seen
         seeds = [evaluation.scene_seed(name) for name in names]
         gaussians = self.timed("inference", lambda: self.draw(seen, seeds, evaluation.samples), len(names))
-        truth, cameras = scenes.all_views(), seen.all_views().cameras
+        truth = scenes.all_views()
+        cameras = seen.all_views().cameras
         for b, name in enumerate(names):
             samples = gaussians[b * evaluation.samples : (b + 1) * evaluation.samples]
             rendered = self.timed("rendering", partial(self.render_from, samples, cameras[b]), evaluation.samples)
@@ -215,7 +218,10 @@ class SceneFiles(Scorer):
 
     def __init__(self, folder: str, frame: str, align: str, name: str | None, **rendering: Any) -> None:
         super().__init__(**rendering)
-        self.folder, self.frame, self.align, self.name = Path(folder), frame, align, name
+        self.folder = Path(folder)
+        self.frame = frame
+        self.align = align
+        self.name = name
         self.files: dict[str, list[Path]] = {}
         if not self.folder.is_dir():
             raise CompleteSplatError(f"scenes={folder}: no such folder; give one with SCENE/{FILES}")
@@ -230,7 +236,8 @@ class SceneFiles(Scorer):
         folders = {scene: self.folder / safe_name(scene) for scene in scenes}
         self.files = {scene: sorted(folder.glob(FILES), key=by_numbers)[:samples] for scene, folder in folders.items()}
         if incomplete := [scene for scene, paths in self.files.items() if len(paths) < samples]:
-            folder, count = folders[incomplete[0]], len(self.files[incomplete[0]])
+            folder = folders[incomplete[0]]
+            count = len(self.files[incomplete[0]])
             present = f"{count} files {FILES}" if folder.is_dir() else "no such folder"
             needed = f"{samples} files are needed ({len(incomplete)} of {len(scenes)} scenes have too few)"
             raise CompleteSplatError(f"{folder}: {present}, {needed}; write them, or score fewer samples")
@@ -250,7 +257,8 @@ class SceneFiles(Scorer):
 
     def _read(self, scene: SceneBatch, samples: int) -> list[Gaussians]:
         """Read one scene's samples and place them in the reference camera's frame, in the data's units."""
-        sets, paths = [], self.files[str(scene.names)][:samples]
+        sets = []
+        paths = self.files[str(scene.names)][:samples]
         for path in paths:
             gaussians = read_gaussians(path)
             if not gaussians.count:

@@ -148,7 +148,8 @@ class Stage(Scorer):
 
         Lightning divides each batch's loss, a mean over its scenes, by the number of batches in a complete group.
         """
-        counts, batches = self.accumulated, self.trainer.accumulate_grad_batches
+        counts = self.accumulated
+        batches = self.trainer.accumulate_grad_batches
         super().backward(loss * (counts[-1] / counts[0]), *args, **kwargs)
         factor = batches * counts[0] / sum(counts)
         if factor != 1 and (len(counts) == batches or self.trainer.is_last_batch):
@@ -161,7 +162,8 @@ class Stage(Scorer):
 
         Fused optimizers in bfloat16, too, which Lightning refuses without loss scaling.
         """
-        norm, self.gradient_norm = self.gradient_norm, None
+        norm = self.gradient_norm
+        self.gradient_norm = None
         if norm is not None and gradient_clip_val and gradient_clip_algorithm in (None, "norm"):
             return torch.nn.utils.clip_grads_with_norm_(self.parameters(), gradient_clip_val, norm)
         precision = self.trainer.precision_plugin

@@ -150,7 +150,8 @@ class LiveMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
     def during(self, work: Callable[[], T]) -> tuple[T, int, list[Operation]]:
         """Do some work; return its result, the maximum meanwhile, and its operations."""
-        self.peak, self.operations = self.bytes, []
+        self.peak = self.bytes
+        self.operations = []
         return work(), self.peak, self.operations
 
 
@@ -159,7 +160,8 @@ class _Store(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, floats: tuple[int, int], cameras: Cameras, *gaussians: Tensor) -> Tensor:
-        new, views = gaussians[0].new_empty, cameras.world_to_camera.shape[1]
+        new = gaussians[0].new_empty
+        views = cameras.world_to_camera.shape[1]
         shape = (len(gaussians[0]), views, gaussians[0].shape[1])
         image = new(*shape[:2], 5, *cameras.image_size)
         ctx.shape = (*shape, floats[1])
@@ -222,7 +224,8 @@ def count_step(
             normalize_in_float32(module)
         if isinstance(module, ReconstructionModule):
             module.draw_others = lambda targets: targets - 1  # type: ignore[method-assign]
-        weights, latent_bytes = live.bytes, None
+        weights = live.bytes
+        latent_bytes = None
         inputs: Batch = synthetic_batch(image_size, batch, targets)
         if isinstance(module, LatentDiffusion) and isinstance(inputs, SceneBatch):
             encoded = with_latents(module, inputs)  # rows of a cache are in float32 with a checksum, images in bytes
@@ -273,7 +276,8 @@ def fake_tensors() -> Iterator[None]:
 @torch.no_grad()
 def with_latents(module: LatentDiffusion, scenes: SceneBatch) -> CachedScene:
     """Return the scenes as a latent cache would give them."""
-    parts, images = module.completesplat, scenes.reference.images
+    parts = module.completesplat
+    images = scenes.reference.images
     latent = torch.zeros_like(module.inputs(scenes)[0])
     condition = parts.conditioning(images) if parts.conditioning.frozen else images
     return CachedScene(latent, latent.clone(), condition, scenes.reference_frame, scenes.names)

@@ -22,7 +22,8 @@ from lightning.pytorch.strategies.launchers import subprocess_script as launcher
 from completesplat import signals
 from completesplat.signals import Interrupted
 
-LOOK_SECONDS, GRACE_SECONDS = 0.5, 5.0
+LOOK_SECONDS = 0.5
+GRACE_SECONDS = 5.0
 """Interval at which a process checks its child processes, and their time to end by themselves."""
 LAUNCHERS: tuple[Any, ...] = (launcher_of_fabric, launcher_of_trainers)
 

@@ -23,7 +23,8 @@ from websockets.http11 import Request, Response
 
 from completesplat.errors import CompleteSplatError
 
-TITLE, LOADING = "completesplat", "loading the model or scene"
+TITLE = "completesplat"
+LOADING = "loading the model or scene"
 HEAD = Path(__file__).with_name("head.html")
 
 HOST = "127.0.0.1"

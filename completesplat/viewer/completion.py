@@ -26,7 +26,8 @@ class Completion:
     """Controls that complete a photo, added to a page; the model runs only in the page's worker."""
 
     def __init__(self, page: Page, model: SceneModel, start: dict[str, Any]) -> None:
-        self.page, self.model = page, model
+        self.page = page
+        self.model = model
         self.photograph: tuple[str, Photograph] | None = None
         self.controls = add_drawing(page.server.gui, model, start)
         page.complete = self.complete
@@ -68,13 +69,16 @@ class Completion:
     def _draw(self, name: str, photograph: Photograph, settings: dict[str, Any]) -> None:
         """Draw samples in the worker's thread, and show them while they form."""
         began = time.monotonic()
-        progress, forming = self.controls.progress, self.controls.forming.value
-        before, up = self.page.view.samples, self.model.up.tolist()
+        progress = self.controls.progress
+        forming = self.controls.forming.value
+        before = self.page.view.samples
+        up = self.model.up.tolist()
         earlier = [sample for sample in before if sample.finished] if self.controls.keep.value else []
         if self.page.view.up.tolist() != up:  # that of a scene which was opened meanwhile
             self.page.view.set_up(up)
         layers = self.model.parameterization.layers
-        reference, last_shown = self.model.camera(photograph).to("cpu"), 0.0
+        reference = self.model.camera(photograph).to("cpu")
+        last_shown = 0.0
 
         def arranged(scenes: Sequence[Gaussians], finished: bool) -> list[Sample]:
             """Return the earlier samples and then the new ones, without the first ones if there are too many."""
@@ -93,7 +97,9 @@ class Completion:
                 last_shown = time.monotonic()
 
         show_status(self.page.server, f"drawing from {name}")
-        progress.animated, progress.visible, progress.value = not forming, True, 0.0 if forming else 100.0
+        progress.animated = not forming
+        progress.visible = True
+        progress.value = 0.0 if forming else 100.0
         try:
             scenes = self.model(photograph, on_step=formed if forming else None, **settings)
             self.page.show(arranged(scenes, finished=True), f"{len(scenes)} drawn in {time.monotonic() - began:.1f} s")

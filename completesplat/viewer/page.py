@@ -32,7 +32,8 @@ from completesplat.viewer.splat_view import SplatView
 
 Task = Callable[[], None]
 
-THUMBNAIL, MOST_THUMBNAILS = 96, 24  # px
+THUMBNAIL = 96
+MOST_THUMBNAILS = 24  # px
 SHOWN = "shown"  # kind of all jobs that show other samples
 
 log = logging.getLogger(__name__)
@@ -46,8 +47,10 @@ class Worker:
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
-        self._failed, self._jobs = failed, dict[Hashable, Future[None]]()
-        self._pool, self._lock = ThreadPoolExecutor(1, "completesplat-viewer"), threading.Lock()
+        self._failed = failed
+        self._jobs = dict[Hashable, Future[None]]()
+        self._pool = ThreadPoolExecutor(1, "completesplat-viewer")
+        self._lock = threading.Lock()
         self.closed = False
 
     def submit(self, kind: Hashable, job: Task) -> None:
@@ -90,7 +93,10 @@ class Saver:
     def __init__(
         self, folder: Path, view: SplatView, make_rasterizer: Callable[[], Rasterizer], frames: int, background: float
     ) -> None:
-        self.folder, self.view, self.frames, self.background = folder, view, frames, background
+        self.folder = folder
+        self.view = view
+        self.frames = frames
+        self.background = background
         self.rasterizer = cache(make_rasterizer)
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
@@ -105,7 +111,8 @@ class Saver:
     def thumbnail(self, sample: Sample, size: int) -> panel.Pixels:
         """Render a sample from behind, where samples differ, with `size` px on the longer side."""
         up = torch.from_numpy(self.view.up).to(sample.reference.intrinsics)
-        camera, scene = orbit(sample.reference, sample.pivot(), up, 2)[1], sample.for_viewers()
+        camera = orbit(sample.reference, sample.pivot(), up, 2)[1]
+        scene = sample.for_viewers()
         factor = size / max(camera.image_size)
         height, width = (max(1, round(side * factor)) for side in camera.image_size)
         intrinsics = camera.intrinsics * camera.intrinsics.new_tensor([[factor], [factor], [1.0]])
@@ -144,7 +151,10 @@ class Page:
     """
 
     def __init__(self, server: GuardedServer, view: SplatView, saver: Saver, scenes: Mapping[str, Path]) -> None:
-        self.server, self.view, self.saver, self.scenes = server, view, saver, scenes
+        self.server = server
+        self.view = view
+        self.saver = saver
+        self.scenes = scenes
         self.complete: Callable[[Path, str, viser.ClientHandle | None], None] | None = None
         self.told: Exception | None = None
         self.worker = Worker(self.tell)
@@ -183,7 +193,8 @@ class Page:
     def show_photo(self, scene: Path) -> None:
         """Show a prediction's photo, if its folder has one, in the panel; raise BadImage for a damaged one."""
         folder = scene if scene.is_dir() else scene.parent
-        file, self.photo.content = folder / PHOTO_FILE, ""
+        file = folder / PHOTO_FILE
+        self.photo.content = ""
         if file.is_file() and is_described(folder):
             with refused_as_bad(str(file)), open_image(file, ("PNG",)) as image:
                 pixels = np.asarray(image.convert("RGB").resize((THUMBNAIL, THUMBNAIL)))
@@ -198,7 +209,8 @@ class Page:
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
         """Show an uploaded scene, or complete an uploaded image, when the scene that is being drawn is finished."""
         file = self.opening.upload.value
-        name, content = printable(file.name), file.content
+        name = printable(file.name)
+        content = file.content
         file.content = b""  # which the button would keep until the next upload
         self.submit(SHOWN, event.client, partial(self._open_upload, event.client, name, content))
 
@@ -221,8 +233,10 @@ class Page:
 
     def _let_choose_another(self, name: str) -> None:
         """Name an uploaded scene in the choice, so that each of `scenes` can be chosen next."""
-        chosen, uploaded = self.opening.chosen, f"loaded: {name}"
-        chosen.options, chosen.visible = (uploaded, *self.scenes), bool(self.scenes)
+        chosen = self.opening.chosen
+        uploaded = f"loaded: {name}"
+        chosen.options = (uploaded, *self.scenes)
+        chosen.visible = bool(self.scenes)
         chosen.value = uploaded
 
     def _draw_thumbnails(self, samples: Sequence[Sample]) -> None:
@@ -250,7 +264,8 @@ class Page:
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
         """Show an error in one browser or in all, and keep it; log it as well if it is a fault of the program."""
         show_status(self.server, "")  # what was waited for
-        self.told, text = error, str(error)
+        self.told = error
+        text = str(error)
         if not isinstance(error, CompleteSplatError):
             text = f"{type(error).__name__}: {text}"
             log.error("the viewer goes on after %s", text, exc_info=error)
@@ -262,10 +277,12 @@ class Page:
         stop_server(self.server)
 
     def _connect_looking(self) -> None:
-        looking, view = self.looking, self.view
+        looking = self.looking
+        view = self.view
 
         def changed(_: viser.GuiEvent[Any]) -> None:
-            index, last = looking.chosen.options.index(looking.chosen.value), len(looking.chosen.options) - 1
+            index = looking.chosen.options.index(looking.chosen.value)
+            last = len(looking.chosen.options) - 1
             view.chosen = None if index == last else index
             view.hidden_layers = {i for i, layer in enumerate(looking.layers) if not layer.value}
             view.depth = looking.depth.value
@@ -285,7 +302,9 @@ class Page:
         looking.front.on_click(lambda event: view.look_from_the_front(event.client))
 
     def _save(self, event: viser.GuiEvent[Any]) -> None:
-        client, kind, shown = event.client, self.saving.kind.value, list(self.view.visible)
+        client = event.client
+        kind = self.saving.kind.value
+        shown = list(self.view.visible)
         if client is None:
             return
 

@@ -20,7 +20,9 @@ from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.sample import MOST_LAYERS
 
-MOST_SAMPLES, MOST_STEPS, MOST_SEED = 8, 100, 99
+MOST_SAMPLES = 8
+MOST_STEPS = 100
+MOST_SEED = 99
 SLIDERS = ("samples", "skip_weight", "guidance_weight", "color_fits", "steps", "seed")  # settings of `CompleteSplat`
 SIDE_BY_SIDE = "all, side by side"
 CUT_OUT = (
@@ -41,7 +43,8 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
     The controls of drawing are hidden if the model draws no samples.
     """
     draws = model.draws_samples
-    most_steps, first_steps = 2, 1
+    most_steps = 2
+    first_steps = 1
     if isinstance(model, CompleteSplat):
         most_steps = possible_steps(model.sampler)[-1]
         first_steps = nearest_steps(model.sampler, start["steps"] or model.sampler.steps)
@@ -51,8 +54,10 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
     with gui.add_folder("Completion", order=2):
         if not draws:
             gui.add_markdown("One answer for each image: these weights draw no samples.")
-        free, diverse = "1: most faithful, 0: most free", "more: more diverse"
-        slider, fits = cast(Any, partial(gui.add_slider, visible=draws)), start["color_fits"]
+        free = "1: most faithful, 0: most free"
+        diverse = "more: more diverse"
+        slider = cast(Any, partial(gui.add_slider, visible=draws))
+        fits = start["color_fits"]
         return SimpleNamespace(
             preview=preview,
             remove_background=remove,

@@ -25,7 +25,8 @@ UP = (0.0, -1.0, 0.0)
 NEWEST_FILE = "scenes.json"
 MOST_LAYERS = 16
 EXTREME = 1e6  # ratio of focal length and image, and length of the direction up
-FRAMING_FOV, FRAMING_SIZE = 50.0, 512
+FRAMING_FOV = 50.0
+FRAMING_SIZE = 512
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +85,8 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
         return [Sample(scene, 1, framing_camera(scene)) for scene in scenes], UP
     with errors_at(description):
         data = read_json(description)
-        reference, settings = _camera(field(data, "reference_camera", dict)), field(data, "settings", dict)
+        reference = _camera(field(data, "reference_camera", dict))
+        settings = field(data, "settings", dict)
         up = _up(settings)
     return [Sample(scene, _layers(scene, reference), reference, settings) for scene in scenes], up
 
@@ -95,9 +97,11 @@ def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
     samples = []
     with errors_at(path):
         data = read_json(path)
-        step, up = field(data, "step", int), _up(data)
+        step = field(data, "step", int)
+        up = _up(data)
         for row in field(data, "scenes", list):
-            camera, settings = _camera(field(row, "reference_camera", dict)), {"scene": field(row, "scene", str)}
+            camera = _camera(field(row, "reference_camera", dict))
+            settings = {"scene": field(row, "scene", str)}
             scene = read_gaussians(folder / Path(field(row, "file", str)).name)
             samples.append(Sample(scene, _layers(scene, camera), camera, settings | {"step": step}))
     return step, samples, up

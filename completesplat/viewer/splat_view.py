@@ -22,9 +22,12 @@ from completesplat.geometry.trajectories import orbit
 from completesplat.viewer.sample import Sample
 
 LARGEST_COVARIANCE = 3e4
-GAP, NARROWEST_WINDOW, SAME = 1.25, 1.1, 0.15
+GAP = 1.25
+NARROWEST_WINDOW = 1.1
+SAME = 0.15
 MARGIN = 1.15  # height and width that are shown, as multiples of the photo's
-REFERENCE_COLOR, ORBIT_COLOR = (200, 60, 40), (60, 60, 60)
+REFERENCE_COLOR = (200, 60, 40)
+ORBIT_COLOR = (60, 60, 60)
 
 
 @dataclass(frozen=True)
@@ -78,8 +81,10 @@ def arrangement_of(samples: Sequence[Sample]) -> Arrangement:
     reference = samples[0].reference
     pivots = [sample.pivot() for sample in samples]
     pose = reference.camera_to_world.cpu().numpy()
-    pivot, eye = pivots[0].cpu().numpy(), pose[:3, 3]
-    forward, distance = pose[:3, 2], float(np.linalg.norm(pivot - eye))
+    pivot = pivots[0].cpu().numpy()
+    eye = pose[:3, 3]
+    forward = pose[:3, 2]
+    distance = float(np.linalg.norm(pivot - eye))
     height, width = reference.image_size
     tangent = height / 2 / reference.intrinsics[1, 1].item()
     aspect = width / 2 / reference.intrinsics[0, 0].item() / tangent
@@ -117,13 +122,15 @@ class SplatView:
     @property
     def visible(self) -> list[Sample]:
         """The samples on the page: the chosen one (or the first, if its number does not exist), or all."""
-        samples, chosen = self.samples, self.chosen
+        samples = self.samples
+        chosen = self.chosen
         return samples if chosen is None or not samples else [samples[chosen if chosen < len(samples) else 0]]
 
     def set_up(self, up: Sequence[float]) -> None:
         """Set the direction up, and make the next drawing be seen from the front, because it shows another scene."""
         with self._lock:
-            self.up, self._arrangement = np.asarray(up, float), None
+            self.up = np.asarray(up, float)
+            self._arrangement = None
             self.server.scene.set_up_direction(self.up)
 
     def show(self, samples: Sequence[Sample]) -> None:
@@ -150,13 +157,17 @@ class SplatView:
         with self._lock:
             if self._arrangement is None:
                 return
-            view, start = self._arrangement, self.server.initial_camera
-            start.position, start.look_at, start.fov = view.position, view.look_at, view.fov
+            view = self._arrangement
+            start = self.server.initial_camera
+            start.position = view.position
+            start.look_at = view.look_at
+            start.fov = view.fov
             for browser in list(self.server.get_clients().values()) if client is None else [client]:
                 camera = browser.camera
                 with browser.atomic():
                     camera.up_direction = self.up
-                    camera.position, camera.look_at = view.position, view.look_at
+                    camera.position = view.position
+                    camera.look_at = view.look_at
                     if camera.image_width * camera.image_height:  # else hidden: `_welcome` fits its view when it shows
                         camera.fov = view.fov_in(camera.image_width / camera.image_height)
 
@@ -166,7 +177,8 @@ class SplatView:
 
         def fit(camera: viser.CameraHandle) -> None:
             nonlocal last_aspect
-            aspect, view = camera.image_width / max(camera.image_height, 1), self._arrangement
+            aspect = camera.image_width / max(camera.image_height, 1)
+            view = self._arrangement
             if view is not None and aspect > 0 and aspect != last_aspect:
                 last_aspect = aspect
                 camera.fov = view.fov_in(aspect)
@@ -198,7 +210,8 @@ class SplatView:
                 handle = self._splats[name] = self.server.scene.add_gaussian_splats(name, **arrays)
             else:
                 handle.set_gaussians(**arrays)
-            handle.scale, handle.position = scale, shift
+            handle.scale = scale
+            handle.position = shift
             handle.visible = layer not in self.hidden_layers
 
     def _draw_cameras(self, samples: Sequence[Sample], arrangement: Arrangement) -> None:
@@ -215,7 +228,8 @@ class SplatView:
                 cameras, color = groups[name]
                 height, width = cameras.image_size
                 for j, (pose, intrinsics) in enumerate(zip(cameras.camera_to_world, cameras.intrinsics, strict=True)):
-                    place, fov = f"/cameras/{i}/{name}/{j}", 2 * math.atan(height / 2 / intrinsics[1, 1].item())
+                    place = f"/cameras/{i}/{name}/{j}"
+                    fov = 2 * math.atan(height / 2 / intrinsics[1, 1].item())
                     frustum = self.server.scene.add_camera_frustum(place, fov, width / height, color=color, **look)
                     frustum.wxyz = matrix_to_quaternion(pose[:3, :3]).cpu().numpy()
                     frustum.position = pose[:3, 3].cpu().numpy() + arrangement.shift(i)
@@ -232,7 +246,8 @@ def to_splats(gaussians: Gaussians) -> tuple[dict[str, Any], float]:
     largest = finite.scales.max().item() if finite.count else 1.0
     scale = max(largest, 1e-12) / math.sqrt(LARGEST_COVARIANCE)
     unit = replace(finite, means=finite.means / scale, scales=finite.scales / scale)
-    colors, opacities = round_to_uint8(finite.colors * 255), round_to_uint8(finite.opacities[:, None] * 255)
+    colors = round_to_uint8(finite.colors * 255)
+    opacities = round_to_uint8(finite.opacities[:, None] * 255)
     arrays = {"centers": unit.means.float().numpy(), "covariances": unit.covariances().float().numpy()}
     return arrays | {"rgbs": colors, "opacities": opacities}, scale
 

@@ -17,9 +17,14 @@ from completesplat.errors import WeightsError
 from completesplat.files import printable, write_text
 
 SHIPPED = Path(__file__).parent
-CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE = "config.json", "model.safetensors", "SHA256SUMS"
+CONFIG_FILE = "config.json"
+WEIGHTS_FILE = "model.safetensors"
+SUMS_FILE = "SHA256SUMS"
 # In a training run's folder: its final weights, its config, its newest checkpoint, fitted scenes.
-RUN_WEIGHTS, RUN_CONFIG_FILE, RUN_CHECKPOINT, SCENES = "weights", "config.yaml", "checkpoints/last.ckpt", "scenes"
+RUN_WEIGHTS = "weights"
+RUN_CONFIG_FILE = "config.yaml"
+RUN_CHECKPOINT = "checkpoints/last.ckpt"
+SCENES = "scenes"
 AUTO = "auto"  # in place of a name: the shipped weights whose training images are nearest to the photo
 NEWEST = "images/newest"  # in a training run's folder, too: its fixed scenes as they are now, with `scenes.json`
 CAMERA = "camera"  # in stage 1's checkpoints: the typical camera of the training set
@@ -42,7 +47,8 @@ def locate(weights: Path | str) -> Path:
     Raises:
         WeightsError: there is no such folder, a file is missing, or its checksum differs.
     """
-    name, path = str(weights), Path(weights).expanduser()
+    name = str(weights)
+    path = Path(weights).expanduser()
     check_name(name)
     if name in shipped():
         path = shipped()[name]

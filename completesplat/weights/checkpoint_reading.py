@@ -68,7 +68,8 @@ def _checked_pickle(path: Path, sums: bool) -> bytes:
         file.seek(0)
         if file.read(len(ZIP)) != ZIP:
             raise TensorFileError("not an archive of torch.save")
-        archive, listed = torch._C.PyTorchFileReader(str(path)), records.infolist()
+        archive = torch._C.PyTorchFileReader(str(path))
+        listed = records.infolist()
         if sum(record.file_size for record in listed) > path.stat().st_size:
             raise TensorFileError("its parts are larger than the file")
         # torch and zipfile may find different lists of records in a file; not if both have the first byte's record.
@@ -132,9 +133,9 @@ class _DryRun(pickle._Unpickler):
                 pass
             case ("Counter", (dict() as entries,)) | ("Size", (tuple() as entries,)):
                 self._count(BYTES_PER_ENTRY * len(entries))
-            case "encode", (str() as text, "latin1"):  # some other codecs double the bytes each time they are called
+            case ["encode", (str() as text, "latin1")]:  # some other codecs double the bytes each time they are called
                 self._count(len(text))
-            case "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_tensor_v3", (_Made(), _, tuple() as sizes, *_):
+            case ["_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_tensor_v3", (_Made(), _, tuple() as sizes, *_)]:
                 if len(sizes) > MOST_AXES or not all(type(size) is int for size in sizes):
                     raise TensorFileError("made of unusual sizes, not of tensors alone")
                 self._count(abs(math.prod(sizes)))

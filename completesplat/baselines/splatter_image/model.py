@@ -50,7 +50,8 @@ HUB = "szymanowiczs/splatter-image-v1"
 PAGE = f"https://huggingface.co/{HUB}"
 PREFIX = "splatter_image:"
 STATE = "model_state_dict"
-GENERAL, GENERAL_FILE = "objaverse", "model_latest.pth"
+GENERAL = "objaverse"
+GENERAL_FILE = "model_latest.pth"
 MODEL_FILE = re.compile(r"model_(\w+)\.pth")
 
 # Options that are read, by section. All published weights for one image have the literal values.

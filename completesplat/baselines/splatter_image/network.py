@@ -84,11 +84,13 @@ class SongUNet(nn.Module):
 
     def __init__(self, size: int, inputs: int, outputs: int, width: int, blocks: int, attention: Sequence[int]) -> None:
         super().__init__()
-        self.enc, self.dec = nn.ModuleDict(), nn.ModuleDict()
+        self.enc = nn.ModuleDict()
+        self.dec = nn.ModuleDict()
         levels = [(f"{size >> level}x{size >> level}", width * multiple) for level, multiple in enumerate(MULTIPLES)]
         attending = [size >> level in attention for level in range(len(MULTIPLES))]
         self.enc[f"{levels[0][0]}_conv"] = nn.Conv2d(inputs, width, 3, padding=1)
-        channels, skips = width, [width]
+        channels = width
+        skips = [width]
         for level, (name, outer) in enumerate(levels):
             if level:
                 self.enc[f"{name}_down"] = ResidualBlock(channels, channels, "down")

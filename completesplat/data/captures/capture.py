@@ -31,7 +31,8 @@ logger = logging.getLogger(__name__)
 FEWEST_FRAMES = 6
 SIDEWAYS = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 # Limits for an undistorted image's area and sides, relative to the distorted image's. Wrong coefficients exceed them.
-SMALLEST_AREA, LARGEST_SIDE = 0.5, 2.0
+SMALLEST_AREA = 0.5
+LARGEST_SIDE = 2.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class Lens:
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
 
     def __post_init__(self) -> None:
-        (height, width), (x, y) = self.image_size, self.center
+        height, width = self.image_size
+        x, y = self.center
         if not (np.abs([*self.focal, *self.center, *self.distortion]) < LARGEST).all():
             raise BadCamera(f"intrinsics are not finite: {self.focal}, {self.center}, {self.distortion}")
         if min(height, width) <= 0 or min(self.focal) <= 0:
@@ -82,7 +84,8 @@ class CapturedFrame:
         """Return the pinhole camera (float64) of the undistorted image; errors as in `undistorted_lens`."""
         with errors_at(self.image, frame=self.number):
             lens = undistorted_lens(self.lens)
-        (fx, fy), (x, y) = lens.focal, lens.center
+        fx, fy = lens.focal
+        x, y = lens.center
         intrinsics = torch.tensor([[fx, 0, x], [0, fy, y], [0, 0, 1]], dtype=torch.float64)
         return Cameras(torch.from_numpy(self.world_to_camera), intrinsics, lens.image_size)
 
@@ -95,13 +98,15 @@ class CapturedFrame:
             DataError: a file is missing, unusable or of another aspect, or its EXIF orientation leaves two images.
         """
         with errors_at(self.image, frame=self.number):
-            orientation, mask = self.check(), None
+            orientation = self.check()
+            mask = None
             with files.refused_as_bad(str(self.image)), files.open_image(self.image, files.FORMATS) as stored:
                 if stored.has_transparency_data and stored.mode in files.EIGHT_BIT_MODES:
                     files.check_sums(stored, self.image)
                     stored.load()
                     turned = files.turn_upright(stored, orientation)
-                    image, mask = files.over_grey(turned, 1.0), turned.convert("RGBA").getchannel("A")
+                    image = files.over_grey(turned, 1.0)
+                    mask = turned.convert("RGBA").getchannel("A")
             if mask is None:
                 turn = orientation is not None
                 image = files.decode_image(self.image, str(self.image), "RGB", self.lens.image_size, turn)
@@ -124,7 +129,8 @@ class CapturedFrame:
                 raise BadImage(f"has {size[0]} x {size[1]} pixels, its image {height} x {width}", str(self.mask))
             with files.refused_as_bad(str(self.image)), files.open_image(self.image, files.FORMATS) as image:
                 orientation = read_exif(image).get(ORIENTATION)
-                as_stored, sideways = image.size == (width, height), orientation in SIDEWAYS
+                as_stored = image.size == (width, height)
+                sideways = orientation in SIDEWAYS
                 as_upright = image.size == (height, width) if sideways else as_stored
                 if not as_stored and not as_upright:
                     differs = f"has {image.height} x {image.width} pixels, its camera {height} x {width}"
@@ -202,7 +208,8 @@ def undistorted_lens(lens: Lens) -> Lens:
     """
     if not any(lens.distortion):
         return lens
-    pycolmap, (height, width) = import_pycolmap(), lens.image_size
+    pycolmap = import_pycolmap()
+    height, width = lens.image_size
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), _distorted(lens))
     size = pinhole.height, pinhole.width
     sides = size[0] / height, size[1] / width
@@ -216,7 +223,8 @@ def undistort(image: Image.Image, lens: Lens) -> Image.Image:
     if not any(lens.distortion):
         return image
     pycolmap = import_pycolmap()
-    options, bitmap = pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(np.array(image))
+    options = pycolmap.UndistortCameraOptions()
+    bitmap = pycolmap.Bitmap.from_array(np.array(image))
     return Image.fromarray(pycolmap.undistort_image(options, bitmap, _distorted(lens))[0].to_array())
 
 
@@ -231,5 +239,6 @@ def import_pycolmap() -> ModuleType:
 
 
 def _distorted(lens: Lens) -> "Camera":
-    (height, width), params = lens.image_size, [*lens.focal, *lens.center, *lens.distortion, 0.0, 0.0, 0.0]
+    height, width = lens.image_size
+    params = [*lens.focal, *lens.center, *lens.distortion, 0.0, 0.0, 0.0]
     return import_pycolmap().Camera(model="FULL_OPENCV", width=width, height=height, params=params)

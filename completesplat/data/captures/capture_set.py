@@ -35,7 +35,8 @@ def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
         BadAnnotation: an entry is neither a capture nor a folder of captures.
         SharedSequences: two splits have captures of one object.
     """
-    content, splits = read_json(path), dict[str, list[str]]()
+    content = read_json(path)
+    splits = dict[str, list[str]]()
     owners: dict[str, str] = {}
     with errors_at(path):
         for split in SPLITS:

@@ -82,12 +82,13 @@ def _parsed(parse: Callable[[Row], T], read: Callable[[Path], Iterator[Row]], pa
 def _camera_of(row: Row) -> tuple[int, Lens]:
     """Return a camera's number and lens; the parameters have the order of colmap.github.io/cameras.html."""
     number, kind, width, height, *rest = row
-    size, parameters = (int(height), int(width)), tuple(map(float, rest))
+    size = (int(height), int(width))
+    parameters = tuple(map(float, rest))
     match kind, parameters:
-        case "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL", (f, cx, cy, *radial):
+        case ["SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL", (f, cx, cy, *radial)]:
             k1, k2 = [*radial, 0.0, 0.0][:2]
             return int(number), Lens((f, f), (cx, cy), size, (k1, k2, 0.0, 0.0, 0.0))
-        case "PINHOLE" | "OPENCV", (fx, fy, cx, cy, *distortion):
+        case ["PINHOLE" | "OPENCV", (fx, fy, cx, cy, *distortion)]:
             k1, k2, p1, p2 = distortion or (0.0,) * 4
             return int(number), Lens((fx, fy), (cx, cy), size, (k1, k2, p1, p2, 0.0))
     raise BadCamera(f"camera model {kind} is not supported; undistort the images with COLMAP's image_undistorter")
@@ -95,7 +96,9 @@ def _camera_of(row: Row) -> tuple[int, Lens]:
 
 def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | None) -> CapturedFrame:
     """Return an image with its camera; a row has number, pose (qw, qx, qy, qz, tx, ty, tz), camera and name."""
-    number, camera, name = int(row[0]), int(row[8]), str(row[9])
+    number = int(row[0])
+    camera = int(row[8])
+    name = str(row[9])
     with errors_at(frame=number):
         if camera not in lenses:
             raise BadAnnotation(f"no camera {camera}")
@@ -131,7 +134,8 @@ def _text_rows(path: Path) -> Iterator[Row]:
 
 def _binary_rows(path: Path) -> Iterator[Row]:
     """Yield the entries of a binary file, without the features of images and points."""
-    content, offset = path.read_bytes(), 0
+    content = path.read_bytes()
+    offset = 0
 
     def take(layout: str) -> tuple[Any, ...]:
         nonlocal offset
@@ -145,7 +149,8 @@ def _binary_rows(path: Path) -> Iterator[Row]:
             kind, count = list(MODELS.items())[model] if 0 <= model < len(MODELS) else (model, 0)
             yield number, kind, width, height, *take(f"{count}d")
         elif path.stem == "images":
-            numbers, end = take("I7dI"), content.index(b"\0", offset)
+            numbers = take("I7dI")
+            end = content.index(b"\0", offset)
             name = take(f"{end - offset}sx")[0].decode()
             yield *numbers, name
             take(f"{24 * take('Q')[0]}x")

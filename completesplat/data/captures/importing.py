@@ -62,7 +62,8 @@ def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> 
         raise DataError("no such file or folder", str(source))
     pycolmap = import_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    video, path = source.is_file(), source.resolve()
+    video = source.is_file()
+    path = source.resolve()
     capture = out / (path.stem if video else path.name)
     if capture.exists():
         raise DataError("exists already: import it without cameras=colmap, or choose another out=DIR", str(capture))
@@ -114,7 +115,8 @@ def _copy_photos(folder: Path, images: Path) -> None:
 
 def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
     """Return the photos in a folder or, if there are none, in the folders below it; name files of other formats."""
-    folders, below = [folder], sorted(folder.glob("[!.]*/"))
+    folders = [folder]
+    below = sorted(folder.glob("[!.]*/"))
     photos = files.image_files(folder, formats)
     if not photos:
         photos = [photo for path in below for photo in files.image_files(path, formats)]
@@ -151,14 +153,19 @@ def image_pairs(images: int, sequential: bool) -> list[tuple[int, int]]:
 def _find_cameras(folder: Path, names: list[str], sequential: bool, max_image_size: int) -> set[str]:
     """Write COLMAP's largest model as `folder`/sparse/0; return its images. Those of a folder and size share a lens."""
     pycolmap = import_pycolmap()
-    images, database, pairs, at_a_time = folder / "images", folder / "db", folder / "pairs", usable_cores()
+    images = folder / "images"
+    database = folder / "db"
+    pairs = folder / "pairs"
+    at_a_time = usable_cores()
     pycolmap.Database.open(database).close()
     sizes = {(Path(name).parent, files.stored_size(images / name, name)) for name in names}
     uniform = len(sizes) == len({Path(name).parent for name in names})
     mode = pycolmap.CameraMode.PER_FOLDER if uniform else pycolmap.CameraMode.PER_IMAGE
     pycolmap.import_images(database, images, mode, names)
-    extraction, pairing = pycolmap.FeatureExtractionOptions(), pycolmap.ImportedPairingOptions()
-    extraction.max_image_size, extraction.sift.max_num_features = max_image_size, MOST_FEATURES
+    extraction = pycolmap.FeatureExtractionOptions()
+    pairing = pycolmap.ImportedPairingOptions()
+    extraction.max_image_size = max_image_size
+    extraction.sift.max_num_features = MOST_FEATURES
     for start in track(range(0, len(names), at_a_time), "features"):
         chunk = names[start : start + at_a_time]
         pycolmap.extract_features(database, images, chunk, extraction_options=extraction)

@@ -26,7 +26,8 @@ logger = logging.getLogger(__name__)
 
 # Points whose distance from the median point exceeds this multiple of the median distance are outliers, because the
 # farthest point determines the scale of the scene. Beyond the second multiple, they are errors of the reconstruction.
-FARTHEST, FARTHEST_USED = 5.0, 100_000
+FARTHEST = 5.0
+FARTHEST_USED = 100_000
 FEWEST_HELD_OUT = 3
 TRANSFORMS = ("transforms.json", "transforms_train.json")  # the second is NeRF's (synthetic)
 # Of COLMAP, nerfstudio, and COLMAP's undistorter.
@@ -80,7 +81,8 @@ def _largest_model(folder: Path) -> Path | None:
 
 def read_captures(folders: Mapping[str, Path]) -> tuple[dict[str, Capture], list[DataError]]:
     """Read the captures in some of the folders, by name; return also the errors of those that cannot be read."""
-    captures, refused = dict[str, Capture](), list[DataError]()
+    captures = dict[str, Capture]()
+    refused = list[DataError]()
     for name, folder in folders.items():
         with refused_to(refused.append, sequence=name):
             capture = read_capture(folder)
@@ -151,7 +153,8 @@ class CaptureSource(SequenceSource):
             points = points[distance <= FARTHEST_USED]
         numbers = self._members(len(capture.frames))
         read = partial(_read, name, [capture.frames[number] for number in numbers], self.framing)
-        center, moved = placement.center, torch.eye(4, dtype=torch.float64)
+        center = placement.center
+        moved = torch.eye(4, dtype=torch.float64)
         moved[:3, 3] = center
         selected = [replace(cameras[i], world_to_camera=cameras[i].world_to_camera @ moved) for i in numbers]
         placement = placement._replace(center=torch.zeros_like(center))

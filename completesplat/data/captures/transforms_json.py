@@ -77,7 +77,8 @@ def read_polycam(keyframes: Path) -> Capture:
         DataError: as in `read_transforms`.
     """
     kind = "corrected_" if (keyframes / "corrected_cameras").is_dir() else ""
-    files, entries = sorted((keyframes / f"{kind}cameras").glob("*.json")), []
+    files = sorted((keyframes / f"{kind}cameras").glob("*.json"))
+    entries = []
     for file in files:
         camera = read_json(file, allow_nan=True)
         with errors_at(file):
@@ -99,7 +100,8 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
         CompleteSplatError: a photo is not in the file.
     """
     frames = {frame.image.resolve(): frame for frame in _read_frames(path, read_json(path, allow_nan=True))}
-    squares, cameras = [], []
+    squares = []
+    cameras = []
     for image in images:
         frame = frames.get(image.resolve())
         if frame is None:
@@ -109,7 +111,8 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
             undistorted = Image.fromarray(np.array(undistorted))
         squares.append(read_photograph(undistorted, size).image)
         camera = frame.camera()
-        (height, width), side = camera.image_size, min(camera.image_size)
+        height, width = camera.image_size
+        side = min(camera.image_size)
         cameras.append(crop_resize(camera, (width - side) // 2, (height - side) // 2, side, size))
     placed = stack(cameras)
     relative = placed.relative_to(placed[0]).to(torch.float32)
@@ -124,7 +127,8 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
     Raises:
         DataError: as in `read_transforms`; or the lens distorts, its focal lengths differ, or `fl_x` is without a size.
     """
-    content, cameras = read_json(path), []
+    content = read_json(path)
+    cameras = []
     with errors_at(path):
         for number, entry in enumerate(field(content, "frames", list)):
             with errors_at(frame=number):
@@ -135,11 +139,14 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
                     if "fl_x" in values:
                         raise BadAnnotation("fl_x is in pixels, but w and h are missing")
                     values |= {"w": size, "h": size}
-                lens, pose = _read_lens(values, path), torch.from_numpy(_read_pose(entry.get("transform_matrix")))
+                lens = _read_lens(values, path)
+                pose = torch.from_numpy(_read_pose(entry.get("transform_matrix")))
                 if any(lens.distortion) or not math.isclose(*lens.focal, rel_tol=SAME_FOCAL):
                     raise BadCamera(f"only pinhole cameras are rendered, not {lens.focal}, {lens.distortion}")
-                (height, width), scale = lens.image_size, size / min(lens.image_size)
-                (f, _), (x, y) = lens.focal, lens.center
+                height, width = lens.image_size
+                scale = size / min(lens.image_size)
+                f, _ = lens.focal
+                x, y = lens.center
                 intrinsics = scale * torch.tensor([[f, 0, x], [0, f, y], [0, 0, 1 / scale]], dtype=torch.float64)
                 cameras.append(Cameras(pose, intrinsics, (round(scale * height), round(scale * width))))
         if len(cameras) < FEWEST_CAMERAS:
@@ -148,7 +155,9 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
 
 
 def _read_frames(path: Path, content: Any) -> list[CapturedFrame]:
-    root, frames, missing = path.parent, [], []
+    root = path.parent
+    frames = []
+    missing = []
     with errors_at(path):
         entries = field(content, "frames", list)
         for number, entry in enumerate(entries):
@@ -162,7 +171,8 @@ def _read_frames(path: Path, content: Any) -> list[CapturedFrame]:
                     continue
                 masked = entry.get("mask_path") is not None
                 mask = require_file(path_below(root, field(entry, "mask_path", str))) if masked else None
-                values, pose = {**content, **entry}, _read_pose(entry.get("transform_matrix"))
+                values = {**content, **entry}
+                pose = _read_pose(entry.get("transform_matrix"))
                 frame = CapturedFrame(number, image, mask, _read_lens(values, image), pose)
                 sized = {"w", "h"} <= values.keys()
                 frames.append(fit_lens(frame) if sized else replace(frame, orientation="unknown"))

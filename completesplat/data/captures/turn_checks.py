@@ -25,7 +25,9 @@ LEAST_STEP = 8.0  # degrees between photos that are compared
 CERTAIN = 3.0  # standard errors from which on the flow has a direction
 HULL = 48  # voxels along each side of the hull, and pixels of the masks that carve it
 MOST_VIEWS = 24  # that carve it
-TILES, TILE, LABEL = 8, 48, 12  # photos of a turn on the sheet; pixels
+TILES = 8
+TILE = 48
+LABEL = 12  # photos of a turn on the sheet; pixels
 
 
 class Turn(NamedTuple):
@@ -57,14 +59,17 @@ def examine(photos: Photos, masks: Masks, angles: Float[np.ndarray, " photo"], c
     brightness = (photos * masks).mean((1, 2, 3)) / masks.mean((1, 2, 3))
     even = photos * (brightness.mean() / brightness).view(-1, 1, 1, 1) * masks + 1 - masks
     neighbours, opposite = (255 * (even - even.roll(-n, 0)).abs().mean((1, 2, 3)) for n in (1, len(even) // 2))
-    ends, mean, half = float(neighbours[-1]), float(neighbours[:-1].mean()), float(opposite.mean())
+    ends = float(neighbours[-1])
+    mean = float(neighbours[:-1].mean())
+    half = float(opposite.mean())
     whole = 2 * math.pi - angles[-1] + angles[0] < 2 * np.median(np.diff(angles))
     if whole and ends > max(float(neighbours[:-1].max()), (mean + half) / 2):
         message = f"last and first photo differ by {ends:.1f} of 255, neighbours by {mean:.1f}, opposite ones by"
         raise DataError(f"the turn does not close: {message} {half:.1f}")
     tiles = (photos * masks + 0.7 * (1 - masks))[torch.arange(TILES) * len(photos) // TILES]
     tiles = interpolate(tiles, size=(TILE, TILE), mode="area")
-    flow, overlap = direction_of_flow(even, masks, angles), hull_overlap(masks, cameras)
+    flow = direction_of_flow(even, masks, angles)
+    overlap = hull_overlap(masks, cameras)
     return Turn(cameras, (ends, mean, half), flow, overlap, tiles)
 
 
@@ -84,7 +89,8 @@ def direction_of_flow(photos: Photos, masks: Masks, angles: Float[np.ndarray, " 
     scores = []
     for index, first in enumerate(unrolled):
         later = (index + stride) % len(unrolled)
-        second, step = unrolled[later], round((degrees[later] - degrees[index]) % 360)
+        second = unrolled[later]
+        step = round((degrees[later] - degrees[index]) % 360)
         if 0 < step <= WIDEST:
             left = (first[..., step:] - second[..., :-step]).square().mean()
             right = (first[..., :-step] - second[..., step:]).square().mean()
@@ -114,13 +120,16 @@ def hull_overlap(masks: Masks, cameras: Cameras) -> float:
 
 def write_sheet(turns: Mapping[str, Turn], path: Path) -> None:
     """Write some photos of each turn, evenly spread over it, with the turn's name and overlap, in columns."""
-    height, width = TILE + LABEL, TILES * TILE + LABEL
+    height = TILE + LABEL
+    width = TILES * TILE + LABEL
     columns = math.ceil(math.sqrt(len(turns) * height / width))
     rows = math.ceil(len(turns) / columns)
     sheet = Image.new("RGB", (columns * width, rows * height), "white")
-    draw, font = ImageDraw.Draw(sheet), label_font(LABEL - 3)
+    draw = ImageDraw.Draw(sheet)
+    font = label_font(LABEL - 3)
     for index, (name, turn) in enumerate(turns.items()):
-        left, top = index // rows * width, index % rows * height
+        left = index // rows * width
+        top = index % rows * height
         draw.text((left, top), printable(f"{name}  {turn.overlap:.2f}"), "black", font)
         strip = np.concatenate(list(turn.tiles.numpy()), axis=-1).transpose(1, 2, 0)
         sheet.paste(Image.fromarray(to_uint8(strip)), (left, top + LABEL))

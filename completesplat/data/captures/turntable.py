@@ -37,7 +37,8 @@ MOST_SIDE = 512  # pixels; larger photos are reduced
 SHEET = "sheet.png"
 WHITE = 245  # least value of a white background's pixels, in every channel
 FULL = 0.98  # a mask that covers more than this share of the photo is refused
-LEAST_FACTOR, LARGEST_FACTOR = 0.8, 1.25  # bounds of the scale that undoes a crop
+LEAST_FACTOR = 0.8
+LARGEST_FACTOR = 1.25  # bounds of the scale that undoes a crop
 MARGIN = 1.1  # side of the images, in units of the object's largest side
 LOW_OVERLAP = 0.85  # of the masks with their visual hull; a turn with less is named
 
@@ -92,7 +93,8 @@ def _write_turns(folders: Mapping[str, Path], out: Path, settings: TurntableSett
     """Write images and masks of all turns that can be used, and return their findings; name the others."""
     count = settings["photos_of_a_turn"]
     counts = read_json(Path(count)) if isinstance(count, str) else dict.fromkeys(folders, count)
-    turns, refused = dict[str, Turn](), list[DataError]()
+    turns = dict[str, Turn]()
+    refused = list[DataError]()
     for name, photos in track(folders.items(), "turns"):
         with refused_to(refused.append, sequence=name):
             known = None if count is None else field(counts, name, int)
@@ -168,7 +170,8 @@ def _on_circle(
     angles: Float[np.ndarray, " photo"], elevation: float, distance: float, focal: float, side: int
 ) -> Cameras:
     """Return cameras [photo] in float64 whose azimuths are the angles, each to the right of the one before."""
-    azimuths, height = torch.from_numpy(angles), math.radians(elevation)
+    azimuths = torch.from_numpy(angles)
+    height = math.radians(elevation)
     level = math.cos(height) * torch.stack([azimuths.cos(), azimuths.sin()], dim=-1)
     eyes = distance * torch.cat([level, torch.full_like(level[:, :1], math.sin(height))], dim=-1)
     poses = look_at(eyes, torch.zeros_like(eyes), eyes.new_tensor([0, 0, 1]))
@@ -210,10 +213,12 @@ def _read_photo(path: Path, background: str | None) -> Photo:
 def _without_white(image: Image.Image) -> Image.Image:
     """Make white pixels transparent that can be reached from the border through white ones."""
     white = np.pad((np.asarray(image) >= WHITE).all(-1), 1, constant_values=True)
-    before, reached = np.zeros_like(white), np.zeros_like(white)
+    before = np.zeros_like(white)
+    reached = np.zeros_like(white)
     reached[0] = True
     while (reached != before).any():  # Pillow's own flood fill is five times as slow
-        before, reached = reached, _along_rows(_along_rows(reached, white).T, white.T).T
+        before = reached
+        reached = _along_rows(_along_rows(reached, white).T, white.T).T
     image.putalpha(Image.fromarray(~reached[1:-1, 1:-1]).convert("L"))
     return image
 
@@ -238,7 +243,8 @@ def _squared(photos: Sequence[Photo], height: str | None) -> tuple[list[Photo], 
         factors = (np.median(heights) / heights).clip(LEAST_FACTOR, LARGEST_FACTOR)
     else:  # Over a full turn, the box around all masks is centred on the axis.
         boxes[:] = np.concatenate([boxes[:, :2].min(0), boxes[:, 2:].max(0)])
-    sizes, centers = boxes[:, 2:] - boxes[:, :2], (boxes[:, :2] + boxes[:, 2:]) / 2
+    sizes = boxes[:, 2:] - boxes[:, :2]
+    centers = (boxes[:, :2] + boxes[:, 2:]) / 2
     side = math.ceil(MARGIN * (factors * sizes.max(1)).max())
     squares = []
     for (image, mask), center, factor in zip(photos, centers, factors, strict=True):
@@ -258,7 +264,8 @@ def _write_transforms(folder: Path, cameras: Cameras) -> None:
         {"file_path": f"images/{name}.jpg", "mask_path": f"masks/{name}.png", "transform_matrix": pose}
         for name, pose in zip(names, poses.tolist(), strict=True)
     ]
-    focal, (height, width) = float(cameras.intrinsics[0, 0, 0]), cameras.image_size
+    focal = float(cameras.intrinsics[0, 0, 0])
+    height, width = cameras.image_size
     lens = {"camera_model": "PINHOLE", "fl_x": focal, "fl_y": focal, "w": width, "h": height}
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}, indent=1) + "\n")
 

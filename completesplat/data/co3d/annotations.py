@@ -108,7 +108,9 @@ def _entries(path: Path, refuse: Refuse) -> Iterator[tuple[str, JsonObject]]:
 
 
 def _frame(root: Path, number: int, entry: JsonObject) -> CO3DFrame:
-    image, mask, depth = field(entry, "image", dict), field(entry, "mask", dict), None
+    image = field(entry, "image", dict)
+    mask = field(entry, "mask", dict)
+    depth = None
     size = field(image, "size", list)
     if [type(side) for side in size] != [int, int] or not 0 < min(size) <= max(size) <= MOST_PIXELS:
         expected = f"two positive integers of at most {MOST_PIXELS:,}"
@@ -143,13 +145,15 @@ def camera_from_viewpoint(viewpoint: JsonObject, image_size: Sequence[int]) -> C
     unit = half if layout == "ndc_norm_image_bounds" else np.full(2, half.min())
     numbers = {key: finite_array(viewpoint.get(key), shape, key) for key, shape in VIEWPOINT_SHAPES.items()}
     require_rotation(numbers["R"], "R")
-    focal, center = numbers["focal_length"] * unit, half - numbers["principal_point"] * unit
+    focal = numbers["focal_length"] * unit
+    center = half - numbers["principal_point"] * unit
     if not ((focal > 0) & np.isfinite(focal)).all():
         raise BadCamera(f"focal_length must be positive and finite, not {viewpoint['focal_length']}")
     if not ((center > 0) & (center < 2 * half)).all():
         raise BadCamera(f"principal point ({center[0]:g}, {center[1]:g}) lies outside of the {width} x {height} image")
     world_to_camera = np.eye(4)
-    world_to_camera[:3, :3], world_to_camera[:3, 3] = FLIP @ numbers["R"].T, FLIP @ numbers["T"]
+    world_to_camera[:3, :3] = FLIP @ numbers["R"].T
+    world_to_camera[:3, 3] = FLIP @ numbers["T"]
     intrinsics = np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
     return Cameras(torch.from_numpy(world_to_camera), torch.from_numpy(intrinsics), (height, width))
 

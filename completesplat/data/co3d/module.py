@@ -101,7 +101,9 @@ class CO3DDataModule(ObjectDataModule):
         """Return the test scenes with the modes that were written beside their images; see `HiddenModeScenes`."""
         if not self.chances:
             return super().hidden_modes(views, spread_views)
-        store, folder, first = self.store("test"), self.root / self.category, next(iter(self.chances))
+        store = self.store("test")
+        folder = self.root / self.category
+        first = next(iter(self.chances))
         if not any((folder / name / first).is_dir() for name in store.names):
             advice = "data toy writes those of test scenes, data render all with hidden=modes; prepared data have none"
             raise MissingFile(f"no test scene has images in each mode, such as {first}: {advice}", str(folder))

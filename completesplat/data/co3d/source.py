@@ -77,7 +77,8 @@ def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
 
     The 99 % and 1 % quantiles replace the largest and smallest values, because depth maps have outliers.
     """
-    count, points = min(len(frames), DEPTH_MAPS), []
+    count = min(len(frames), DEPTH_MAPS)
+    points = []
     for frame in (frames[i * len(frames) // count] for i in range(count)):
         with errors_at(frame=frame.number):
             points.append(_foreground(frame))
@@ -127,10 +128,12 @@ class CO3DSource(SequenceSource):
         return self._sequences[name]
 
     def _make(self, name: str) -> PosedSequence:
-        members, size = self._members, self.framing.image_size
+        members = self._members
+        size = self.framing.image_size
         frames = members.frames[name]
         placement = object_placement(members.point_clouds[name], frames, members.captured[name])
-        numbers, cameras = [frame.number for frame in frames], [frame.camera for frame in frames]
+        numbers = [frame.number for frame in frames]
+        cameras = [frame.camera for frame in frames]
         with errors_at(self._files[0]):
             read = partial(_read, name, frames, self.framing)
             sequence = placed_sequence(name, numbers, cameras, placement, self.framing, read)
@@ -140,7 +143,8 @@ class CO3DSource(SequenceSource):
 
 
 def _read(name: str, frames: list[CO3DFrame], framing: ObjectFraming, index: int) -> MaskedImage:
-    frame, image_size = frames[index], frames[index].camera.image_size
+    frame = frames[index]
+    image_size = frames[index].camera.image_size
     with errors_at(sequence=name, frame=frame.number):
         image = decode_image(frame.image, str(frame.image), "RGB", image_size)
         mask = decode_image(frame.mask, str(frame.mask), "L", image_size)

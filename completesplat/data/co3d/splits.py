@@ -79,14 +79,16 @@ def remove_test_sequences(path: Path, listed: Listed, rule: SeededSplit) -> tupl
         advice = "choose another data.subset, or set data.allow_shared_sequences=true"
         raise SharedSequences("; ".join([*overlaps(shared), advice]), str(path))
     lost = names["train"] & names["val"]
-    train, val = listed["train"], {frame for frame in listed["val"] if frame[0] not in lost}
+    train = listed["train"]
+    val = {frame for frame in listed["val"] if frame[0] not in lost}
     if not val and len(names["train"]) > 1:
         held_out = set(split_by_hash(sorted(names["train"]), rule.val_fraction, rule.split_seed)[1])
         logger.warning(
             "%s lists nothing for validation alone: %d of %d training sequences validate, by seed %d",
             *(path, len(held_out), len(names["train"]), rule.split_seed),
         )
-        val, lost = {frame for frame in train if frame[0] in held_out}, lost - held_out
+        val = {frame for frame in train if frame[0] in held_out}
+        lost = lost - held_out
         train = train - val
     return {"train": train, "val": val, "test": listed["test"]}, sorted(lost)
 
@@ -162,9 +164,12 @@ def read_category(
     folder = path_below(root, category)
     if not os.path.isdir(folder):
         raise DataError("no such CO3D category", str(folder))
-    frames_file, videos_file = folder / "frame_annotations.jgz", folder / "sequence_annotations.jgz"
-    set_list, refused = set_list_path(folder, subset), list[DataError]()
-    listed, lost = None, list[str]()
+    frames_file = folder / "frame_annotations.jgz"
+    videos_file = folder / "sequence_annotations.jgz"
+    set_list = set_list_path(folder, subset)
+    refused = list[DataError]()
+    listed = None
+    lost = list[str]()
     if set_list is not None:
         listed = read_set_list(set_list, refused)
         if not allow_shared:

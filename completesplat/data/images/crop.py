@@ -24,7 +24,8 @@ def principal_square(center: tuple[float, float], image_size: tuple[int, int]) -
 
     This is Splatter Image's crop (`co3d_normalisation.py`, `get_max_box_side`). The point must lie inside the image.
     """
-    (x, y), (height, width) = center, image_size
+    x, y = center
+    height, width = image_size
     half = min(x, y, width - x, height - y)
     if not half > 0:
         raise BadCamera(f"principal point ({x:g}, {y:g}) lies outside of the {width} x {height} image")

@@ -20,12 +20,14 @@ from completesplat.errors import BadImage, ImageError
 from completesplat.files import by_numbers
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
-HEIC, NEEDS_HEIC = (".heic", ".heif"), '; HEIC needs: pip install "completesplat[heic]"'
+HEIC = (".heic", ".heif")
+NEEDS_HEIC = '; HEIC needs: pip install "completesplat[heic]"'
 MOST_PIXELS = 64_000_000  # cameras of 61 million pixels are common
 MOST_BYTES = 2**28
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
 SIXTEEN_BIT_MODES = ("I;16", "I;16B", "I;16L")
-TIFF_BITS, TIFF_PHOTOMETRIC = 258, 262
+TIFF_BITS = 258
+TIFF_PHOTOMETRIC = 262
 TRANSPARENT = "has transparent pixels; lay it over a background first"
 LARGEST_SCALE = 2.0**112  # its product with the largest float16 still fits into float32
 

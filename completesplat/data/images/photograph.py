@@ -173,7 +173,8 @@ def _object_window(image: Image.Image, share: float | None) -> Window | None:
 
 def _centered_window(size: tuple[int, int], side: int, left: int = 0, top: int = 0) -> Window:
     """Return the square in the middle of a box, which may extend beyond it, as left, top, right and bottom."""
-    left, top = left + (size[0] - side) // 2, top + (size[1] - side) // 2
+    left = left + (size[0] - side) // 2
+    top = top + (size[1] - side) // 2
     return left, top, left + side, top + side
 
 
@@ -184,7 +185,9 @@ def _cropped(image: Image.Image, window: Window) -> Image.Image:
     if left >= 0 and top >= 0 and right <= image.width and bottom <= image.height:
         return image.crop(window)
     factor = -(-side // LARGEST_PADDED)
-    left, top, side = left // factor, top // factor, side // factor
+    left = left // factor
+    top = top // factor
+    side = side // factor
     return image.convert("RGBA").reduce(factor).crop((left, top, left + side, top + side))
 
 
@@ -273,7 +276,8 @@ def by_grabcut(image: Image.Image) -> Image.Image:
         extras = 'pip install "completesplat[background]", or "completesplat[grabcut]" (no download, coarser)'
         raise CompleteSplatError(f"background=remove needs rembg or OpenCV: {extras}") from error
     width, height = (max(SMALLEST_SIDE, round(side * GRABCUT_SIDE / max(image.size))) for side in image.size)
-    x, y = width // 30, height // 30  # at least one of them is above 0
+    x = width // 30
+    y = height // 30  # at least one of them is above 0
     rows, columns = np.ogrid[1 - height : height : 2, 1 - width : width : 2]
     labels = np.where(np.hypot(rows / height, columns / width) < MIDDLE, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels = np.pad(labels[y : height - y, x : width - x], ((y, y), (x, x)), constant_values=cv2.GC_BGD)
@@ -310,7 +314,8 @@ def image_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tens
 
     The measures of detail are the mean absolute differences between neighbours in a row, and in a column.
     """
-    means, deviations = images.mean((-2, -1)), images.std((-2, -1), correction=0)
+    means = images.mean((-2, -1))
+    deviations = images.std((-2, -1), correction=0)
     steps = [images.diff(dim=axis).abs().mean((-3, -2, -1))[..., None] for axis in (-1, -2)]
     return torch.cat([means, deviations, *steps], dim=-1)
 

@@ -90,8 +90,11 @@ def turn_hue(images: Float32[ndarray, "view 3 pixel"], turn: np.float32) -> None
 @helper
 def _turn(reds: Plane, greens: Plane, blues: Plane, turn: np.float32) -> None:
     for i in range(len(reds)):
-        red, green, blue = reds[i], greens[i], blues[i]
-        high, low = max(red, max(green, blue)), min(red, min(green, blue))
+        red = reds[i]
+        green = greens[i]
+        blue = blues[i]
+        high = max(red, max(green, blue))
+        low = min(red, min(green, blue))
         chroma = high - low
         share = ONE / chroma if chroma > ZERO else ZERO
         hue = (red - green) * share + FOUR
@@ -212,7 +215,8 @@ def augment(
     jitter_rng, flip_rng, boxes_rng, camera_rng = rng.spawn(4)
     if color_jitter is not None:
         images = color_jitter(scene.all_views().images, jitter_rng)
-        reference, targets = replace(scene.reference, images=images[0]), replace(scene.targets, images=images[1:])
+        reference = replace(scene.reference, images=images[0])
+        targets = replace(scene.targets, images=images[1:])
         scene = replace(scene, reference=reference, targets=targets)
     if horizontal_flip and flip_rng.random() < 0.5:
         scene = mirrored(scene)
@@ -231,5 +235,6 @@ def mirrored(scene: SceneBatch) -> SceneBatch:
         depths = None if views.depths is None else views.depths.flip(-1)
         return Views(views.images.flip(-1), mirror(views.cameras), views.masks.flip(-1), depths)
 
-    reference, targets = flipped(scene.reference), flipped(scene.targets)
+    reference = flipped(scene.reference)
+    targets = flipped(scene.targets)
     return replace(scene, reference=reference, targets=targets, visible=scene.visible.flip(-1))

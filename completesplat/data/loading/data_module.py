@@ -245,7 +245,8 @@ class SceneDataModule(LightningDataModule):
 
     def _check_training(self) -> None:
         """Raise if an epoch has fewer scenes than a batch, or every sequence has fewer frames than a scene needs."""
-        scenes, frames = self._training_scenes(), [1]
+        scenes = self._training_scenes()
+        frames = [1]
         names = scenes.store.names
         if self.batch_size > len(scenes):
             counted = f"{len(scenes)} scenes (data.references_per_sequence of each of {len(names)} sequences)"
@@ -282,8 +283,10 @@ class SceneDataModule(LightningDataModule):
     predict_dataloader = test_dataloader
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
-        store, seen = self.store(split), None if self.at_model_size is None else self.at_model_size.store(split)
-        choose, depths = partial(self.evaluation_views, split=split), split == "test"
+        store = self.store(split)
+        seen = None if self.at_model_size is None else self.at_model_size.store(split)
+        choose = partial(self.evaluation_views, split=split)
+        depths = split == "test"
         scenes = EvaluationScenes(store, choose, store.names, seen, depths)
         batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
         local = scenes.share(batch_size) if split == "test" else scenes

@@ -121,7 +121,10 @@ def write_cache(
     Args:
         batches: at least one batch of the sequences' stored frames, in their order, each with its moment sums.
     """
-    total, written, schema, waiting = np.zeros(()), 0, latent_schema(origin), Rows()
+    total = np.zeros(())
+    written = 0
+    schema = latent_schema(origin)
+    waiting = Rows()
     with (
         atomic_path(folder / FILE, f"{FILE}{UNFINISHED}") as unfinished,
         unfinished.open("wb") as file,
@@ -140,7 +143,8 @@ def write_cache(
                 writer.write_batch(pa.RecordBatch.from_arrays([pa.array([sequence.name]), *lists], schema=schema))
                 waiting = {name: values[count:] for name, values in waiting.items()}
                 written += 1
-    shapes, size = {name: rows.shape[1:] for name, rows in waiting.items()}, (folder / FILE).stat().st_size
+    shapes = {name: rows.shape[1:] for name, rows in waiting.items()}
+    size = (folder / FILE).stat().st_size
     manifest = LatentCacheManifest(__version__, origin, *moments(total), shapes, tuple(sequences), size)
     text = json.dumps({**HEADER, **asdict(manifest)}, indent=2, allow_nan=False) + "\n"
     write_text(folder / MANIFEST, text.replace(NO_SUM, sha256(text.encode()).hexdigest()))
@@ -161,11 +165,13 @@ class LatentCache:
             raise MissingFile("no finished latent cache: completesplat data latents makes one", str(folder))
         self.folder = folder
         self.manifest = read_as(LatentCacheManifest, folder / MANIFEST, HEADER, ADVICE)
-        text, digest = (folder / MANIFEST).read_text(), self.manifest.sha256
+        text = (folder / MANIFEST).read_text()
+        digest = self.manifest.sha256
         if sha256(text.replace(digest, NO_SUM).encode()).hexdigest() != digest:
             raise ChangedFile(f"its checksum is another: {ADVICE}", str(folder / MANIFEST))
         self.origin = self.manifest.origin
-        self.mean, self.std = self.manifest.mean, self.manifest.std
+        self.mean = self.manifest.mean
+        self.std = self.manifest.std
         self.sequences = {sequence.name: sequence for sequence in self.manifest.sequences}
         self._places = {name: place for place, name in enumerate(self.sequences)}
         with errors_at(file=require_file(folder / FILE)):

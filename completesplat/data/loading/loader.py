@@ -112,8 +112,10 @@ class SceneLoader:
         Raises:
             DataError: an item cannot be read and `on_bad` is "raise", too many cannot be read, or none can.
         """
-        resume, self._resume = self._resume, {}
-        self.refused, self.refused_depths = [], []
+        resume = self._resume
+        self._resume = {}
+        self.refused = []
+        self.refused_depths = []
         self._batches = resume.get("batches", 0) if resume.get("epoch") == self._epoch else 0
         if self._order is not None:
             self._order.start = self._batches * self.batch_size
@@ -171,5 +173,6 @@ class SceneLoader:
     def _report(self) -> None:
         if self.refused:
             kinds = ", ".join(f"{count} {kind}" for kind, count in Counter(e.kind for e in self.refused).most_common())
-            count, first = f"{len(self.refused)} of {self._items}", self.refused[0]
+            count = f"{len(self.refused)} of {self._items}"
+            first = self.refused[0]
             logger.warning("skipped %s items (%s); the first: %s", count, kinds, first)

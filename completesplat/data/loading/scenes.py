@@ -55,10 +55,12 @@ class SceneStore:
         """Return the scene of the views with these indices, in the reference camera's coordinates."""
         views = [reference, *targets]
         pairs = [self._read(sequence, view) for view in views]
-        images, masks = _as_floats([pair.image for pair in pairs]), self._masks(pairs)
+        images = _as_floats([pair.image for pair in pairs])
+        masks = self._masks(pairs)
         cameras = sequence.cameras[views].relative_to(sequence.cameras[reference]).to(torch.float32)
         loaded = Views(images, cameras, masks)
-        depth_range, frame = sequence.depth_ranges[reference], torch.tensor(reference)
+        depth_range = sequence.depth_ranges[reference]
+        frame = torch.tensor(reference)
         return SceneBatch(loaded[0], loaded[1:], depth_range, torch.ones_like(masks[0]), frame, sequence.name)
 
     def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
@@ -199,7 +201,8 @@ def with_true_depths(scene: SceneBatch, sequence: PosedSequence, reference: int,
 
 
 def _with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]) -> SceneBatch:
-    reference, targets = replace(scene.reference, depths=depths[0]), replace(scene.targets, depths=depths[1:])
+    reference = replace(scene.reference, depths=depths[0])
+    targets = replace(scene.targets, depths=depths[1:])
     return replace(scene, reference=reference, targets=targets)
 
 

@@ -15,9 +15,11 @@ from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras
 
 # A mean over all images of RealEstate10K's 66,033 training clips would take hours.
-SEQUENCES, IMAGES = 400, 8192
+SEQUENCES = 400
+IMAGES = 8192
 # Fewer images suffice for the standard deviations of eight features.
-FEATURE_IMAGES, SMALLEST_DEVIATION = 1024, 1e-3
+FEATURE_IMAGES = 1024
+SMALLEST_DEVIATION = 1e-3
 LEAST_TURN = 0.1  # radians, root mean square; image axes that turn less show no horizon
 
 
@@ -46,7 +48,8 @@ def world_up(cameras: Cameras) -> Float[Tensor, "3"]:
     cameras' up directions (after `co3d_normalisation.py` of Splatter Image). If the cameras hardly turn, no horizon
     follows from them, and up is the mean of their up directions.
     """
-    horizontal, down = cameras.world_to_camera[:, 0, :3], cameras.world_to_camera[:, 1, :3]
+    horizontal = cameras.world_to_camera[:, 0, :3]
+    down = cameras.world_to_camera[:, 1, :3]
     _, lengths, axes = torch.linalg.svd(horizontal)
     if not (lengths[1:2] > LEAST_TURN * len(horizontal) ** 0.5).any():
         return -torch.nn.functional.normalize(down.mean(dim=0), dim=0)
@@ -63,7 +66,8 @@ def mean_camera(store: SceneStore) -> TypicalCamera:
 
 def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]:
     """Average the images of the same frames; return black if none can be read."""
-    total, count = torch.zeros(3, size, size, dtype=torch.float64), 0
+    total = torch.zeros(3, size, size, dtype=torch.float64)
+    count = 0
     for image in _images(store, IMAGES):
         total += image
         count += 1

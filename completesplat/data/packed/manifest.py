@@ -103,7 +103,8 @@ def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:
     Raises:
         DataError: settings differ; the message names each of them.
     """
-    stored, wanted = read_manifest(root).settings, dict(settings)
+    stored = read_manifest(root).settings
+    wanted = dict(settings)
     sizes = stored.get("image_size"), wanted.get("image_size")
     if isinstance(sizes[0], int) and isinstance(sizes[1], int) and sizes[0] > sizes[1]:
         wanted["image_size"] = sizes[0]  # larger images are reduced when they are read

@@ -94,7 +94,8 @@ def encode_image(sequence: PosedSequence, index: int, codec: str) -> EncodedImag
 
 def to_row(sequence: PosedSequence, usable: Sequence[int], images: Sequence[EncodedImage]) -> pa.Table:
     """Return a table of one row with the frames whose indices are `usable`, and their `images`."""
-    indices, cameras = list(usable), sequence.cameras
+    indices = list(usable)
+    cameras = sequence.cameras
     numbers = {
         "frames": np.array([sequence.frames[index] for index in indices], dtype=np.int64),
         "world_to_camera": cameras.world_to_camera[indices].double().numpy().ravel(),
@@ -137,12 +138,14 @@ def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None)
         cameras = Cameras(world_to_camera, torch.from_numpy(numbers["intrinsics"]).view(count, 3, 3), (size, size))
         side = image_size or size
         depth_ranges = torch.from_numpy(numbers["depth_ranges"]).view(count, 2)
-        images, masks = _values(row, "images", count), _values(row, "masks", count)
+        images = _values(row, "images", count)
+        masks = _values(row, "masks", count)
         checksums = _numbers(row, "picture_checksums", count)
 
         def read(index: int) -> MaskedImage:  # It does not access the bytes of other frames.
             with errors_at(file=file, sequence=name, frame=frames[index]):
-                image, mask = images[index].as_py(), masks[index].as_py()
+                image = images[index].as_py()
+                mask = masks[index].as_py()
                 if image is None or EncodedImage(image, mask).checksum() != checksums[index]:
                     raise BadImage("is no longer what was written")
                 coverage = None if mask is None else decode_square(mask, 1, size, side)

@@ -79,7 +79,8 @@ class ShardWriter:
         """
         path = self.folder / plan.file
         refused: list[Refusal] = []
-        names, frames = [], 0
+        names = []
+        frames = 0
         # One record batch for each sequence, so that memory holds only one sequence.
         with atomic_path(path, f"{path.name}{UNFINISHED}") as unfinished:
             with unfinished.open("wb") as stream, pa.ipc.new_stream(stream, SCHEMA) as writer:
@@ -96,7 +97,8 @@ class ShardWriter:
         return record
 
     def _encode(self, sequence: PosedSequence, refused: list[Refusal]) -> pa.Table:
-        usable, images = [], []
+        usable = []
+        images = []
         for index, number in enumerate(sequence.frames):
             with refused_to(partial(self._refuse, refused), frame=number, sequence=sequence.name):
                 images.append(encode_image(sequence, index, self.codec))
@@ -251,7 +253,8 @@ def _finish(manifest: PackedManifest, out: Path, max_bad_fraction: float) -> Non
     """Refuse a store with too many errors or no sequences; else write the manifest and log a summary."""
     refused = [refusal for split in manifest.splits.values() for refusal in split.refused]
     shards = [shard for split in manifest.splits.values() for shard in split.shards]
-    sequences, frames = sum(len(shard.sequences) for shard in shards), sum(shard.frames for shard in shards)
+    sequences = sum(len(shard.sequences) for shard in shards)
+    frames = sum(shard.frames for shard in shards)
     counts = Counter(refusal.kind for refusal in refused)
     kinds = ", ".join(f"{count:,} x {kind}" for kind, count in counts.most_common()) or "nothing"
     if not sequences:
@@ -270,5 +273,6 @@ def _finish(manifest: PackedManifest, out: Path, max_bad_fraction: float) -> Non
 def _bad_share(refused: Sequence[Refusal], sequences: int, frames: int) -> float:
     """Return the share of refused frames or of refused sequences, the larger one, given the numbers of the others."""
     of_sequences = {refusal.sequence or refusal.file for refusal in refused if refusal.frame is None}
-    bad_frames, bad_sequences = sum(refusal.frame is not None for refusal in refused), len(of_sequences)
+    bad_frames = sum(refusal.frame is not None for refusal in refused)
+    bad_sequences = len(of_sequences)
     return max(bad_frames / (bad_frames + frames), bad_sequences / (bad_sequences + sequences))

@@ -78,7 +78,8 @@ def make_clip(key: str, source: Path, timestamps: Sequence[int], rows: Float[Ten
         raise TooFewFrames(f"{len(rows)} frames, at least two are needed")
     with errors_at(frame=0):
         size = stored_size(*_stored(images[0], source), FORMATS)
-    rows, count = rows.double(), Counter(timestamps)
+    rows = rows.double()
+    count = Counter(timestamps)
     world_to_camera = rows[:, 6:].reshape(-1, 3, 4)
     rotation = world_to_camera[:, :, :3]
     deviation = (rotation @ rotation.mT - torch.eye(3, dtype=rows.dtype)).abs().amax(dim=(1, 2))
@@ -94,7 +95,8 @@ def make_clip(key: str, source: Path, timestamps: Sequence[int], rows: Float[Ten
             raise kind(reason, frame=int(bad.nonzero()[0]))
     intrinsics, pose = (torch.eye(n, dtype=rows.dtype).repeat(len(rows), 1, 1) for n in (3, 4))
     sides = rows.new_tensor(size[::-1])
-    intrinsics[:, [0, 1], [0, 1]], intrinsics[:, :2, 2] = rows[:, :2] * sides, rows[:, 2:4] * sides
+    intrinsics[:, [0, 1], [0, 1]] = rows[:, :2] * sides
+    intrinsics[:, :2, 2] = rows[:, 2:4] * sides
     pose[:, :3] = world_to_camera
     return Clip(key, source, Cameras(pose, intrinsics, size), images)
 
@@ -149,7 +151,8 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
     """Return timestamps and camera rows. Above them is the video's address, which some copies lack."""
-    timestamps, rows = [], []
+    timestamps = []
+    rows = []
     lines = [line.split() for line in read_text(path, MOST_BYTES).splitlines() if line.strip()]
     for frame, columns in enumerate(lines[1:] if lines and len(lines[0]) == 1 else lines):
         with errors_at(frame=frame):
@@ -252,7 +255,9 @@ def read_chunk(path: Path) -> Chunk:
 
 
 def _clip_from_entry(path: Path, key: str, entry: dict[str, object]) -> Clip:
-    images, times, rows = entry.get("images"), entry.get("timestamps"), entry.get("cameras")
+    images = entry.get("images")
+    times = entry.get("timestamps")
+    rows = entry.get("cameras")
     if not isinstance(images, list) or not all(_is_bytes(image) for image in images):
         raise BadAnnotation("images are not a list of JPEG files (uint8)")
     if not _is_plain(rows) or not rows.is_floating_point() or rows.shape[1:] != (CAMERA_NUMBERS,):

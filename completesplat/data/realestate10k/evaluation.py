@@ -10,7 +10,9 @@ from completesplat.data.sequences import PosedSequence, SequenceSource, first_na
 from completesplat.data.validation import read_json, read_text
 from completesplat.errors import BadAnnotation, DataError, errors_at
 
-CONTEXT, TARGET, SCORED = "context", "target", "target_quantify"
+CONTEXT = "context"
+TARGET = "target"
+SCORED = "target_quantify"
 LINE = "KEY source target target target"
 
 logger = logging.getLogger(__name__)
@@ -91,15 +93,18 @@ def choose_clips(source: SequenceSource, index: EvaluationIndex | None, listed: 
 
     Log the number of tests and the clips that are left out, as a warning if some of them are missing in the data.
     """
-    keys, tests = source.names, dict[str, list[Choice]]() if index is None else index.views
-    left_out, absent = dict[str, list[str]](), set[str]()
+    keys = source.names
+    tests = dict[str, list[Choice]]() if index is None else index.views
+    left_out = dict[str, list[str]]()
+    absent = set[str]()
     if index is not None:
         left_out["null in the index"] = [key for key in tests if not tests[key]]
         keys = [key for key in keys if tests.get(key) != []]
     wanted = {"index": None if index is None else [key for key in tests if tests[key]], "list": listed}
     for what, names in wanted.items():
         if names is not None:
-            selected, known = set(names), set(source.names)
+            selected = set(names)
+            known = set(source.names)
             missing = [name for name in dict.fromkeys(names) if name not in known]
             left_out[f"in the {what}, not in the data"] = missing
             left_out[f"not in the {what}"] = [key for key in keys if key not in selected]
@@ -112,7 +117,8 @@ def choose_clips(source: SequenceSource, index: EvaluationIndex | None, listed: 
 
 def _named_tests(keys: Sequence[str], tests: Mapping[str, list[Choice]]) -> tuple[dict[str, str], dict[str, Choice]]:
     """Return clips and views by the name of their test; clips without an index are their own tests."""
-    clips, views = dict[str, str](), dict[str, Choice]()
+    clips = dict[str, str]()
+    views = dict[str, Choice]()
     for key in keys:
         choices = tests.get(key, [])
         names = [key] if len(choices) < 2 else [f"{key}#{number}" for number in range(1, len(choices) + 1)]
@@ -133,7 +139,8 @@ def _report(scenes: int, clips: int, left_out: Mapping[str, list[str]], level: i
 def _from_table(content: object) -> EvaluationIndex:
     if not isinstance(content, dict):
         raise BadAnnotation("not a table of clips")
-    forms, views = dict[str, None](), dict[str, list[Choice]]()
+    forms = dict[str, None]()
+    views = dict[str, list[Choice]]()
     for key, value in content.items():
         with errors_at(sequence=key):
             entries = [] if value is None else value if isinstance(value, list) else [value]

@@ -63,7 +63,8 @@ class RE10KSource(SequenceSource):
 
     def read(self, name: str) -> PosedSequence:
         """Read one clip's cameras; its images are read by `PosedSequence.read`."""
-        clip, framing = self._clips.clip(name), self.framing
+        clip = self._clips.clip(name)
+        framing = self.framing
         count = len(clip.images)
         squares = [_square(clip, framing.crop, frame) for frame in range(count)]
         if len(set(squares)) == 1:
@@ -185,7 +186,8 @@ class RE10KDataModule(SceneDataModule):
     def check_test(self) -> None:
         """Read all clips of an evaluation index, chunks as a whole, because clips may lack its frames."""
         if self.index is not None:
-            store, refused = self.store("test"), list[DataError]()
+            store = self.store("test")
+            refused = list[DataError]()
             for name in store.names:
                 with refused_to(refused.append, sequence=name):
                     store.source.read(name)

@@ -21,7 +21,8 @@ IMPORTERS = {
 }
 # With these, an importer keeps vertices that are not finite, which it would otherwise move to the origin.
 AS_STORED = {"stl": {"use_mesh_validate": False}, **{kind: {"validate_meshes": False} for kind in ("obj", *USD)}}
-MOST, FAR = 0.99, 4.0  # share of the surface, and its reach times which faces count as stray
+MOST = 0.99
+FAR = 4.0  # share of the surface, and its reach times which faces count as stray
 
 
 class RefusedMesh(Exception):
@@ -151,7 +152,8 @@ def normalize(objects: list[Any]) -> dict[str, Any]:
 def faces_of(mesh: Any) -> tuple[Any, Any, Any]:
     """Return the places of all faces' corners [n 3], and each face's number of corners and area."""
     places = values_of(mesh.vertices, "co", np.float32, 3).reshape(-1, 3)[values_of(mesh.loops, "vertex_index")]
-    sizes, areas = values_of(mesh.polygons, "loop_total"), values_of(mesh.polygons, "area", np.float32)
+    sizes = values_of(mesh.polygons, "loop_total")
+    areas = values_of(mesh.polygons, "area", np.float32)
     return places.astype(np.float64), sizes, areas.astype(np.float64)
 
 
@@ -166,7 +168,8 @@ def stray_faces(corners: Any, sizes: Any, areas: Any) -> Any:
 
     The ball's centre is the median of the faces, weighted by area, which stray faces do not move.
     """
-    firsts, weights = np.cumsum(sizes) - sizes, areas + 1e-300  # equal if no face has an area
+    firsts = np.cumsum(sizes) - sizes
+    weights = areas + 1e-300  # equal if no face has an area
     middle = [quantile(places, weights, 0.5) for places in corners[firsts].T]
     reaches = np.maximum.reduceat(np.linalg.norm(corners - middle, axis=1), firsts)
     return reaches > FAR * quantile(reaches, weights, MOST)

@@ -37,11 +37,17 @@ def paint_back(objects: list[Any], toward: list[float], least: float) -> Any:
     group = bpy.data.node_groups.new("back", "ShaderNodeTree")
     for side in ("INPUT", "OUTPUT"):
         group.interface.new_socket("Shader", in_out=side, socket_type="NodeSocketShader")
-    new, link = group.nodes.new, group.links.new
+    new = group.nodes.new
+    link = group.links.new
     color, paint, mix = (new(f"ShaderNode{kind}") for kind in ("RGB", "BsdfDiffuse", "MixShader"))
-    facing, away, seen = new("ShaderNodeVectorMath"), new("ShaderNodeMath"), new("ShaderNodeMath")
-    facing.operation, away.operation, seen.operation = "DOT_PRODUCT", "LESS_THAN", "MULTIPLY"
-    facing.inputs[1].default_value, away.inputs[1].default_value = toward, -least
+    facing = new("ShaderNodeVectorMath")
+    away = new("ShaderNodeMath")
+    seen = new("ShaderNodeMath")
+    facing.operation = "DOT_PRODUCT"
+    away.operation = "LESS_THAN"
+    seen.operation = "MULTIPLY"
+    facing.inputs[1].default_value = toward
+    away.inputs[1].default_value = -least
     link(new("ShaderNodeNewGeometry").outputs["True Normal"], facing.inputs[0])
     link(facing.outputs["Value"], away.inputs[0])
     link(away.outputs[0], seen.inputs[0])
@@ -79,7 +85,8 @@ def surface_material(pattern: str, colors: list[list[float]], repeats: float, fi
     """Return a matt material: an image file, or two colours in a pattern (`checker` or `noise`)."""
     material, shader = new_material()
     shader.inputs["Roughness"].default_value = 0.8
-    nodes, link = material.node_tree.nodes, material.node_tree.links.new
+    nodes = material.node_tree.nodes
+    link = material.node_tree.links.new
     scale = nodes.new("ShaderNodeVectorMath")
     scale.operation = "SCALE"
     scale.inputs["Scale"].default_value = repeats
@@ -109,7 +116,8 @@ def add_surroundings(job: dict[str, Any], ground: float) -> None:
         add_plane([(x, y, ground) for x, y in square], job["floor"])
     if job["wall"]:
         for (x, y), (next_x, next_y) in zip(square, [*square[1:], square[0]], strict=True):
-            low, high = ground, ground + 2 * side
+            low = ground
+            high = ground + 2 * side
             wall = add_plane([(x, y, low), (next_x, next_y, low), (next_x, next_y, high), (x, y, high)], job["wall"])
             wall.visible_shadow = False
 
@@ -119,17 +127,20 @@ def add_light(light: dict[str, Any]) -> None:
     world = bpy.data.worlds.new("world")
     bpy.context.scene.world = world
     world.use_nodes = True
-    nodes, link = world.node_tree.nodes, world.node_tree.links.new
+    nodes = world.node_tree.nodes
+    link = world.node_tree.links.new
     direction = nodes.new("ShaderNodeTexCoord").outputs["Generated"]
     if "file" in light:
-        turn, texture = nodes.new("ShaderNodeMapping"), nodes.new("ShaderNodeTexEnvironment")
+        turn = nodes.new("ShaderNodeMapping")
+        texture = nodes.new("ShaderNodeTexEnvironment")
         turn.inputs["Rotation"].default_value[2] = light["turn"]
         texture.image = bpy.data.images.load(light["file"])
         link(direction, turn.inputs["Vector"])
         link(turn.outputs["Vector"], texture.inputs["Vector"])
         link(texture.outputs["Color"], nodes["Background"].inputs["Color"])
         return
-    height, mix = nodes.new("ShaderNodeSeparateXYZ"), nodes.new("ShaderNodeMixRGB")
+    height = nodes.new("ShaderNodeSeparateXYZ")
+    mix = nodes.new("ShaderNodeMixRGB")
     link(direction, height.inputs[0])
     link(height.outputs["Z"], mix.inputs["Fac"])
     mix.use_clamp = True
@@ -137,7 +148,9 @@ def add_light(light: dict[str, Any]) -> None:
         mix.inputs[name].default_value = (*color, 1.0)
     link(mix.outputs["Color"], nodes["Background"].inputs["Color"])
     sun = bpy.data.lights.new("sun", "SUN")
-    sun.energy, sun.color, sun.angle = light["strength"], light["color"], light["angle"]
+    sun.energy = light["strength"]
+    sun.color = light["color"]
+    sun.angle = light["angle"]
     lamp = bpy.data.objects.new("sun", sun)
     lamp.rotation_euler = (math.pi / 2 - light["elevation"], 0, light["azimuth"])
     bpy.context.scene.collection.objects.link(lamp)
@@ -148,30 +161,42 @@ def set_camera(view: dict[str, Any]) -> None:
 
     Blender's camera looks along -z with +y up. Its shifts are in units of the image's width, and move the frame.
     """
-    scene, (width, height), (x, y) = bpy.context.scene, view["size"], view["center"]
-    scene.render.resolution_x, scene.render.resolution_y = width, height
+    scene = bpy.context.scene
+    width, height = view["size"]
+    x, y = view["center"]
+    scene.render.resolution_x = width
+    scene.render.resolution_y = height
     camera = scene.camera
     camera.matrix_world = Matrix(view["world_to_camera"]).inverted() @ Matrix.Diagonal((1, -1, -1, 1))
-    camera.data.sensor_fit, camera.data.sensor_width = "HORIZONTAL", SENSOR
+    camera.data.sensor_fit = "HORIZONTAL"
+    camera.data.sensor_width = SENSOR
     camera.data.lens = view["focal"] * SENSOR / width
-    camera.data.shift_x, camera.data.shift_y = (width / 2 - x) / width, (y - height / 2) / width
-    camera.data.clip_start, camera.data.clip_end = 1e-3, 1e4
+    camera.data.shift_x = (width / 2 - x) / width
+    camera.data.shift_y = (y - height / 2) / width
+    camera.data.clip_start = 1e-3
+    camera.data.clip_end = 1e4
 
 
 def set_up_renderer(objects: list[Any]) -> None:
     """Select Cycles on one CPU thread, without its caustics, and mark the object for the coverage pass."""
-    scene, layer = bpy.context.scene, bpy.context.view_layer
+    scene = bpy.context.scene
+    layer = bpy.context.view_layer
     scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(scene.camera)
-    scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
-    scene.render.threads_mode, scene.render.threads = "FIXED", 1
-    scene.render.use_persistent_data, scene.render.resolution_percentage = True, 100
-    scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGB"
+    scene.render.engine = "CYCLES"
+    scene.cycles.device = "CPU"
+    scene.render.threads_mode = "FIXED"
+    scene.render.threads = 1
+    scene.render.use_persistent_data = True
+    scene.render.resolution_percentage = 100
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.image_settings.color_mode = "RGB"
     scene.view_settings.view_transform = "Standard"
     scene.cycles.use_adaptive_sampling = False
     scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = False
     # Colours alone: albedo and normals cost small images more time than samples that reduce noise as much.
-    scene.cycles.denoiser, scene.cycles.denoising_input_passes = "OPENIMAGEDENOISE", "RGB"
+    scene.cycles.denoiser = "OPENIMAGEDENOISE"
+    scene.cycles.denoising_input_passes = "RGB"
     layer.use_pass_z = layer.use_pass_object_index = layer.use_pass_cryptomatte_asset = True
     owner = bpy.data.objects.new("object", None)  # parts count as one asset if they have one parent
     scene.collection.objects.link(owner)
@@ -183,9 +208,11 @@ def set_up_outputs(folder: Path) -> dict[str, Any]:
     """Return nodes that write the object's coverage, and depth with object index, as OpenEXR files into `folder`."""
     scene = bpy.context.scene
     scene.use_nodes = True
-    nodes, link = scene.node_tree.nodes, scene.node_tree.links.new
+    nodes = scene.node_tree.nodes
+    link = scene.node_tree.links.new
     nodes.clear()
-    layers, both = nodes.new("CompositorNodeRLayers"), nodes.new("CompositorNodeCombineColor")
+    layers = nodes.new("CompositorNodeRLayers")
+    both = nodes.new("CompositorNodeCombineColor")
     link(layers.outputs["Image"], nodes.new("CompositorNodeComposite").inputs["Image"])
     matte = nodes.new("CompositorNodeCryptomatteV2")
     matte.layer_name = f"{bpy.context.view_layer.name}.CryptoAsset"
@@ -196,8 +223,11 @@ def set_up_outputs(folder: Path) -> dict[str, Any]:
     outputs = {}
     for name, socket in {"coverage": matte.outputs["Matte"], "geometry": both.outputs["Image"]}.items():
         outputs[name] = output = nodes.new("CompositorNodeOutputFile")
-        output.base_path, output.file_slots[0].path = str(folder), f"{name}_"
-        output.format.file_format, output.format.color_mode, output.format.color_depth = "OPEN_EXR", "RGB", "32"
+        output.base_path = str(folder)
+        output.file_slots[0].path = f"{name}_"
+        output.format.file_format = "OPEN_EXR"
+        output.format.color_mode = "RGB"
+        output.format.color_depth = "32"
         link(socket, output.inputs[0])
     return outputs
 
@@ -209,7 +239,8 @@ def render(folder: Path, views: list[dict[str, Any]], samples: int, paint: Any, 
     further = [("", f"{index}_", color) for index, color in enumerate(colors) if index]
     for task, prefix, color in [("coverage", "", (*colors, None)[0]), *further, ("geometry", "", None)]:
         images = task != "geometry"
-        scene.cycles.samples, scene.cycles.use_denoising = samples if images else 1, images
+        scene.cycles.samples = samples if images else 1
+        scene.cycles.use_denoising = images
         scene.cycles.max_bounces = BOUNCES if images else 0
         scene.cycles.pixel_filter_type = "BLACKMAN_HARRIS" if images else "GAUSSIAN"
         scene.cycles.filter_width = 1.5 if images else TINY_FILTER
@@ -219,7 +250,8 @@ def render(folder: Path, views: list[dict[str, Any]], samples: int, paint: Any, 
             paint.default_value = (*color, 1.0)
         for number, view in enumerate(views):
             set_camera(view)
-            scene.frame_current, scene.cycles.seed = number, number
+            scene.frame_current = number
+            scene.cycles.seed = number
             scene.render.filepath = str(folder / f"{prefix}{number:04d}.png")
             bpy.ops.render.render(write_still=images)
     for number in range(len(views)):

@@ -82,7 +82,9 @@ def run_job(
         minutes: time after which Blender is killed; the job's `memory` (bytes) limits it on Linux.
     """
     end = time.monotonic() + 60 * minutes
-    path, messages, memory = folder / "job.json", folder / "messages.txt", job.get("memory")
+    path = folder / "job.json"
+    messages = folder / "messages.txt"
+    memory = job.get("memory")
     path.write_text(json.dumps(job))
     separator = () if PYTHON_OPTIONS[0] in blender.command else ("--",)
     with messages.open("wb") as output:

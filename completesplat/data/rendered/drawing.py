@@ -19,8 +19,10 @@ from completesplat.settings.schema import Entries, Natural, Positive, Range, Sid
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 # Distance at which the ball around the object touches the image's border, times this.
-NEAREST, FARTHEST = 0.9, 1.2
-ROOM, SMALLEST_ROOM = 1.3, 3.0  # half size of a room: relative to the farthest camera, and at least
+NEAREST = 0.9
+FARTHEST = 1.2
+ROOM = 1.3
+SMALLEST_ROOM = 3.0  # half size of a room: relative to the farthest camera, and at least
 TEXTURES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 ENVIRONMENTS = (".hdr", ".exr")
 WHITE_FLOOR = 0.5, 1.1
@@ -65,7 +67,9 @@ def draw_rendered_scene(name: str, settings: RenderSettings) -> tuple[dict[str, 
     """Draw surroundings and cameras by the seed and an object's name; return them for `_scene_script.py`."""
     digest = hashlib.sha256(name.encode()).digest()
     rng = np.random.default_rng([settings["seed"], int.from_bytes(digest[:8])])
-    views, size, front = settings["views"], settings["size"], settings["front"]
+    views = settings["views"]
+    size = settings["size"]
+    front = settings["front"]
     cameras = draw_cameras(rng, settings["cameras"], views, settings["fov"], size, front)
     job = {
         "seed": int(rng.integers(2**31)),
@@ -81,7 +85,8 @@ def draw_rendered_scene(name: str, settings: RenderSettings) -> tuple[dict[str, 
 
 
 def _view(camera: Cameras) -> dict[str, Any]:
-    focal, center = camera.intrinsics[0, 0].item(), camera.intrinsics[:2, 2].tolist()
+    focal = camera.intrinsics[0, 0].item()
+    center = camera.intrinsics[:2, 2].tolist()
     size = camera.image_size[::-1]
     return {"world_to_camera": camera.world_to_camera.tolist(), "focal": focal, "center": center, "size": size}
 
@@ -141,10 +146,13 @@ def draw_light(rng: np.random.Generator, light: str) -> dict[str, Any]:
     """Draw a sun and a sky (`random`), or the turn of an environment map's file."""
     if light != "random":
         return {"file": os.path.abspath(light), "turn": rng.uniform(0, 2 * np.pi)}
-    warm, elevation = rng.uniform(), math.radians(rng.uniform(30, 80))
+    warm = rng.uniform()
+    elevation = math.radians(rng.uniform(30, 80))
     # Radiance of a white floor, as if the camera had chosen its exposure, and the sun's part of it.
-    white, part = rng.uniform(*WHITE_FLOOR), rng.uniform(0.2, 0.8)
-    horizon, zenith = np.array([0.9, 0.95, 1.0]), np.array([0.3, 0.5, 1.0]) + rng.uniform(0, 0.6)
+    white = rng.uniform(*WHITE_FLOOR)
+    part = rng.uniform(0.2, 0.8)
+    horizon = np.array([0.9, 0.95, 1.0])
+    zenith = np.array([0.3, 0.5, 1.0]) + rng.uniform(0, 0.6)
     return {
         "sky": [((1 - part) * white * color.clip(0, 1)).tolist() for color in (horizon, zenith)],
         "strength": math.pi * part * white / math.sin(elevation),
@@ -182,7 +190,8 @@ def draw_back(rng: np.random.Generator, first: Cameras, hidden: str) -> dict[str
     drawn = str(rng.choice(list(PAINTS), p=[paint.chance for paint in PAINTS.values()]))
     names = [drawn, *(name for name in PAINTS if name != drawn and hidden == "modes")]
     distance = first.centers.norm().item()
-    toward, colors = (first.centers / distance).tolist(), [PAINTS[name].color for name in names]
+    toward = (first.centers / distance).tolist()
+    colors = [PAINTS[name].color for name in names]
     return {"toward": toward, "least": 1 / distance, "modes": names, "colors": colors}
 
 

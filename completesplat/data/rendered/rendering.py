@@ -39,13 +39,17 @@ from completesplat.settings.schema import Natural, Positive, Range
 logger = logging.getLogger(__name__)
 
 CATEGORY = "rendered"
-DESCRIPTION, OBJECT, BROKEN, LOCK = "rendered.json", "object.json", "broken.json", ".rendered.lock"
+DESCRIPTION = "rendered.json"
+OBJECT = "object.json"
+BROKEN = "broken.json"
+LOCK = ".rendered.lock"
 FORMAT_VERSION = 2
 SUFFIXES = ("glb", "gltf", "obj", "ply", "stl", "fbx", "usd", "usda", "usdc", "usdz")
 MOST_POINTS = 20_000
 SKY = 1e9  # Cycles has 1e10 where no surface is
 MEGABYTE = 1_000_000
-LEAST_MEMORY, MEMORY_OF_BYTE = 4000 * MEGABYTE, 20  # of Blender for a mesh: bytes, and for each byte of its file
+LEAST_MEMORY = 4000 * MEGABYTE
+MEMORY_OF_BYTE = 20  # of Blender for a mesh: bytes, and for each byte of its file
 MOST_OPTIONS = 30  # words before the name of a texture
 
 
@@ -191,10 +195,12 @@ def render(
     check_surroundings(settings)
     draw_rendered_scene("", settings)  # refuses cameras that cannot be read
     objects = find_meshes(Path(meshes)) if meshes is not None else []
-    program, category = find_blender(blender), out / CATEGORY
+    program = find_blender(blender)
+    category = out / CATEGORY
     objects = objects or procedural_objects(program, str(factory), count)
     mine = share_of(objects, job["shard"], job["shards"])
-    parameters, lock = {"format": FORMAT_VERSION, **settings}, FileLock(out / LOCK)
+    parameters = {"format": FORMAT_VERSION, **settings}
+    lock = FileLock(out / LOCK)
     out.mkdir(parents=True, exist_ok=True)
     with lock:
         if not writing.is_written(category / DESCRIPTION, parameters):
@@ -248,7 +254,8 @@ def _write_object(
     category: Path, program: Blender, settings: RenderSettings, most: tuple[int, float], asset: Asset, stopped: Event
 ) -> tuple[str, str]:
     """Render an object into its folder, whole or not at all; return its name, and why it is left out (or "")."""
-    mesh, (most_bytes, minutes) = asset.mesh, most
+    mesh = asset.mesh
+    most_bytes, minutes = most
     try:
         job, cameras = draw_rendered_scene(asset.key, settings)
         job["factory"] = asset.factory
@@ -288,7 +295,9 @@ def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Came
     """Write images, masks, depths and points from the files of Blender; return the annotations."""
     for kind in writing.FOLDERS:
         (folder / kind).mkdir()
-    frames, points, colors = list[writing.Annotation](), [], []
+    frames = list[writing.Annotation]()
+    points = []
+    colors = []
     for number, camera in enumerate(cameras):
         image = _pixels(files / f"{number:04d}.png")
         depth, seen, coverage = np.moveaxis(np.load(files / f"{number:04d}.npy"), -1, 0)
@@ -320,8 +329,10 @@ def _pixels(path: Path) -> Float[np.ndarray, "height width 3"]:
 
 def _viewpoint(camera: Cameras) -> dict[str, object]:
     half = np.array(camera.image_size[::-1]) / 2
-    matrix, intrinsics = camera.world_to_camera.numpy(), camera.intrinsics.numpy()
-    focal, center = intrinsics.diagonal()[:2] / half, 1 - intrinsics[:2, 2] / half
+    matrix = camera.world_to_camera.numpy()
+    intrinsics = camera.intrinsics.numpy()
+    focal = intrinsics.diagonal()[:2] / half
+    center = 1 - intrinsics[:2, 2] / half
     return viewpoint(matrix[:3, :3], matrix[:3, 3], focal.tolist(), center.tolist())
 
 

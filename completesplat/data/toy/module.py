@@ -37,7 +37,8 @@ class ToyObjectsDataModule(CO3DDataModule):
     depth range that it was trained with.
     """
 
-    record, chances = DESCRIPTION, dict.fromkeys(PATCH_COLORS, 1 / len(PATCH_COLORS))
+    record = DESCRIPTION
+    chances = dict.fromkeys(PATCH_COLORS, 1 / len(PATCH_COLORS))
 
     def __init__(
         self,
@@ -82,7 +83,8 @@ class ToyRoomsDataModule(RE10KDataModule):
     ) -> None:
         home = Path(root)
         super().__init__(str(home if is_packed(home) else home / ROOMS / "text"), **reading)
-        self.home, self.make = home, make
+        self.home = home
+        self.make = make
         self.making = DataSetSize(scenes=scenes, frames=frames, size=height, seed=data_seed)
 
     def describe(self) -> dict[str, str]:

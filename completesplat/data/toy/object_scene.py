@@ -60,7 +60,8 @@ class _Painter:
         first = color(self.hue, self.rng.uniform(0.5, 0.85), self.rng.uniform(0.7, 0.95))
         second = color(self.hue + self.rng.uniform(-0.1, 0.1), self.rng.uniform(0.35, 0.7), self.rng.uniform(0.4, 0.65))
         pattern = self.rng.choice([PLAIN, STRIPES, CHECKS, RIPPLES])
-        frequency, phase = self.rng.uniform(5.0, 9.0), self.rng.uniform(0, 2 * np.pi)
+        frequency = self.rng.uniform(5.0, 9.0)
+        phase = self.rng.uniform(0, 2 * np.pi)
         return np.stack([first, second]), np.array([pattern, frequency, phase])
 
     def detail(self) -> Look:
@@ -84,7 +85,9 @@ def bear(rng: np.random.Generator) -> Blueprint:
     paint = _Painter(rng)
     fur = paint.body()
     light = plain_look(color(paint.hue + 0.04, 0.25, 0.95))
-    wide, tall, deep = rng.uniform(0.3, 0.38), rng.uniform(0.36, 0.44), rng.uniform(0.28, 0.34)
+    wide = rng.uniform(0.3, 0.38)
+    tall = rng.uniform(0.36, 0.44)
+    deep = rng.uniform(0.28, 0.34)
     skull = rng.uniform(0.24, 0.3)
     top = tall + 0.7 * skull
     ear = rng.uniform(0.08, 0.13)
@@ -117,9 +120,11 @@ def _arm(side: int, wide: float, tall: float, rng: np.random.Generator, paint: _
 def hydrant(rng: np.random.Generator) -> Blueprint:
     """Draw a fire hydrant: base, body, dome, a large outlet in front, two at the sides; the patch is on its back."""
     paint = _Painter(rng)
-    radius, half = rng.uniform(0.22, 0.29), rng.uniform(0.4, 0.5)
+    radius = rng.uniform(0.22, 0.29)
+    half = rng.uniform(0.4, 0.5)
     reach = rng.uniform(0.1, 0.16)
-    coat, ring = paint.body(), paint.detail()
+    coat = paint.body()
+    ring = paint.detail()
     outlets = half * rng.uniform(0.3, 0.5)
     parts = [
         _frustum((0, 0, 0), radius, half, coat, taper=rng.uniform(-0.15, 0.0)),
@@ -140,7 +145,8 @@ def hydrant(rng: np.random.Generator) -> Blueprint:
 
 FAMILIES = (hydrant, bear)
 DOME_RADIUS = 3.5
-SURFACE_DIRECTIONS, SURFACE_RAYS = 60, 130
+SURFACE_DIRECTIONS = 60
+SURFACE_RAYS = 130
 PATCH_COLORS = {
     "red": (0.9, 0.08, 0.1),
     "green": (0.1, 0.7, 0.2),
@@ -211,7 +217,8 @@ def _placed(
     yaw = rng.uniform(0, 2 * np.pi)
     cameras = draw_orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
     name = str(rng.choice(list(PATCH_COLORS), p=chances))
-    level, down = np.cos(tilt), np.sin(tilt)
+    level = np.cos(tilt)
+    down = np.sin(tilt)
     facing = -np.array([level * np.sin(yaw), down, level * np.cos(yaw)])
     patch = Patch(facing, np.array(PATCH_COLORS[name]), np.array(blueprint.patch_heights), edge)
     dome, light = draw_surroundings(rng)
@@ -267,7 +274,8 @@ def _surroundings(rng: np.random.Generator) -> tuple[Dome, Light]:
     """Draw a dome of one palette, a ground of two related colours and a light from above; `_placed` sets the height."""
     hue = rng.uniform()
     floor = hue + rng.uniform(0.3, 0.7)
-    azimuth, height = rng.uniform(0, 2 * np.pi), 0.9 * rng.uniform(0.6, 1.0)
+    azimuth = rng.uniform(0, 2 * np.pi)
+    height = 0.9 * rng.uniform(0.6, 1.0)
     dome = Dome(
         ground=-np.inf,
         ground_colors=np.stack([color(floor, 0.3, 0.9), color(floor + rng.uniform(-0.06, 0.06), 0.45, 0.55)]),
@@ -282,7 +290,8 @@ def _surroundings(rng: np.random.Generator) -> tuple[Dome, Light]:
 
 def _grey(rng: np.random.Generator) -> tuple[Dome, Light]:
     """Draw a plain dome without ground and a light from above."""
-    azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0.6, 0.9)
+    azimuth = rng.uniform(0, 2 * np.pi)
+    height = rng.uniform(0.6, 0.9)
     dome = Dome(-np.inf, np.zeros((2, 3)), np.zeros(3), DOME_RADIUS, hue=0.0, turn=0.0, plain=True)
     return dome, _sunlight(azimuth, height, rng.uniform(0.6, 0.7))
 
@@ -299,13 +308,16 @@ def _surface(
     """Sample points on the object that are visible from above, and their colours, by random, nearly parallel rays."""
     shapes = as_arrays(parts)
     reach = max(map(_farthest_point, parts))
-    points, colors = [], []
+    points = []
+    colors = []
     for _ in range(SURFACE_DIRECTIONS):
-        azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0, 1)
+        azimuth = rng.uniform(0, 2 * np.pi)
+        height = rng.uniform(0, 1)
         level = np.sqrt(1 - height**2)
         outwards = torch.tensor([level * np.sin(azimuth), height, level * np.cos(azimuth)], dtype=torch.float64)
         pose = invert_rigid(look_at(20 * reach * outwards, torch.zeros_like(outwards), UP)).numpy()
-        angle, radius = rng.uniform(0, 2 * np.pi, SURFACE_RAYS), np.sqrt(rng.uniform(0, 1, SURFACE_RAYS))
+        angle = rng.uniform(0, 2 * np.pi, SURFACE_RAYS)
+        radius = np.sqrt(rng.uniform(0, 1, SURFACE_RAYS))
         rays = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(SURFACE_RAYS, 20.0)], axis=-1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         seen, coverage, distances = trace(shapes, light, (dome, patch), pose, rays[:, None])

@@ -10,9 +10,11 @@ from completesplat.data.toy.shapes import BOX, CHECKS, ELLIPSOID, FRUSTUM, RIPPL
 from completesplat.rasterizers.kernels.compilation import helper, kernel
 
 # Numbers of faces. A room has two across each of x, y and z, the lower one first; else there are a ground and a dome.
-FLOOR, CEILING = 2, 3
+FLOOR = 2
+CEILING = 3
 WALLS = (0, 1, 4, 5)
-GROUND, DOME = 6, 7
+GROUND = 6
+DOME = 7
 
 SELF_INTERSECTION = 1e-6
 WHITE = (1.0, 1.0, 1.0)
@@ -125,7 +127,10 @@ def _hit_ball(ox, oy, oz, dx, dy, dz):
 @inlined
 def _hit_frustum(ox, oy, oz, dx, dy, dz, taper):
     """Return the nearest hit (distance, normal) of x^2 + z^2 = (1 + taper y)^2 with caps at y = -1 and 1."""
-    nearest, nx, ny, nz = np.inf, 0.0, 0.0, 0.0
+    nearest = np.inf
+    nx = 0.0
+    ny = 0.0
+    nz = 0.0
     a = dx * dx + dz * dz - taper * taper * dy * dy
     b = ox * dx + oz * dz - taper * dy * (1 + taper * oy)
     c = ox * ox + oz * oz - (1 + taper * oy) ** 2
@@ -135,30 +140,45 @@ def _hit_frustum(ox, oy, oz, dx, dy, dz, taper):
             t = (-b + sign * math.sqrt(square)) / a
             y = oy + t * dy
             if SELF_INTERSECTION < t < nearest and abs(y) <= 1:
-                nearest, nx, ny, nz = t, ox + t * dx, -taper * (1 + taper * y), oz + t * dz
+                nearest = t
+                nx = ox + t * dx
+                ny = -taper * (1 + taper * y)
+                nz = oz + t * dz
     if abs(dy) > 1e-12:
         for cap in (-1.0, 1.0):
             t = (cap - oy) / dy
-            x, z = ox + t * dx, oz + t * dz
+            x = ox + t * dx
+            z = oz + t * dz
             if SELF_INTERSECTION < t < nearest and x * x + z * z <= (1 + taper * cap) ** 2:
-                nearest, nx, ny, nz = t, 0.0, cap, 0.0
+                nearest = t
+                nx = 0.0
+                ny = cap
+                nz = 0.0
     return nearest, nx, ny, nz
 
 
 @inlined
 def _hit_cube(ox, oy, oz, dx, dy, dz):
     """Return the nearest hit (distance, normal) of the cube [-1, 1]^3 from outside."""
-    enter, leave, nx, ny, nz = -np.inf, np.inf, 0.0, 0.0, 0.0
+    enter = -np.inf
+    leave = np.inf
+    nx = 0.0
+    ny = 0.0
+    nz = 0.0
     for i in range(3):
         o, d = (ox, dx) if i == 0 else ((oy, dy) if i == 1 else (oz, dz))
         if abs(d) < 1e-12:
             if abs(o) > 1:
                 return np.inf, 0.0, 0.0, 0.0
         else:
-            middle, half, side = -o / d, abs(1 / d), -math.copysign(1.0, d)
+            middle = -o / d
+            half = abs(1 / d)
+            side = -math.copysign(1.0, d)
             if middle - half > enter:
                 enter = middle - half
-                nx, ny, nz = side if i == 0 else 0.0, side if i == 1 else 0.0, side if i == 2 else 0.0
+                nx = side if i == 0 else 0.0
+                ny = side if i == 1 else 0.0
+                nz = side if i == 2 else 0.0
             leave = min(leave, middle + half)
     return (enter, nx, ny, nz) if SELF_INTERSECTION < enter <= leave else (np.inf, 0.0, 0.0, 0.0)
 
@@ -166,11 +186,17 @@ def _hit_cube(ox, oy, oz, dx, dy, dz):
 @inlined
 def _hit_shapes(shapes, ox, oy, oz, dx, dy, dz):
     """Return the nearest shape along a ray: distance (in units of the direction), shape (or -1), local normal."""
-    nearest, shape, nx, ny, nz = np.inf, -1, 0.0, 0.0, 0.0
+    nearest = np.inf
+    shape = -1
+    nx = 0.0
+    ny = 0.0
+    nz = 0.0
     balls = shapes.bounding_balls
     square = dx * dx + dy * dy + dz * dz
     for i in range(len(shapes.kinds)):
-        cx, cy, cz = balls[i, 0] - ox, balls[i, 1] - oy, balls[i, 2] - oz
+        cx = balls[i, 0] - ox
+        cy = balls[i, 1] - oy
+        cz = balls[i, 2] - oz
         along = cx * dx + cy * dy + cz * dz
         if (cx * cx + cy * cy + cz * cz - balls[i, 3]) * square > along * along:
             continue
@@ -183,7 +209,11 @@ def _hit_shapes(shapes, ox, oy, oz, dx, dy, dz):
         else:
             t, lx, ly, lz = _hit_cube(px, py, pz, qx, qy, qz)
         if t < nearest:
-            nearest, shape, nx, ny, nz = t, i, lx, ly, lz
+            nearest = t
+            shape = i
+            nx = lx
+            ny = ly
+            nz = lz
     return nearest, shape, nx, ny, nz
 
 
@@ -200,22 +230,27 @@ def _hit_dome(dome, ox, oy, oz, dx, dy, dz):
 @inlined
 def _hit_room(room, ox, oy, oz, dx, dy, dz):
     """Return distance, face and normal where a ray from inside leaves the room."""
-    nearest, face = np.inf, 0
+    nearest = np.inf
+    face = 0
     for i in range(3):
         o, d = (ox, dx) if i == 0 else ((oy, dy) if i == 1 else (oz, dz))
         if abs(d) > 1e-12:
             low = 0.0 if i == 1 else -0.5 * room.size[i]
             t = ((low + room.size[i] if d > 0 else low) - o) / d
             if t < nearest:
-                nearest, face = t, 2 * i + (1 if d > 0 else 0)
-    inwards, axis = 1.0 if face % 2 == 0 else -1.0, face // 2
+                nearest = t
+                face = 2 * i + (1 if d > 0 else 0)
+    inwards = 1.0 if face % 2 == 0 else -1.0
+    axis = face // 2
     return nearest, face, inwards * (axis == 0), inwards * (axis == 1), inwards * (axis == 2)
 
 
 @inlined
 def _solid_pattern(texture, x, y, z):
     """Return the weight of the second colour, 0 to 1, at a local point of an object's part."""
-    kind, frequency, phase = texture[0], texture[1], texture[2]
+    kind = texture[0]
+    frequency = texture[1]
+    phase = texture[2]
     if kind == STRIPES:
         return 0.5 + 0.5 * soft_sign(5 * math.sin(frequency * y + phase))
     if kind == CHECKS:
@@ -230,7 +265,9 @@ def _solid_pattern(texture, x, y, z):
 @inlined
 def _flat_pattern(texture, u, v):
     """Return the weight of the second colour, 0 to 1, at a point of a plane."""
-    kind, frequency, phase = texture[0], texture[1], texture[2]
+    kind = texture[0]
+    frequency = texture[1]
+    phase = texture[2]
     if kind == STRIPES:
         return 0.5 + 0.5 * soft_sign(5 * math.sin(frequency * u + phase))
     if kind == CHECKS:
@@ -255,7 +292,8 @@ def _part_color(shapes, patch, part, lx, ly, lz, nx, ny, nz):
 def _furniture_color(shapes, solid, lx, ly, lz, hx, hy, hz):
     """Return the colour of a local point, with this local normal, on a box or an ellipsoid in a room."""
     half = shapes.half_sizes[solid]
-    u, v = lx * half[0], ly * half[1]
+    u = lx * half[0]
+    v = ly * half[1]
     if shapes.kinds[solid] == BOX and hx != 0:
         u = lz * half[2]
     elif shapes.kinds[solid] == BOX and hy != 0:
@@ -268,7 +306,8 @@ def _face_color(room, face, x, y, z):
     """Return the colour of a point on a face of the room; later decals cover earlier ones."""
     u, v = (z, y) if face < 2 else ((x, z) if face < 4 else (x, y))
     for i in range(len(room.decals) - 1, -1, -1):
-        decal, colors = room.decals[i], room.decal_colors[i]
+        decal = room.decals[i]
+        colors = room.decal_colors[i]
         if face == decal[0] and decal[1] < u < decal[2] and decal[3] < v < decal[4]:
             if min(u - decal[1], decal[2] - u, v - decal[3], decal[4] - v) < decal[5]:
                 return colors[0, 0], colors[0, 1], colors[0, 2]
@@ -279,22 +318,28 @@ def _face_color(room, face, x, y, z):
 @inlined
 def _dome_color(dome, face, x, y, z):
     if face == GROUND:
-        kind, frequency, angle = dome.ground_texture[0], dome.ground_texture[1], dome.ground_texture[2]
-        cos, sin = math.cos(angle), math.sin(angle)
+        kind = dome.ground_texture[0]
+        frequency = dome.ground_texture[1]
+        angle = dome.ground_texture[2]
+        cos = math.cos(angle)
+        sin = math.sin(angle)
         wave = math.sin(frequency * (cos * x + sin * z))
         if kind == CHECKS:
             wave *= math.sin(frequency * (cos * z - sin * x))
         return blend(dome.ground_colors[0], dome.ground_colors[1], 0.5 + 0.5 * soft_sign(6 * wave))
     if dome.plain:
         return 0.5, 0.5, 0.5
-    cos_turn, sin_turn = math.cos(dome.turn), math.sin(dome.turn)
+    cos_turn = math.cos(dome.turn)
+    sin_turn = math.sin(dome.turn)
     level = math.sqrt(x * x + z * z) + 1e-12
-    sin, cos = (x * cos_turn - z * sin_turn) / level, (z * cos_turn + x * sin_turn) / level
+    sin = (x * cos_turn - z * sin_turn) / level
+    cos = (z * cos_turn + x * sin_turn) / level
     sin_fourfold = 4 * sin * cos * (1 - 2 * sin * sin)
     hue = 2 * math.pi * (dome.hue + 0.17 * sin)
     rise = max(0.0, min(1.0, (y - dome.ground) / dome.radius))
     value = 0.68 + 0.1 * soft_sign(4 * sin_fourfold) * (1 - rise) + 0.15 * rise
-    cos_hue, sin_hue = 0.2 * (1 - 0.5 * rise) * math.cos(hue), 0.2 * (1 - 0.5 * rise) * math.sin(hue)
+    cos_hue = 0.2 * (1 - 0.5 * rise) * math.cos(hue)
+    sin_hue = 0.2 * (1 - 0.5 * rise) * math.sin(hue)
     # Red, green and blue are a third of a turn apart.
     half_root_3 = 0.8660254037844386
     return value + cos_hue, value - 0.5 * cos_hue + half_root_3 * sin_hue, value - 0.5 * cos_hue - half_root_3 * sin_hue
@@ -303,11 +348,17 @@ def _dome_color(dome, face, x, y, z):
 @inlined
 def _brightness(shapes, light, x, y, z, nx, ny, nz):
     """Return the light on a point with this unit normal."""
-    lx, ly, lz = light.place[0], light.place[1], light.place[2]
-    length, reach = 1.0, np.inf
+    lx = light.place[0]
+    ly = light.place[1]
+    lz = light.place[2]
+    length = 1.0
+    reach = np.inf
     if light.is_point:
-        lx, ly, lz = lx - x, ly - y, lz - z
-        length, reach = math.sqrt(lx * lx + ly * ly + lz * lz), 1.0
+        lx = lx - x
+        ly = ly - y
+        lz = lz - z
+        length = math.sqrt(lx * lx + ly * ly + lz * lz)
+        reach = 1.0
     direct = max(0.0, (nx * lx + ny * ly + nz * lz) / length)
     if direct > 0:
         shift = 1e-4
@@ -322,22 +373,33 @@ def _shade(shapes, light, dome, patch, room, ox, oy, oz, dx, dy, dz):
     """Return colour, distance and shape (-1: none) along a ray."""
     t, shape, hx, hy, hz = _hit_shapes(shapes, ox, oy, oz, dx, dy, dz)
     # Either the dome or the room is None. Numba compiles no code for the one that is None.
-    far, face, nx, ny, nz = np.inf, 0, 0.0, 0.0, 0.0
+    far = np.inf
+    face = 0
+    nx = 0.0
+    ny = 0.0
+    nz = 0.0
     if dome is not None:
         far, face, nx, ny, nz = _hit_dome(dome, ox, oy, oz, dx, dy, dz)
     if room is not None:
         far, face, nx, ny, nz = _hit_room(room, ox, oy, oz, dx, dy, dz)
     if far < t:
-        t, shape = far, -1
-    x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-    red, green, blue = 0.0, 0.0, 0.0
+        t = far
+        shape = -1
+    x = ox + t * dx
+    y = oy + t * dy
+    z = oz + t * dz
+    red = 0.0
+    green = 0.0
+    blue = 0.0
     if shape >= 0:
         m = shapes.to_local[shape]
         lx, ly, lz = map_point(m, x, y, z)
         # Normals transform by the transpose of the map into the local frame.
         nx, ny, nz = map_direction(m[:, :3].T, hx, hy, hz)
         norm = math.sqrt(nx * nx + ny * ny + nz * nz)
-        nx, ny, nz = nx / norm, ny / norm, nz / norm
+        nx = nx / norm
+        ny = ny / norm
+        nz = nz / norm
         if dome is not None:
             red, green, blue = _part_color(shapes, patch, shape, lx, ly, lz, nx, ny, nz)
         if room is not None:
@@ -356,8 +418,12 @@ def _shade(shapes, light, dome, patch, room, ox, oy, oz, dx, dy, dz):
 @compiled
 def _trace(shapes, light, dome, patch, room, pose, rays):
     pixels, samples, _ = rays.shape
-    colors, coverage, distances = np.zeros((pixels, 3)), np.zeros(pixels), np.zeros(pixels)
-    ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
+    colors = np.zeros((pixels, 3))
+    coverage = np.zeros(pixels)
+    distances = np.zeros(pixels)
+    ox = pose[0, 3]
+    oy = pose[1, 3]
+    oz = pose[2, 3]
     for pixel in range(pixels):
         for sample in range(samples):
             dx, dy, dz = map_direction(pose, rays[pixel, sample, 0], rays[pixel, sample, 1], rays[pixel, sample, 2])

@@ -35,7 +35,8 @@ Piece = list[Part]
 
 
 def _look(rng: np.random.Generator) -> Look:
-    hue, saturation = rng.uniform(), rng.uniform(0.2, 0.8)
+    hue = rng.uniform()
+    saturation = rng.uniform(0.2, 0.8)
     first = color(hue, saturation, rng.uniform(0.6, 0.95))
     second = color(hue + rng.uniform(-0.08, 0.08), saturation, rng.uniform(0.3, 0.55))
     pattern = rng.choice([PLAIN, STRIPES, CHECKS, RIPPLES])
@@ -50,8 +51,11 @@ def cabinet(rng: np.random.Generator) -> Piece:
 
 def table(rng: np.random.Generator) -> Piece:
     """Draw a slab on four legs."""
-    wide, deep, top = rng.uniform(0.4, 0.7), rng.uniform(0.3, 0.45), rng.uniform(0.45, 0.75)
-    look, leg = _look(rng), _look(rng)
+    wide = rng.uniform(0.4, 0.7)
+    deep = rng.uniform(0.3, 0.45)
+    top = rng.uniform(0.45, 0.75)
+    look = _look(rng)
+    leg = _look(rng)
     legs = [
         make_part(BOX, (x * (wide - 0.06), top / 2, z * (deep - 0.06)), (0.035, top / 2, 0.035), leg)
         for x in (-1, 1)
@@ -62,8 +66,11 @@ def table(rng: np.random.Generator) -> Piece:
 
 def sofa(rng: np.random.Generator) -> Piece:
     """Draw a seat, a back and two arms."""
-    wide, deep, seat = rng.uniform(0.5, 0.9), rng.uniform(0.35, 0.45), rng.uniform(0.18, 0.23)
-    look, back = _look(rng), rng.uniform(0.35, 0.45)
+    wide = rng.uniform(0.5, 0.9)
+    deep = rng.uniform(0.35, 0.45)
+    seat = rng.uniform(0.18, 0.23)
+    look = _look(rng)
+    back = rng.uniform(0.35, 0.45)
     arms = [make_part(BOX, (x * (wide - 0.08), seat + 0.1, 0), (0.08, seat + 0.1, deep), look) for x in (-1, 1)]
     rest = make_part(BOX, (0, back, 0.09 - deep), (wide - 0.16, back, 0.09), look)
     return [make_part(BOX, (0, seat, 0), (wide - 0.16, seat, deep), look), rest, *arms]
@@ -76,7 +83,8 @@ def pouf(rng: np.random.Generator) -> Piece:
 
 def lamp(rng: np.random.Generator) -> Piece:
     """Draw a foot, a pole and an ellipsoid on top."""
-    top, shade = rng.uniform(1.0, 1.4), (rng.uniform(0.15, 0.25), rng.uniform(0.12, 0.2), rng.uniform(0.15, 0.25))
+    top = rng.uniform(1.0, 1.4)
+    shade = (rng.uniform(0.15, 0.25), rng.uniform(0.12, 0.2), rng.uniform(0.15, 0.25))
     look = _look(rng)
     foot = make_part(BOX, (0, 0.03, 0), (0.15, 0.03, 0.15), look)
     pole = make_part(BOX, (0, top / 2, 0), (0.02, top / 2, 0.02), look)
@@ -126,7 +134,8 @@ def _placed(rng: np.random.Generator, piece: Piece, size: Array) -> Piece:
 
 
 MARGIN = 0.3
-LOWEST, HIGHEST = 1.0, 1.7
+LOWEST = 1.0
+HIGHEST = 1.7
 # Range of the camera's step from frame to frame, as in a video with 30 frames a second, taken at a slow walk.
 STEPS = (0.012, 0.032)
 LARGEST_TURN = np.radians(3.0)
@@ -187,7 +196,8 @@ def _path(rng: np.random.Generator, frames: int, size: Array, furniture: Sequenc
 
     A path that comes too near to something or turns too fast is drawn again and shorter, until one is free.
     """
-    stride, step = 1.2, rng.uniform(*STEPS)
+    stride = 1.2
+    step = rng.uniform(*STEPS)
     while True:
         waypoints = _waypoints(rng, size, stride)
         parameters = np.linspace(0, 1, WAYPOINTS)
@@ -257,7 +267,8 @@ def render_room_frame(scene: RoomScene, frame: int, height: int, width: int) -> 
 def _faces(rng: np.random.Generator) -> tuple[Array, Array]:
     """Draw colours [face 2 3] and textures [face 3]: walls of related hues, a darker floor, a bright ceiling."""
     hue = rng.uniform()
-    colors, textures = np.zeros((6, 2, 3)), np.zeros((6, 3))
+    colors = np.zeros((6, 2, 3))
+    textures = np.zeros((6, 3))
     for face in range(6):
         face_hue = hue + rng.uniform(-0.15, 0.15)
         value = {FLOOR: 0.7, CEILING: 1.0}.get(face, 0.92)

@@ -8,9 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-ELLIPSOID, FRUSTUM, BOX = 0, 1, 2
+ELLIPSOID = 0
+FRUSTUM = 1
+BOX = 2
 # Patterns: the first number of a texture. The others are its frequency (radians per unit of length) and phase.
-PLAIN, STRIPES, CHECKS, RIPPLES = 0, 1, 2, 3
+PLAIN = 0
+STRIPES = 1
+CHECKS = 2
+RIPPLES = 3
 SAMPLES = 3  # rays of a pixel in each direction
 
 Array = NDArray[np.float64]
@@ -84,11 +89,13 @@ def as_arrays(parts: Sequence[Part]) -> Shapes:
 
 def rotation_about(axis: str, radians: float) -> Array:
     """Return the rotation matrix about a coordinate axis; about y it turns +z towards +x."""
-    cos, sin = np.cos(radians), np.sin(radians)
+    cos = np.cos(radians)
+    sin = np.sin(radians)
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.eye(3)
     matrix[i, i] = matrix[j, j] = cos
-    matrix[j, i], matrix[i, j] = sin, -sin
+    matrix[j, i] = sin
+    matrix[i, j] = -sin
     return matrix
 
 

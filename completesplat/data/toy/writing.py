@@ -132,8 +132,10 @@ def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed
     rng = np.random.default_rng([seed, index])
     scene = draw_room_scene(rng, frames)
     scene = scene._replace(light=scene.light._replace(color=light))
-    width, start = image_width(size), int(rng.integers(LATEST_START))
-    intrinsics, poses = scene.move.intrinsics(size, width), scene.move.world_to_camera().reshape(frames, 12)
+    width = image_width(size)
+    start = int(rng.integers(LATEST_START))
+    intrinsics = scene.move.intrinsics(size, width)
+    poses = scene.move.world_to_camera().reshape(frames, 12)
     rows = np.concatenate([np.broadcast_to(intrinsics, (frames, 4)), np.zeros((frames, 2)), poses], axis=1)
     key = f"room{index:05d}"
     images = root / "text" / split / key
@@ -166,7 +168,8 @@ def write(
     """
     if kind not in KINDS:
         raise DataError(f"no toy data of kind {kind!r}; there are: {', '.join(KINDS)}")
-    folder, rooms = out / f"toy_{kind}", kind == "rooms"
+    folder = out / f"toy_{kind}"
+    rooms = kind == "rooms"
     rules = {"scenes": Range(1 + rooms), "frames": Range(2, MOST_FRAMES), "size": Range(8)}
     for name, rule in rules.items():
         reason = rule.refusal(number := numbers[name])  # type: ignore[literal-required]
@@ -185,7 +188,9 @@ def write(
 
 
 def _write_all(folder: Path, parameters: Mapping[str, Any], workers: int | None, progress: bool) -> None:
-    rooms, scenes, light = folder.name == "toy_rooms", parameters["scenes"], parameters.get("light", WHITE)
+    rooms = folder.name == "toy_rooms"
+    scenes = parameters["scenes"]
+    light = parameters.get("light", WHITE)
     sizes = {name: parameters[name] for name in ("frames", "size", "seed")}
     with atomic_folder(folder) as unfinished:
         write_one: Callable[..., Any] = _write_clip if rooms else partial(_write_scene, category=folder.name)
@@ -197,4 +202,5 @@ def _write_all(folder: Path, parameters: Mapping[str, Any], workers: int | None,
         (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1) + "\n")
 
 
-write_objects, write_rooms = partial(write, "objects"), partial(write, "rooms")
+write_objects = partial(write, "objects")
+write_rooms = partial(write, "rooms")

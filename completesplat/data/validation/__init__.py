@@ -19,7 +19,8 @@ from completesplat.ply_files import read_vertices
 MOST_BYTES = 2**32
 # Content above the first size may be larger than its gzipped file by at most the second factor. Deflate reaches 1032;
 # annotations of frames have 6, those of sequences 23.
-BYTES_OF_ANY_RATIO, LARGEST_RATIO = 2**24, 40
+BYTES_OF_ANY_RATIO = 2**24
+LARGEST_RATIO = 40
 CHUNK = 2**20  # bytes that are read at once
 ROTATION_TOLERANCE = 1e-3
 LARGEST = 2.0**60  # numbers whose squares float32 holds, too
@@ -43,13 +44,16 @@ def path_below(root: Path, relative: str) -> Path:
     Raises:
         OutsidePath: the path is empty, has `..`, a drive, scheme or NUL, or it or a link leads out.
     """
-    path, windows = PurePath(relative.replace("\\", "/")), PureWindowsPath(relative)
-    absolute, preview = path.is_absolute() or windows.drive, printable(repr(relative), SHORT)
+    path = PurePath(relative.replace("\\", "/"))
+    windows = PureWindowsPath(relative)
+    absolute = path.is_absolute() or windows.drive
+    preview = printable(repr(relative), SHORT)
     if not path.parts or ".." in path.parts or any(text in relative for text in ("\0", "://")):
         raise OutsidePath(f"leads outside of {root}, or nowhere: {preview}")
     try:
         # `realpath` also accepts a path that does not exist, and one whose links form a ring.
-        real_root, real_path = os.path.realpath(root), os.path.realpath(root / path)
+        real_root = os.path.realpath(root)
+        real_path = os.path.realpath(root / path)
     except ValueError:
         raise OutsidePath(f"characters that no file name has: {preview}") from None
     if windows.drive or os.path.commonpath([real_root, real_path]) != real_root:
@@ -112,7 +116,8 @@ def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
     Raises:
         BadAnnotation: the value has another type (true is no `int`), or a field is missing.
     """
-    origin, arguments = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    arguments = get_args(kind)
     if origin is tuple and type(value) is list:
         return tuple(parsed(arguments[0], item, name) for item in value)
     if origin is dict and type(value) is dict:
@@ -154,7 +159,9 @@ def require_rotation(matrix: np.ndarray, what: str) -> None:
 
 def _read(path: Path, most_bytes: int) -> bytearray:
     """Read the bytes of a file, unpacked if its name ends in `.jgz`."""
-    raw, size, packed = bytearray(), require_file(path).stat().st_size, path.suffix == ".jgz"
+    raw = bytearray()
+    size = require_file(path).stat().st_size
+    packed = path.suffix == ".jgz"
     limit = min(most_bytes, max(BYTES_OF_ANY_RATIO, LARGEST_RATIO * size)) if packed else most_bytes
     with GzipFile(path) if packed else path.open("rb") as file:
         while chunk := file.read(CHUNK):

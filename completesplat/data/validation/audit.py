@@ -72,7 +72,8 @@ def check(
     share them on purpose (`SceneDataModule.splits_share_sequences`).
     """
     refused = [error for source in sources.values() for error in _source_errors(source)]
-    sequences, batches = list[_Sequence](), _batches(sources)
+    sequences = list[_Sequence]()
+    batches = _batches(sources)
     with Progress(disable=not progress) as bar:
         task = bar.add_task("reading sequences", total=sum(map(len, batches)))
         for batch in map_in_processes(partial(_read_batch, sources), batches, workers):
@@ -155,7 +156,8 @@ def _read_batch(sources: Sources, batch: _Batch) -> list[_Sequence]:
 
 
 def _read(sources: Sources, name: str, splits: list[str]) -> _Sequence:
-    sequence, seen = _Sequence(name), set[int]()
+    sequence = _Sequence(name)
+    seen = set[int]()
     for split in splits:
         with refused_to(sequence.refused.append, sequence=name):
             posed = sources[split].read(name)

@@ -21,8 +21,16 @@ REACH = 16  # the largest u^2 + v^2 at which alpha >= min_alpha; negative if the
 PREPARED_WIDTH = 17
 
 # records
-CENTER_X, CENTER_Y, U, SHEAR, V, LOG2_OPACITY = 0, 1, 2, 3, 4, 5
-RED, GREEN, BLUE, DEPTH = 6, 7, 8, 9
+CENTER_X = 0
+CENTER_Y = 1
+U = 2
+SHEAR = 3
+V = 4
+LOG2_OPACITY = 5
+RED = 6
+GREEN = 7
+BLUE = 8
+DEPTH = 9
 INVERSE_U = 10
 RIGHTMOST_Y = 11  # d_y of the ellipse's right-most point; its left-most is at minus this
 EXTENT_Y = 12  # half the ellipse's height
@@ -34,15 +42,25 @@ RECORD_WIDTH = 16
 SUM_COLOR = 0  # 3 columns; sums of weight times the gradient of a colour channel
 SUM_DEPTH = 3
 SUM_S = 4  # s is -dL/dsigma at a pixel
-SUM_SU, SUM_SV, SUM_SUU, SUM_SUV, SUM_SVV = 5, 6, 7, 8, 9
+SUM_SU = 5
+SUM_SV = 6
+SUM_SUU = 7
+SUM_SUV = 8
+SUM_SVV = 9
 REACHED = 10  # 1 except in row 0
 GRADIENT_WIDTH = 16
 
 # camera
 ROTATION = 0  # 9 columns, row-major
 TRANSLATION = 9
-FOCAL_X, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y = 12, 13, 14, 15
-MIN_SLOPE_X, MAX_SLOPE_X, MIN_SLOPE_Y, MAX_SLOPE_Y = 16, 17, 18, 19  # limits of x/z and y/z in the Jacobian
+FOCAL_X = 12
+FOCAL_Y = 13
+PRINCIPAL_X = 14
+PRINCIPAL_Y = 15
+MIN_SLOPE_X = 16
+MAX_SLOPE_X = 17
+MIN_SLOPE_Y = 18
+MAX_SLOPE_Y = 19  # limits of x/z and y/z in the Jacobian
 CAMERA_WIDTH = 20
 
 # images are processed in blocks of 4 x 4 pixels, row-major, with one SIMD lane for each pixel

@@ -30,7 +30,8 @@ OPTIONS: dict[str, Any] = {
 
 def kernel(function: Callable[..., Result], **changed: object) -> Callable[..., Result]:
     """Compile an entry point on its first call, with changed `OPTIONS`; later processes load it from the cache."""
-    before, directory = numba_config.CACHE_DIR, cache_directory()
+    before = numba_config.CACHE_DIR
+    directory = cache_directory()
     numba_config.CACHE_DIR = before if directory is None else str(directory)
     cached = directory is not None
     try:

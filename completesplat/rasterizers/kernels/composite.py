@@ -22,9 +22,11 @@ BLOCK = layout.BLOCK
 SLACK = np.float32(layout.SLACK)
 WORD_BITS = 64
 WORD_SHIFT = 6
-ZERO, ONE = np.float32(0), np.float32(1)
+ZERO = np.float32(0)
+ONE = np.float32(1)
 ALL_BITS = np.uint64(2**64 - 1)
-BIT, TWO_BITS = np.uint64(1), np.uint64(2)
+BIT = np.uint64(1)
+TWO_BITS = np.uint64(2)
 # In px; extends the choice of blocks against rounding. The test at the pixel itself decides.
 MARGIN = np.float32(0.01)
 
@@ -75,21 +77,33 @@ def composite(
     blocks_left = open_all_blocks(open_words, end_row - first_row, columns)
     for j in range(count):
         rows = integers[j, layout.ROWS]
-        top, bottom = max(rows & 0xFFFF, first_row), min(rows >> 16, end_row - 1)
+        top = max(rows & 0xFFFF, first_row)
+        bottom = min(rows >> 16, end_row - 1)
         if bottom < top:
             continue
         if blocks_left == 0:
             break
         row_spans(records, j, log2_min_alpha, top, bottom, width, spans)
-        red, green, blue = records[j, layout.RED], records[j, layout.GREEN], records[j, layout.BLUE]
+        red = records[j, layout.RED]
+        green = records[j, layout.GREEN]
+        blue = records[j, layout.BLUE]
         z = records[j, layout.DEPTH]
         reached = False
         zero = simd.splat(ZERO)
-        sum_red, sum_green, sum_blue, sum_z = zero, zero, zero, zero
-        sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv = zero, zero, zero, zero, zero, zero
+        sum_red = zero
+        sum_green = zero
+        sum_blue = zero
+        sum_z = zero
+        sum_s = zero
+        sum_su = zero
+        sum_sv = zero
+        sum_suu = zero
+        sum_suv = zero
+        sum_svv = zero
         for row in range(top, bottom + 1):
             span = span_offset(row - top)
-            first, last = spans[span], spans[span + ROWS_AT_ONCE]
+            first = spans[span]
+            last = spans[span + ROWS_AT_ONCE]
             if last < first:
                 continue
             for word in range(first >> WORD_SHIFT, (last >> WORD_SHIFT) + 1):
@@ -114,19 +128,28 @@ def composite(
                         simd.store(state, offset + 4 * simd.LANES, state_vector(state, offset, 4) + weight * z)
                         simd.store(state, offset + 5 * simd.LANES, state_vector(state, offset, 5) + weight)
                     else:
-                        grad_red, grad_green = state_vector(state, offset, 2), state_vector(state, offset, 3)
-                        grad_blue, grad_z = state_vector(state, offset, 4), state_vector(state, offset, 5)
+                        grad_red = state_vector(state, offset, 2)
+                        grad_green = state_vector(state, offset, 3)
+                        grad_blue = state_vector(state, offset, 4)
+                        grad_z = state_vector(state, offset, 5)
                         grad_value = grad_red * red + grad_green * green + grad_blue * blue + grad_z * z
                         sum_behind = state_vector(state, offset, 1) - weight * grad_value
                         simd.store(state, offset + simd.LANES, sum_behind)
                         grad_opacity = transmittance * grad_value - sum_behind / (ONE - opacity)
                         # s = -dL/dsigma = alpha dL/dalpha; the clamp at max_alpha has no gradient.
                         s = simd.keep(passes & (value <= max_alpha), opacity * grad_opacity)
-                        sum_red, sum_green = sum_red + weight * grad_red, sum_green + weight * grad_green
-                        sum_blue, sum_z = sum_blue + weight * grad_blue, sum_z + weight * grad_z
-                        su, sv = s * u, s * v
-                        sum_s, sum_su, sum_sv = sum_s + s, sum_su + su, sum_sv + sv
-                        sum_suu, sum_suv, sum_svv = sum_suu + su * u, sum_suv + su * v, sum_svv + sv * v
+                        sum_red = sum_red + weight * grad_red
+                        sum_green = sum_green + weight * grad_green
+                        sum_blue = sum_blue + weight * grad_blue
+                        sum_z = sum_z + weight * grad_z
+                        su = s * u
+                        sv = s * v
+                        sum_s = sum_s + s
+                        sum_su = sum_su + su
+                        sum_sv = sum_sv + sv
+                        sum_suu = sum_suu + su * u
+                        sum_suv = sum_suv + su * v
+                        sum_svv = sum_svv + sv * v
                     if not simd.any_lane(behind > ZERO):
                         close_block(open_words, row - first_row, column)
                         blocks_left -= 1
@@ -154,7 +177,9 @@ def begin(first_row, end_row, columns, height, width, state):
 def write_images(first_row, end_row, columns, state, color, depth, alpha):
     height, width = alpha.shape
     plane = height * width
-    flat_color, flat_depth, flat_alpha = color.reshape(-1), depth.reshape(-1), alpha.reshape(-1)
+    flat_color = color.reshape(-1)
+    flat_depth = depth.reshape(-1)
+    flat_alpha = alpha.reshape(-1)
     for row in range(first_row, end_row):
         for column in range(columns):
             block = ((row - first_row) * columns + column) * (STATE_VECTORS * simd.LANES)
@@ -170,10 +195,8 @@ def write_images(first_row, end_row, columns, state, color, depth, alpha):
                     pixel = corner + lane // BLOCK * width + lane % BLOCK
                     for channel in range(3):
                         flat_color[channel * plane + pixel] = state[block + (1 + channel) * simd.LANES + lane]
-                    flat_depth[pixel], flat_alpha[pixel] = (
-                        state[block + 4 * simd.LANES + lane],
-                        state[block + 5 * simd.LANES + lane],
-                    )
+                    flat_depth[pixel] = state[block + 4 * simd.LANES + lane]
+                    flat_alpha[pixel] = state[block + 5 * simd.LANES + lane]
 
 
 @helper
@@ -181,15 +204,21 @@ def read_images(first_row, end_row, columns, state, color, depth, alpha, grad_co
     """Write the gradients of the images, and the total sum, to the state."""
     height, width = alpha.shape
     plane = height * width
-    flat_color, flat_depth, flat_alpha = color.reshape(-1), depth.reshape(-1), alpha.reshape(-1)
-    colors, depths, alphas = grad_color.reshape(-1), grad_depth.reshape(-1), grad_alpha.reshape(-1)
+    flat_color = color.reshape(-1)
+    flat_depth = depth.reshape(-1)
+    flat_alpha = alpha.reshape(-1)
+    colors = grad_color.reshape(-1)
+    depths = grad_depth.reshape(-1)
+    alphas = grad_alpha.reshape(-1)
     for row in range(first_row, end_row):
         for column in range(columns):
             block = ((row - first_row) * columns + column) * (STATE_VECTORS * simd.LANES)
             corner = (row * width + column) * BLOCK
             if is_whole(row, column, height, width):
-                red, green = load_block(colors, corner, width), load_block(colors, plane + corner, width)
-                blue, z = load_block(colors, 2 * plane + corner, width), load_block(depths, corner, width)
+                red = load_block(colors, corner, width)
+                green = load_block(colors, plane + corner, width)
+                blue = load_block(colors, 2 * plane + corner, width)
+                z = load_block(depths, corner, width)
                 total = red * load_block(flat_color, corner, width)
                 total = total + green * load_block(flat_color, plane + corner, width)
                 total = total + blue * load_block(flat_color, 2 * plane + corner, width)
@@ -204,12 +233,16 @@ def read_images(first_row, end_row, columns, state, color, depth, alpha, grad_co
             for lane in range(simd.LANES):
                 if is_inside(row, column, lane, height, width):
                     pixel = corner + lane // BLOCK * width + lane % BLOCK
-                    red, green, blue = colors[pixel], colors[plane + pixel], colors[2 * plane + pixel]
+                    red = colors[pixel]
+                    green = colors[plane + pixel]
+                    blue = colors[2 * plane + pixel]
                     total = red * flat_color[pixel] + green * flat_color[plane + pixel]
                     total = total + blue * flat_color[2 * plane + pixel] + depths[pixel] * flat_depth[pixel]
                     state[block + simd.LANES + lane] = total - alphas[pixel] * (ONE - flat_alpha[pixel])
-                    state[block + 2 * simd.LANES + lane], state[block + 3 * simd.LANES + lane] = red, green
-                    state[block + 4 * simd.LANES + lane], state[block + 5 * simd.LANES + lane] = blue, depths[pixel]
+                    state[block + 2 * simd.LANES + lane] = red
+                    state[block + 3 * simd.LANES + lane] = green
+                    state[block + 4 * simd.LANES + lane] = blue
+                    state[block + 5 * simd.LANES + lane] = depths[pixel]
 
 
 @helper
@@ -256,12 +289,15 @@ def row_spans(records, j, log2_min_alpha, top, bottom, width, spans):
     the rows of a block the right end is largest as near as possible to RIGHTMOST_Y, the left end smallest as near as
     possible to -RIGHTMOST_Y. Left ends are in the first half of a vector's lanes, right ends in the second.
     """
-    center_y, extent = records[j, layout.CENTER_Y], records[j, layout.EXTENT_Y]
+    center_y = records[j, layout.CENTER_Y]
+    extent = records[j, layout.EXTENT_Y]
     reach = records[j, layout.LOG2_OPACITY] - log2_min_alpha + SLACK
     # The left end has one pixel too much, so that truncation rounds it up. The limits keep the integers small.
     start = records[j, layout.CENTER_X] - side() * (np.float32(0.5) - MARGIN)
-    extreme_y, stretch = side() * records[j, layout.RIGHTMOST_Y], side() * records[j, layout.INVERSE_U]
-    lowest, highest = lowest_pixel(), is_left() * np.float32(BLOCK + 1) + np.float32(width - 1)
+    extreme_y = side() * records[j, layout.RIGHTMOST_Y]
+    stretch = side() * records[j, layout.INVERSE_U]
+    lowest = lowest_pixel()
+    highest = is_left() * np.float32(BLOCK + 1) + np.float32(width - 1)
     for row in range(top, bottom + 1, ROWS_AT_ONCE):
         low = row_tops() + (np.float32(row * BLOCK) - center_y)
         high = min(low + np.float32(BLOCK - 1), extent)

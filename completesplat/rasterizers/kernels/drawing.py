@@ -69,7 +69,8 @@ def _after_a_fork() -> None:
     """Replace pools and locks in a child process, where the threads that may hold the locks do not exist."""
     global _pool_lock, _free_lock
     _pools.clear()
-    _pool_lock, _free_lock = threading.Lock(), threading.Lock()
+    _pool_lock = threading.Lock()
+    _free_lock = threading.Lock()
 
 
 if hasattr(os, "register_at_fork"):
@@ -161,7 +162,9 @@ class Drawing:
         self, parameters: Parameters, cameras: np.ndarray, image_size: tuple[int, int],
         constants: RenderingConstants, keep: bool,
     ) -> None:  # fmt: skip
-        self.parameters, self.cameras, self.constants = parameters, cameras, constants
+        self.parameters = parameters
+        self.cameras = cameras
+        self.constants = constants
         self.height, self.width = image_size
         self.scenes, self.views = cameras.shape[:2]
         self.count = parameters.means.shape[1]
@@ -195,7 +198,8 @@ class Drawing:
 
     def backward(self, images: RenderedImages, gradients: RenderedImages) -> Parameters:
         """Return gradients of the parameters from those of the images that `draw` returned."""
-        bands, views = len(self.bands), self.scenes * self.views
+        bands = len(self.bands)
+        views = self.scenes * self.views
         sums = BandGradients(
             empty((self.scenes, self.views, bands, self.count + 1, layout.GRADIENT_WIDTH)),
             empty((self.scenes, self.views, bands, self.lanes), np.int32),
@@ -213,7 +217,8 @@ class Drawing:
         scene, camera = divmod(start + slot, self.views)
         room = self.count + 1
         unsorted = empty((room, layout.RECORD_WIDTH))
-        keys, order = empty((2, room), np.int64), empty((2, room), np.int32)
+        keys = empty((2, room), np.int64)
+        order = empty((2, room), np.int32)
         self.visible_counts[slot] = project(
             self.prepared[scene], self.cameras[scene, camera], self.height, self.width,
             float(self.constants.blur), float(self.constants.near_plane),

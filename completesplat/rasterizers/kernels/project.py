@@ -22,10 +22,18 @@ PASSES = 4
 SMALLEST_DEPTH_BITS = np.float64(2.0**-126).view(np.int64)
 DROPPED_BITS = 8 + 52 - PASSES * RADIX_BITS
 # Columns of the sums over views, after which the chain rule continues for each Gaussian separately.
-COLOR, LOG_OPACITY, MEAN, ROOT, REACHED, TOTALS = 0, 3, 4, 7, 16, 17
+COLOR = 0
+LOG_OPACITY = 3
+MEAN = 4
+ROOT = 7
+REACHED = 16
+TOTALS = 17
 no_totals = simd.zeros(TOTALS)
-gather_one, gather_three, gather_four = simd.gather(1), simd.gather(3), simd.gather(4)
-one_column, four_columns = simd.columns(1), simd.columns(4)
+gather_one = simd.gather(1)
+gather_three = simd.gather(3)
+gather_four = simd.gather(4)
+one_column = simd.columns(1)
+four_columns = simd.columns(4)
 
 
 @kernel
@@ -35,7 +43,8 @@ def prepare(
 ) -> None:  # fmt: skip
     """Fill `prepared` and mark Gaussians that are too transparent to be seen or have values that are not finite."""
     count = means.shape[0]
-    flat, stride = prepared.reshape(-1), prepared.shape[1]
+    flat = prepared.reshape(-1)
+    stride = prepared.shape[1]
     prepared[layout.REACH, count:] = -ONE
     for i in range(count):
         log2_opacity = math.log2(np.float64(opacities[i]))
@@ -89,8 +98,10 @@ def project(
     """
     count = 0
     rotation = projection.load_nine(camera, layout.ROTATION)
-    flat, stride = prepared.reshape(-1), prepared.shape[1]
-    unsorted_flat, depths = unsorted.reshape(-1), keys[0].view(np.float64)
+    flat = prepared.reshape(-1)
+    stride = prepared.shape[1]
+    unsorted_flat = unsorted.reshape(-1)
+    depths = keys[0].view(np.float64)
     for start in range(0, stride, simd.LANES):
         mean, root = projection.lane_gaussians(prepared, start)
         (reach,) = simd.widen(one_column(flat, stride, layout.REACH * stride + start))
@@ -99,7 +110,8 @@ def project(
         if not simd.any_lane(inside):
             continue
         inverse_z = ONE / z
-        slope_x, slope_y = x * inverse_z, y * inverse_z
+        slope_x = x * inverse_z
+        slope_y = y * inverse_z
         center_x = camera[layout.FOCAL_X] * slope_x + camera[layout.PRINCIPAL_X]
         center_y = camera[layout.FOCAL_Y] * slope_y + camera[layout.PRINCIPAL_Y]
         row_x, row_y = projection.image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
@@ -108,8 +120,10 @@ def project(
             projection.row_times_matrix(row_x, wide), projection.row_times_matrix(row_y, wide), blur
         )
         # sigma = ln(2) * reach is an ellipse with these half extents.
-        extent_x, extent_y = simd.square_root(TWO * LN2 * reach * xx), simd.square_root(TWO * LN2 * reach * yy)
-        top, bottom = max(center_y - extent_y + HALF, 0.0), min(center_y + extent_y - HALF, height - ONE)
+        extent_x = simd.square_root(TWO * LN2 * reach * xx)
+        extent_y = simd.square_root(TWO * LN2 * reach * yy)
+        top = max(center_y - extent_y + HALF, 0.0)
+        bottom = min(center_y + extent_y - HALF, height - ONE)
         inside = inside & simd.all_within((center_x, center_y, xx, yy), LARGEST_PROJECTION) & (top < bottom + ONE)
         inside = inside & (center_x + extent_x >= HALF) & (center_x - extent_x <= width - HALF)
         inverse_yy = ONE / yy
@@ -149,7 +163,8 @@ def radix_sort(depths, keys, order, count):
             size = starts[digit, bucket]
             starts[digit, bucket] = total
             total += size
-        source, target = digit % 2, 1 - digit % 2
+        source = digit % 2
+        target = 1 - digit % 2
         for i in range(count):
             key = keys[source, i]
             bucket = (key >> (RADIX_BITS * digit)) & (BUCKETS - 1)

@@ -13,10 +13,12 @@ from completesplat.rasterizers.kernels.simd import add_each, choose, columns, ga
 
 ZERO = np.float32(0)
 Array = np.ndarray
-three_columns, nine_columns = columns(3), columns(9)
+three_columns = columns(3)
+nine_columns = columns(9)
 COLUMNS = layout.REACHED + 1
 no_sums = zeros(COLUMNS)
-ONE, TWO = np.float64(1), np.float64(2)
+ONE = np.float64(1)
+TWO = np.float64(2)
 LN2 = np.float64(math.log(2))
 SMALLEST_SQUARED_NORM = np.float64(1e-24)  # of a quaternion that has a direction, as in `geometry.rotations`
 
@@ -93,7 +95,8 @@ def combine(x, a, y, b):
 @helper
 def image_jacobian(camera, rotation, slope_x, slope_y, inverse_z):
     """Return the rows of J W (EWA splatting, Eq. 29): d(pixel) / d(world point), at the clamped slopes x/z and y/z."""
-    x_scale, y_scale = camera[layout.FOCAL_X] * inverse_z, camera[layout.FOCAL_Y] * inverse_z
+    x_scale = camera[layout.FOCAL_X] * inverse_z
+    y_scale = camera[layout.FOCAL_Y] * inverse_z
     x_depth = x_scale * clamp(slope_x, camera[layout.MIN_SLOPE_X], camera[layout.MAX_SLOPE_X])
     y_depth = y_scale * clamp(slope_y, camera[layout.MIN_SLOPE_Y], camera[layout.MAX_SLOPE_Y])
     row_x = combine(x_scale, rotation[:3], -x_depth, rotation[6:])
@@ -111,7 +114,8 @@ def covariance_2d(a, b, blur):
 
     The determinant is written with the cross product (Lagrange's identity), so nothing cancels in thin ellipses.
     """
-    aa, bb = dot(a, a), dot(b, b)
+    aa = dot(a, a)
+    bb = dot(b, b)
     normal = cross(a, b)
     return aa + blur, dot(a, b), bb + blur, dot(normal, normal) + blur * (aa + bb) + blur * blur
 
@@ -119,7 +123,8 @@ def covariance_2d(a, b, blur):
 @helper
 def lane_gaussians(prepared, start):
     """Return means and roots R(quaternion) diag(scales), row-major, of the Gaussians start..start + 15."""
-    flat, stride = prepared.reshape(-1), prepared.shape[1]
+    flat = prepared.reshape(-1)
+    stride = prepared.shape[1]
     mean = three_columns(flat, stride, layout.MEAN * stride + start)
     return mean, nine_columns(flat, stride, layout.ROOT * stride + start)
 
@@ -153,7 +158,9 @@ def cross_of_rows(row_x, row_y, root):
 
     If a Gaussian is a needle, a and b are almost parallel, and their direct product would lose its significant digits.
     """
-    first, second, third = (root[0], root[3], root[6]), (root[1], root[4], root[7]), (root[2], root[5], root[8])
+    first = (root[0], root[3], root[6])
+    second = (root[1], root[4], root[7])
+    third = (root[2], root[5], root[8])
     normal = cross(row_x, row_y)
     return dot(cross(second, third), normal), dot(cross(third, first), normal), dot(cross(first, second), normal)
 
@@ -166,9 +173,11 @@ def splat_gradients(row_x, row_y, root, blur, sums):
     dL/dcentre = 2 ln(2) T^T (sum s u, sum s v), and dL/dcovariance = 1/2 (2 ln 2)^2 T^T S T with the symmetric
     matrix S of the sums of s u u, s u v, s v v (gsplat's backward, `Utils.cuh`, in whitened coordinates).
     """
-    a, b = row_times_matrix(row_x, root), row_times_matrix(row_y, root)
+    a = row_times_matrix(row_x, root)
+    b = row_times_matrix(row_y, root)
     a_cross_b = cross_of_rows(row_x, row_y, root)
-    aa, bb = dot(a, a), dot(b, b)
+    aa = dot(a, a)
+    bb = dot(b, b)
     determinant = dot(a_cross_b, a_cross_b) + blur * (aa + bb + blur)
     inverse_yy = ONE / (bb + blur)
     shear = dot(a, b) * inverse_yy
@@ -196,21 +205,30 @@ def view_gradients(mean, root, camera, blur, sums):
     rotation = load_nine(camera, layout.ROTATION)
     x, y, z = camera_point(camera, rotation, mean)
     inverse_z = ONE / z
-    slope_x, slope_y = x * inverse_z, y * inverse_z
+    slope_x = x * inverse_z
+    slope_y = y * inverse_z
     row_x, row_y = image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
     grad_center_x, grad_center_y, grad_a, grad_b = splat_gradients(row_x, row_y, root, blur, sums)
     grad_root = add_each(outer(row_x, grad_a), outer(row_y, grad_b))
-    grad_row_x, grad_row_y = matrix_times_column(root, grad_a), matrix_times_column(root, grad_b)
+    grad_row_x = matrix_times_column(root, grad_a)
+    grad_row_y = matrix_times_column(root, grad_b)
 
-    focal_x, focal_y = camera[layout.FOCAL_X], camera[layout.FOCAL_Y]
-    min_x, max_x = camera[layout.MIN_SLOPE_X], camera[layout.MAX_SLOPE_X]
-    min_y, max_y = camera[layout.MIN_SLOPE_Y], camera[layout.MAX_SLOPE_Y]
-    x_axis, y_axis, z_axis = rotation[:3], rotation[3:6], rotation[6:]
+    focal_x = camera[layout.FOCAL_X]
+    focal_y = camera[layout.FOCAL_Y]
+    min_x = camera[layout.MIN_SLOPE_X]
+    max_x = camera[layout.MAX_SLOPE_X]
+    min_y = camera[layout.MIN_SLOPE_Y]
+    max_y = camera[layout.MAX_SLOPE_Y]
+    x_axis = rotation[:3]
+    y_axis = rotation[3:6]
+    z_axis = rotation[6:]
     # row_x = (focal_x / z) * (x_axis - clamped_slope_x * z_axis), and the same for y.
-    along_x, along_y = dot(grad_row_x, z_axis), dot(grad_row_y, z_axis)
+    along_x = dot(grad_row_x, z_axis)
+    along_y = dot(grad_row_y, z_axis)
     grad_inverse_z = focal_x * (dot(grad_row_x, x_axis) - clamp(slope_x, min_x, max_x) * along_x)
     grad_inverse_z = grad_inverse_z + focal_y * (dot(grad_row_y, y_axis) - clamp(slope_y, min_y, max_y) * along_y)
-    free_x, free_y = (slope_x >= min_x) & (slope_x <= max_x), (slope_y >= min_y) & (slope_y <= max_y)
+    free_x = (slope_x >= min_x) & (slope_x <= max_x)
+    free_y = (slope_y >= min_y) & (slope_y <= max_y)
     grad_slope_x = focal_x * grad_center_x - keep(free_x, focal_x * inverse_z * along_x)
     grad_slope_y = focal_y * grad_center_y - keep(free_y, focal_y * inverse_z * along_y)
     # slope = point / z, and d(1 / z) / dz = -1 / z^2.

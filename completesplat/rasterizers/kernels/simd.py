@@ -13,8 +13,12 @@ from numba.extending import intrinsic, lower_builtin, models, register_model, ty
 LANES = 16
 FLAGS = ("contract", "nsz", "arcp", "reassoc", "afn")  # as in `compilation.OPTIONS`
 
-F32, F64, I32, I64 = ir.FloatType(), ir.DoubleType(), ir.IntType(32), ir.IntType(64)
-VECTOR_IR, INTEGERS_IR = ir.VectorType(F32, LANES), ir.VectorType(I32, LANES)
+F32 = ir.FloatType()
+F64 = ir.DoubleType()
+I32 = ir.IntType(32)
+I64 = ir.IntType(64)
+VECTOR_IR = ir.VectorType(F32, LANES)
+INTEGERS_IR = ir.VectorType(I32, LANES)
 # x + 1.5 * 2^23 has its last bit at 1, so it is rounded to an integer, which sits in the low bits of the sum.
 _ROUNDING_SHIFT = 1.5 * 2**23
 _ROUNDING_BITS = int(np.float32(_ROUNDING_SHIFT).view(np.int32))
@@ -30,7 +34,8 @@ class LanesType(types.Type):
         self.llvm = ir.VectorType(element, LANES)
 
 
-VECTOR, DOUBLES = LanesType("Float32", F32), LanesType("Float64", F64)
+VECTOR = LanesType("Float32", F32)
+DOUBLES = LanesType("Float64", F64)
 MASK = LanesType("Mask", ir.IntType(1))
 
 
@@ -345,7 +350,8 @@ def gathered_rows(builder, array, places, start):
 def transposed(builder, matrix):
     for step in (1, 2, 4, 8):  # each round swaps the off-diagonal squares of this size
         for i in (i for i in range(LANES) if not i & step):
-            a, b = matrix[i], matrix[i + step]
+            a = matrix[i]
+            b = matrix[i + step]
             upper = [LANES + lane - step if lane & step else lane for lane in range(LANES)]
             lower = [LANES + lane if lane & step else lane + step for lane in range(LANES)]
             matrix[i] = builder.shuffle_vector(a, b, ir.Constant(INTEGERS_IR, upper))
