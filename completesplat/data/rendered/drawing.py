@@ -74,7 +74,7 @@ def draw_rendered_scene(name: str, settings: RenderSettings) -> tuple[dict[str, 
     job = {
         "seed": int(rng.integers(2**31)),
         "samples": settings["samples"],
-        "views": [_view(camera) for camera in cameras],
+        "views": [view_of(camera) for camera in cameras],
         "room": room_size(cameras),
         "light": draw_light(rng, settings["light"]),
         "floor": draw_surface(rng, settings["floor"]),
@@ -84,7 +84,7 @@ def draw_rendered_scene(name: str, settings: RenderSettings) -> tuple[dict[str, 
     return job, cameras
 
 
-def _view(camera: Cameras) -> dict[str, Any]:
+def view_of(camera: Cameras) -> dict[str, Any]:
     focal = camera.intrinsics[0, 0].item()
     center = camera.intrinsics[:2, 2].tolist()
     size = camera.image_size[::-1]

@@ -15,7 +15,7 @@ READABLE = (".glb", ".gltf", ".obj", ".ply")
 """Suffixes that trimesh reads with their textures; Blender reads the others."""
 MOST_TEXTURE = 2048  # pixels of a texture's side; larger ones are reduced, because images are much smaller
 FEWEST_TEXELS = 8  # side below which a texture is not halved any more
-SMOOTH = np.cos(np.radians(45.0))  # a corner is shaded smoothly if its faces' normals differ less from their mean
+SMOOTH = np.cos(np.radians(40.0))  # a corner is shaded smoothly if its faces' normals differ less from their mean
 SAME_PLACE = 1e-6  # of an object's size: corners that are nearer belong to one vertex
 METAL = 0.5
 GREY = 0.8  # linear, of faces without colour: Blender's own default
@@ -85,7 +85,7 @@ class TextureFiles:
         self.root = root
         self.refused: list[str] = []
 
-    def get(self, name: str) -> bytes:
+    def __getitem__(self, name: str) -> bytes:
         """Return a file's content.
 
         Raises:
@@ -101,6 +101,8 @@ class TextureFiles:
         else:
             return path.read_bytes()
         raise FileNotFoundError(name)
+
+    get = __getitem__
 
     def _find(self, name: str) -> Path | None:
         folder = self.mesh.parent
@@ -286,15 +288,21 @@ def _joined(parts: list[_Part], turn: Float[np.ndarray, "3 3"], beyond: str) -> 
 
 
 def corner_normals(corners: Float[np.ndarray, "triangle 3 3"]) -> Float[np.ndarray, "triangle 3 3"]:
-    """Return a unit normal for each corner: the mean of the faces that meet there, or its own face's at an edge."""
+    """Return a unit normal for each corner: the mean of the faces that meet there, or its own face's at an edge.
+
+    Faces count by their angle at the corner, so that it does not matter how they are cut into triangles.
+    """
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    first = np.roll(corners, -1, axis=1) - corners
+    second = np.roll(corners, 1, axis=1) - corners
+    angles = np.arctan2(np.linalg.norm(np.cross(first, second), axis=-1), (first * second).sum(-1))
     keys = np.round(corners.reshape(-1, 3) / SAME_PLACE).astype(np.int64)
     _, vertex = np.unique(keys, axis=0, return_inverse=True)
     vertex = vertex.reshape(-1)
-    repeated = crosses.repeat(3, axis=0)
-    sums = np.stack([np.bincount(vertex, repeated[:, axis]) for axis in range(3)], 1)
-    smooth = _unit(sums)[vertex].reshape(corners.shape)
     faces = _unit(crosses)[:, None]
+    weighted = (angles[..., None] * faces).reshape(-1, 3)
+    sums = np.stack([np.bincount(vertex, weighted[:, axis]) for axis in range(3)], 1)
+    smooth = _unit(sums)[vertex].reshape(corners.shape)
     agree = (smooth * faces).sum(-1, keepdims=True) > SMOOTH
     return np.where(agree, smooth, faces)
 

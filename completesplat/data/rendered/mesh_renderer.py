@@ -141,8 +141,10 @@ def light_of(light: dict[str, Any], mesh: TexturedMesh, planes: list[Plane]) -> 
     azimuth = light["azimuth"]
     level = math.cos(elevation)
     toward = np.array([level * math.sin(azimuth), -level * math.cos(azimuth), math.sin(elevation)])
-    across = np.cross(toward, [0.0, 0.0, 1.0])
-    across = across / max(np.linalg.norm(across), 1e-12)
+    # An axis that is not along the sun's rays, and two across them.
+    helper = np.eye(3)[np.abs(toward).argmin()]
+    across = np.cross(toward, helper)
+    across = across / np.linalg.norm(across)
     axes = np.stack([across, np.cross(toward, across), -toward])
     sun = np.array(light["color"]) * light["strength"] / math.pi
     sky = np.array(light["sky"])

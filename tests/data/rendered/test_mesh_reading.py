@@ -1,0 +1,109 @@
+"""Reading of textured meshes: where textures are looked for, and what is refused."""
+
+import shutil
+from pathlib import Path
+
+import meshes
+import numpy as np
+import pytest
+from PIL import Image
+
+from completesplat.data.rendered.mesh_reading import UnreadableMesh, read_mesh
+
+CASES = Path(__file__).parents[2] / "cases"
+trimesh = pytest.importorskip("trimesh")
+
+
+@pytest.fixture
+def cube(tmp_path):
+    """OBJ of a cube in its own folder, with its material and its texture beside it."""
+    return meshes.write_cube(tmp_path / "root/cube/meshes/model.obj")
+
+
+def texture_of(path, root):
+    """Return the mean linear colour of the first texture, on which none of the cube's colours would be 1."""
+    mesh = read_mesh(path, root.resolve())
+    start, width, height = mesh.textures.levels[0, 0]
+    return mesh.textures.texels[start : start + 4 * width * height].reshape(-1, 4)[:, :3].mean() / 65535
+
+
+def moved(cube: Path, place: str) -> Path:
+    """Move the texture and return its new path."""
+    path = (cube.parent / place).resolve()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shutil.move(cube.with_suffix(".png"), path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("place", "name"),
+    [
+        ("model.png", "model.png"),
+        ("tex/model.png", "tex\\model.png"),
+        ("model.png", "C:\\work\\MODEL.PNG"),
+        ("../materials/textures/model.png", "model.png"),
+        ("MODEL.png", "model.PNG"),
+    ],
+    ids=["beside the mesh", "backslashes", "path of another machine", "Google Scanned Objects", "another case"],
+)
+def test_textures_are_found(cube, tmp_path, place, name):
+    there = texture_of(cube, tmp_path / "root")
+    cube.with_suffix(".mtl").write_text(f"newmtl checker\nmap_Kd {name}\n")
+    if place != "model.png":
+        moved(cube, place)
+    assert texture_of(cube, tmp_path / "root") == there
+    assert 0 < there < 1
+
+
+def test_a_texture_that_is_missing_outside_or_damaged_is_refused(cube, tmp_path):
+    path = moved(cube, "../../../outside.png")
+    with pytest.raises(UnreadableMesh, match=r"its texture model.png is missing"):
+        read_mesh(cube, tmp_path / "root")
+    cube.with_suffix(".mtl").write_text("newmtl checker\nmap_Kd ../../../outside.png\n")
+    with pytest.raises(UnreadableMesh, match=r"its texture outside.png lies outside of the folder of meshes"):
+        read_mesh(cube, (tmp_path / "root").resolve())
+    content = path.read_bytes()
+    (cube.parent / "outside.png").write_bytes(content[: len(content) // 2])
+    cube.with_suffix(".mtl").write_text("newmtl checker\nmap_Kd outside.png\n")
+    with pytest.raises(UnreadableMesh, match=r"its texture outside.png cannot be read"):
+        read_mesh(cube, (tmp_path / "root").resolve())
+
+
+@pytest.mark.parametrize("name", ["badtex.glb", "cuttex.glb", "lfstex.glb", "ktx2only.glb"])
+def test_textures_of_glb_files_that_cannot_be_read_are_refused(name):
+    with pytest.raises(UnreadableMesh, match=r"texture"):
+        read_mesh(CASES / "meshes" / name, CASES.resolve())
+
+
+def test_faces_that_are_stray_empty_or_not_finite(cube, tmp_path):
+    text = cube.read_text()
+    cube.write_text(text + "v 99 0 0\nv 99.001 0 0\nv 99 0.001 0\nf 9/1 10/2 11/3\n")
+    mesh = read_mesh(cube, tmp_path.resolve())
+    assert mesh.left_out == 1
+    assert np.linalg.norm(mesh.corners, axis=-1).max() == pytest.approx(1)
+    for content, reason in (("v 0 0 0\n", "no faces"), ("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not finite")):
+        cube.write_text(content)
+        with pytest.raises(UnreadableMesh, match=reason):
+            read_mesh(cube, tmp_path.resolve())
+    cube.write_text("v 1 1 1\n" * 3 + "f 1 2 3\n")
+    with pytest.raises(UnreadableMesh, match="in one place"):
+        read_mesh(cube, tmp_path.resolve())
+
+
+def test_colours_of_vertices_and_materials_are_linear(tmp_path):
+    triangle = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
+    triangle.visual = trimesh.visual.ColorVisuals(triangle, vertex_colors=[[188, 188, 188, 255]] * 3)
+    triangle.export(tmp_path / "t.ply")
+    assert read_mesh(tmp_path / "t.ply", tmp_path).colors == pytest.approx(np.full((1, 3, 3), 0.503), abs=2e-3)
+    (tmp_path / "t.mtl").write_text("newmtl m\nKd 0.735 0.735 0.735\n")
+    (tmp_path / "t.obj").write_text("mtllib t.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
+    assert read_mesh(tmp_path / "t.obj", tmp_path).colors == pytest.approx(np.full((1, 3, 3), 0.5), abs=5e-3)
+
+
+def test_what_only_blender_draws_is_named(tmp_path):
+    kind = trimesh.visual.material.PBRMaterial(metallicFactor=1.0, baseColorFactor=[255, 255, 255, 255], name="steel")
+    visual = trimesh.visual.TextureVisuals(uv=np.zeros((3, 2)), material=kind)
+    triangle = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False, visual=visual)
+    triangle.export(tmp_path / "t.glb")
+    assert read_mesh(tmp_path / "t.glb", tmp_path).beyond == "metal"
+    assert Image.MAX_IMAGE_PIXELS is not None
