@@ -22,10 +22,10 @@ from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.parts import PartConfig, build, check_architecture, stored_config
+from completesplat.quantities import Natural, Positive, Seed
 from completesplat.run_configs import read_run, read_weights
 from completesplat.scene import Views
 from completesplat.scene_model import SceneModel, Visible
-from completesplat.settings.schema import Natural, Positive, Seed
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import concatenate, in_float32
 from completesplat.weights import WEIGHTS_FILE, first_line, locate

@@ -21,11 +21,12 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import make_folder, write_bytes, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
+from completesplat.quantities import Natural
 from completesplat.rasterizers.front_fitting import fit_front
 from completesplat.rasterizers.selection import auto
 from completesplat.scene import Views
 from completesplat.settings.composition import has_bfloat16
-from completesplat.settings.schema import Natural, check_settings
+from completesplat.settings.schema import check_settings
 from completesplat.splatter_image import Parameterization
 from completesplat.tensors import concatenate, in_float32
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, read_small, shipped, write_sums

@@ -16,8 +16,8 @@ from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
+from completesplat.quantities import Natural, Positive, Share
 from completesplat.scene import Batch, SceneBatch
-from completesplat.settings.schema import Natural, Positive, Share
 from completesplat.training.encoding import check_cache
 from completesplat.training.scoring import Scorer
 from completesplat.training.stage import Compile, Stage, prepare_network

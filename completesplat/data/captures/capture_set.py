@@ -12,7 +12,7 @@ from completesplat.data.packed.manifest import Scalar
 from completesplat.data.sequences import SPLITS
 from completesplat.data.validation import field, read_json, require_file
 from completesplat.errors import BadAnnotation, MissingFile, SharedSequences, errors_at
-from completesplat.settings.schema import Natural, Share
+from completesplat.quantities import Natural, Share
 
 SPLITS_FILE = "splits.json"
 MARKS = {*TRANSFORMS, "keyframes", *(model.split("/")[0] for model in MODELS)}  # a folder with one is a capture

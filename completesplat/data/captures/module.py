@@ -20,7 +20,7 @@ from completesplat.data.packed.manifest import Scalar
 from completesplat.data.placement import ObjectFraming, from_cameras, from_points, placed_sequence, upright_axes
 from completesplat.data.sequences import SPLITS, MaskedImage, PosedSequence, SequenceSource
 from completesplat.errors import DataError, MissingFile, errors_at, refused_to
-from completesplat.settings.schema import Range
+from completesplat.quantities import Range
 
 logger = logging.getLogger(__name__)
 

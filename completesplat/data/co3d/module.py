@@ -10,7 +10,7 @@ from completesplat.data.hidden_modes import HiddenModeScenes
 from completesplat.data.loading.data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.errors import DataError, MissingFile
-from completesplat.settings.schema import Natural, Positive, Range, Share
+from completesplat.quantities import Natural, Positive, Range, Share
 
 
 class CO3DDataModule(ObjectDataModule):

@@ -28,7 +28,8 @@ from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import CompleteSplatError, DataError, TooFewFrames, errors_at
 from completesplat.files import counted
-from completesplat.settings.schema import Natural, Positive, Range, Share, Side, check_value, hints_of
+from completesplat.quantities import Natural, Positive, Range, Share, Side
+from completesplat.settings.schema import check_value, hints_of
 
 MOST_WORKERS = 4  # if data.workers is null
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
