@@ -121,11 +121,11 @@ def test_evaluation_goes_from_the_first_frame_to_those_that_follow(root):
 def test_a_model_sees_images_made_as_its_training_images_were_whatever_size_is_scored(root):
     small, large = module(root, image_size=8), module(root, image_size=HEIGHT)
     expected = list(module(root, image_size=HEIGHT).test_dataloader())
-    large.at_model_size = small
-    for batch, truth, seen in zip(large.test_dataloader(), expected, small.test_dataloader(), strict=True):
+    large.low_resolution = small
+    for batch, truth, model_input in zip(large.test_dataloader(), expected, small.test_dataloader(), strict=True):
         assert same(batch, truth)
-        assert same(batch.seen, seen)
-        assert same(batch[0].seen, seen[0])
+        assert same(batch.low_resolution, model_input)
+        assert same(batch[0].low_resolution, model_input[0])
 
 
 def test_the_evaluation_index_and_the_scene_list_decide(root, tmp_path, caplog):

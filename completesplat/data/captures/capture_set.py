@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from completesplat.data.captures.module import MODELS, TRANSFORMS, CaptureSource, read_captures
-from completesplat.data.co3d.splits import SeededSplit, split_by_seed
-from completesplat.data.loading.data_module import ObjectDataModule
+from completesplat.data.loading.object_data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
-from completesplat.data.sequences import SPLITS
+from completesplat.data.splits import SPLITS, SeededSplit, split_by_seed
 from completesplat.data.validation import field, read_json, require_file
 from completesplat.errors import BadAnnotation, MissingFile, SharedSequences, errors_at
 from completesplat.settings.schema import Natural, Share

@@ -11,7 +11,14 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fit_lens, in_order, warn_of_missing
+from completesplat.data.captures.captured_frames import (
+    Capture,
+    CapturedFrame,
+    Lens,
+    fit_lens,
+    in_order,
+    warn_of_missing,
+)
 from completesplat.data.validation import finite_array, path_below, read_text, require_file
 from completesplat.errors import BadAnnotation, BadCamera, DataError, MissingFile, UnreadableFile, errors_at
 from completesplat.geometry.rotations import quaternion_to_matrix

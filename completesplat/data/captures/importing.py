@@ -13,7 +13,7 @@ from typing import Literal, Unpack
 from PIL import ImageOps
 from rich.progress import Progress, track
 
-from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
+from completesplat.data.captures.captured_frames import FEWEST_FRAMES, import_pycolmap
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.turntable import TurntableSettings, import_turntables
 from completesplat.data.images import files

@@ -12,13 +12,14 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 
-from completesplat.data.captures.capture import Capture, CapturedFrame
+from completesplat.data.captures.captured_frames import Capture, CapturedFrame
 from completesplat.data.captures.colmap import image_count, is_model, read_colmap
 from completesplat.data.captures.transforms_json import read_polycam, read_transforms
-from completesplat.data.loading.data_module import ObjectDataModule
+from completesplat.data.loading.object_data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.placement import ObjectFraming, from_cameras, from_points, placed_sequence, upright_axes
-from completesplat.data.sequences import SPLITS, MaskedImage, PosedSequence, SequenceSource
+from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
+from completesplat.data.splits import SPLITS
 from completesplat.errors import DataError, MissingFile, errors_at, refused_to
 from completesplat.settings.schema import Range
 

@@ -12,7 +12,14 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fit_lens, in_order, warn_of_missing
+from completesplat.data.captures.captured_frames import (
+    Capture,
+    CapturedFrame,
+    Lens,
+    fit_lens,
+    in_order,
+    warn_of_missing,
+)
 from completesplat.data.images.exif import ORIENTATION, read_exif
 from completesplat.data.images.files import stored_size
 from completesplat.data.images.photograph import read_photograph

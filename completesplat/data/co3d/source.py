@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.data.co3d.annotations import CO3DFrame
-from completesplat.data.co3d.splits import SplitMembers
+from completesplat.data.co3d.category import SplitMembers
 from completesplat.data.images.crop import Square
 from completesplat.data.images.files import decode_image, read_depth
 from completesplat.data.placement import (

@@ -12,11 +12,10 @@ import pyarrow as pa
 import torch
 from jaxtyping import Float, Shaped, UInt32
 
-from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import TrainingScenes
 from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, read_as
+from completesplat.data.packed.preparation import UNFINISHED
 from completesplat.data.packed.source import OpenShard
-from completesplat.data.packed.writing import UNFINISHED
 from completesplat.data.sequences import SequenceSource
 from completesplat.data.validation import require_file
 from completesplat.errors import (
@@ -242,29 +241,29 @@ class CachedTrainingScenes(TrainingScenes):
     """Items of `TrainingScenes` without targets, with the same sequence and reference frame for (seed, epoch, index).
 
     If only some frames of a sequence were encoded, the nearest one (the earlier of two) replaces the reference frame.
-    `store` determines the order of items; its images are not read. Box masks hide parts of images as in `augment`.
+    `store` determines the order of items; its images are not read. Box masks hide parts of images as in `Augmentation`.
 
     Raises:
         CompleteSplatError: there are box masks, but the store holds features instead of images.
     """
 
     cache: LatentCache
-    box_masks: BoxMasks | None
 
     def __post_init__(self) -> None:
-        if self.box_masks is not None and not self.cache.holds_images:
+        if self.augmentation.box_masks is not None and not self.cache.holds_images:
             advice = "use data.latent_cache=null, or encode images"
             raise CompleteSplatError(f"data.box_masks cannot hide parts of encoded features: {advice}")
 
     def draw(self, name: str, epoch: int, rng: np.random.Generator) -> CachedScene:
         """Draw a random reference frame of the sequence `name` and return its encoding."""
         sequence = self.cache.sequences[name]
-        reference, _ = self.choose(sequence.frames, epoch, rng)
+        reference, _ = self.views(sequence.frames, epoch, rng)
         stored = np.array(sequence.stored)
         scene = self.cache.scene(name, int(stored[np.abs(stored - reference).argmin()]))
-        if self.box_masks is None:
+        box_masks = self.augmentation.box_masks
+        if box_masks is None:
             return scene
-        boxes_rng = rng.spawn(3)[2]  # the third, as in `augment`
+        boxes_rng = rng.spawn(3)[2]  # the third, as in `Augmentation`
         height, width = scene.condition.shape[-2:]
-        visible = self.box_masks(height, width, boxes_rng)
+        visible = box_masks(height, width, boxes_rng)
         return replace(scene, condition=scene.condition * visible)

@@ -9,7 +9,8 @@ from completesplat.data.validation import field, parsed, read_json
 from completesplat.errors import BadAnnotation, DataError, UnreadableFile, errors_at
 
 MANIFEST = "manifest.json"
-HEADER = {"format": 2}
+FORMAT = 2
+HEADER = {"format": FORMAT}
 
 Scalar = str | int | float | bool | None
 T = TypeVar("T")

@@ -22,13 +22,12 @@ from jaxtyping import Float
 from PIL import Image
 from rich.progress import track
 
-from completesplat.data.co3d import writing
+from completesplat.data.co3d import category_writers
 from completesplat.data.co3d.annotations import viewpoint
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.hidden_modes import in_mode
 from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
-from completesplat.data.rendered.drawing import PAINTS, RenderSettings, check_surroundings, draw_rendered_scene
+from completesplat.data.rendered.random_scenes import PAINTS, RenderSettings, check_surroundings, draw_rendered_scene
 from completesplat.data.validation import read_points
 from completesplat.data.validation.processes import share_of, usable_cores
 from completesplat.errors import CompleteSplatError, DataError, MissingFile, UnreadableFile
@@ -203,7 +202,7 @@ def render(
     lock = FileLock(out / LOCK)
     out.mkdir(parents=True, exist_ok=True)
     with lock:
-        if not writing.is_written(category / DESCRIPTION, parameters):
+        if not category_writers.is_written(category / DESCRIPTION, parameters):
             with atomic_folder(category) as unfinished:
                 (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
     waiting = [asset for asset in mine if not (category / asset.name).exists()]
@@ -231,7 +230,7 @@ def _write_lists(category: Path, objects: Sequence[Asset], broken: dict[str, str
     if len(broken) == len(objects) and not records:
         raise DataError(f"none of {len(broken)} objects can be rendered: {next(iter(broken.values()))}", str(category))
     frames = [frame for record in records for frame in record["frames"]]
-    writing.write_annotations(category, frames, [record["sequence"] for record in records])
+    category_writers.write_annotations(category, frames, [record["sequence"] for record in records])
     logger.info("%s in %s/, %d of them new, %d left out", counted(len(records), "object"), CATEGORY, new, len(broken))
 
 
@@ -293,9 +292,9 @@ def _write_object(
 
 def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Cameras]) -> dict[str, Any]:
     """Write images, masks, depths and points from the files of Blender; return the annotations."""
-    for kind in writing.FOLDERS:
+    for kind in category_writers.FOLDERS:
         (folder / kind).mkdir()
-    frames = list[writing.Annotation]()
+    frames = list[category_writers.Annotation]()
     points = []
     colors = []
     for number, camera in enumerate(cameras):
@@ -303,7 +302,7 @@ def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Came
         depth, seen, coverage = np.moveaxis(np.load(files / f"{number:04d}.npy"), -1, 0)
         depth[depth > SKY] = 0
         place = CATEGORY, name, number
-        frames.append(writing.write_frame(folder, place, image, coverage, depth, _viewpoint(camera)))
+        frames.append(category_writers.write_frame(folder, place, image, coverage, depth, _viewpoint(camera)))
         pixels = pixel_centers(*camera.image_size, dtype=torch.float64)[torch.from_numpy(seen == 1)]
         points.append(unproject(camera, pixels, torch.from_numpy(depth[seen == 1]).double()).numpy())
         colors.append(to_uint8(image[seen == 1]))
@@ -311,8 +310,8 @@ def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Came
     if not step:
         raise BrokenMesh("no image shows it")
     cloud = np.concatenate(points)[::step]
-    writing.write_points(folder / "pointcloud.ply", cloud, np.concatenate(colors)[::step])
-    return {"frames": frames, "sequence": writing.sequence_annotation(CATEGORY, name, len(cloud))}
+    category_writers.write_points(folder / "pointcloud.ply", cloud, np.concatenate(colors)[::step])
+    return {"frames": frames, "sequence": category_writers.sequence_annotation(CATEGORY, name, len(cloud))}
 
 
 def _write_modes(folder: Path, modes: Sequence[str], files: Path) -> None:
@@ -320,7 +319,7 @@ def _write_modes(folder: Path, modes: Sequence[str], files: Path) -> None:
         (folder / mode).mkdir()
         prefix = f"{index}_" if index else ""
         for number, image in enumerate(sorted((folder / "images").iterdir())):
-            save_jpeg(_pixels(files / f"{prefix}{number:04d}.png"), in_mode(image, mode))
+            save_jpeg(_pixels(files / f"{prefix}{number:04d}.png"), category_writers.in_mode(image, mode))
 
 
 def _pixels(path: Path) -> Float[np.ndarray, "height width 3"]:

@@ -6,8 +6,8 @@ from typing import Any
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
+from completesplat.data.toy.data_sets import DESCRIPTION, ROOMS, SUBSET, DataSetSize, write
 from completesplat.data.toy.object_scene import PATCH_COLORS
-from completesplat.data.toy.writing import DESCRIPTION, ROOMS, SUBSET, DataSetSize, write
 from completesplat.errors import MissingFile
 from completesplat.settings.schema import Natural, Positive, Side
 

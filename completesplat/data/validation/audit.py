@@ -9,7 +9,8 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from completesplat.data.sequences import SequenceSource, overlaps, shared_names
+from completesplat.data.sequences import SequenceSource
+from completesplat.data.splits import overlaps, shared_names
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError, TooFewFrames, refused_to
 from completesplat.files import printable

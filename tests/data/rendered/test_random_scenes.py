@@ -12,7 +12,7 @@ from support import change_json, write_capture
 
 from completesplat.data.captures.transforms_json import read_cameras, read_transforms
 from completesplat.data.rendered import rendering
-from completesplat.data.rendered.drawing import (
+from completesplat.data.rendered.random_scenes import (
     PAINTS,
     draw_back,
     draw_cameras,

@@ -64,6 +64,14 @@ def write_frame(
     }
 
 
+def in_mode(image: Path, mode: str) -> Path:
+    """Return the path of an image in a mode of the hidden part, given that of the image in `images`.
+
+    Beside its `images`, a sequence has a folder with the same images in each mode, named after the mode.
+    """
+    return image.parent.parent / mode / image.name
+
+
 def sequence_annotation(category: str, name: str, points: int) -> Annotation:
     """Return the annotation of a sequence without a video; with points, its cloud is `name`/pointcloud.ply."""
     cloud = {"path": f"{category}/{name}/pointcloud.ply", "quality_score": 1.0, "n_points": points}

@@ -2,32 +2,24 @@
 
 import logging
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 from completesplat.data.co3d.annotations import CO3DFrame, CO3DVideo, Frames, read_frames, read_videos
-from completesplat.data.sequences import SPLITS, overlaps, shared_names, split_by_hash
+from completesplat.data.splits import (
+    SPLITS,
+    ListedFrames,
+    SeededSplit,
+    overlaps,
+    shared_names,
+    split_by_hash,
+    split_by_seed,
+)
 from completesplat.data.validation import field, path_below, read_json
 from completesplat.errors import BadAnnotation, DataError, SharedSequences, errors_at, refused_to
-from completesplat.files import counted
-
-Listed = dict[str, set[tuple[str, int]]]
-"""(sequence name, frame number) of each split."""
 
 logger = logging.getLogger(__name__)
-
-
-class SeededSplit(NamedTuple):
-    """Shares of the sequences that are held out by seed, at least one sequence for each share.
-
-    Without a set list, they are shares of all sequences; without validation in a list, `val_fraction` is taken from
-    training.
-    """
-
-    val_fraction: float
-    test_fraction: float
-    split_seed: int
 
 
 def set_list_path(category: Path, subset: str | None) -> Path | None:
@@ -43,14 +35,14 @@ def set_list_path(category: Path, subset: str | None) -> Path | None:
     return folder / f"set_lists_{subset}.json"
 
 
-def read_set_list(path: Path, refused: list[DataError]) -> Listed:
+def read_set_list(path: Path, refused: list[DataError]) -> ListedFrames:
     """Read the frames of each split; errors of single entries are added to `refused`.
 
     Raises:
         DataError: the file is missing, unreadable, or has no list for a split.
     """
     content = read_json(path)
-    splits: Listed = {}
+    splits: ListedFrames = {}
     for split in SPLITS:
         with errors_at(path):
             members = field(content, split, list)
@@ -63,7 +55,7 @@ def read_set_list(path: Path, refused: list[DataError]) -> Listed:
     return splits
 
 
-def remove_test_sequences(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, list[str]]:
+def remove_test_sequences(path: Path, listed: ListedFrames, rule: SeededSplit) -> tuple[ListedFrames, list[str]]:
     """Return a set list whose splits share no sequence, and the names removed from validation.
 
     CO3D's `fewview_train` tests on all its training sequences (facebookresearch/co3d, issue 49); Splatter Image uses
@@ -91,19 +83,6 @@ def remove_test_sequences(path: Path, listed: Listed, rule: SeededSplit) -> tupl
         lost = lost - held_out
         train = train - val
     return {"train": train, "val": val, "test": listed["test"]}, sorted(lost)
-
-
-def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Listed:
-    """Split at least three sequences by seed, each as a whole; a `test_fraction` of 1 tests all, however many."""
-    if len(frames) < 3 and rule.test_fraction < 1:
-        objects = counted(len(frames), "object")
-        raise DataError(f"{objects} cannot be split into train, val and test; write a list (data.splits=FILE)")
-    kept = 1 if rule.test_fraction < 1 else 0  # at least, in training and in validation
-    rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.split_seed, 2 * kept)
-    # The hashes of the remaining names lie above the test fraction; validation gets the next interval.
-    train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.split_seed, kept)
-    names = {"train": train, "val": val, "test": test}
-    return {split: {(name, number) for name in names[split] for number in frames[name]} for split in SPLITS}
 
 
 class Filters(NamedTuple):

@@ -11,9 +11,8 @@ from filelock import FileLock
 from rich.console import Console
 from rich.progress import track
 
-from completesplat.data.co3d import writing
+from completesplat.data.co3d import category_writers
 from completesplat.data.co3d.annotations import viewpoint
-from completesplat.data.hidden_modes import in_mode
 from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_mini, draw_object_scene, render_frame
 from completesplat.data.toy.raytracing import WHITE
@@ -52,7 +51,7 @@ class DataSetSize(TypedDict):
 
 
 Factors = Annotated[Sequence[Annotated[float, Range(0)]], Entries(3, 3)]
-WrittenScene = tuple[str, list[writing.Annotation], writing.Annotation]
+WrittenScene = tuple[str, list[category_writers.Annotation], category_writers.Annotation]
 """Split of a sequence, and annotations of its frames and of itself."""
 
 
@@ -64,7 +63,9 @@ def _write_frame(folder: Path, place: tuple[str, str, int], scene: ToyScene, siz
     translation = scene.unit * world_to_camera[:3, 3] - rotation @ scene.origin
     focal = float(1 / np.tan(np.radians(scene.fov_degrees) / 2))
     seen_from = viewpoint(rotation, translation, [focal, focal], [0.0, 0.0])
-    annotation = writing.write_frame(folder / name, place, *render_frame(scene, frame, size), seen_from, scene.unit)
+    annotation = category_writers.write_frame(
+        folder / name, place, *render_frame(scene, frame, size), seen_from, scene.unit
+    )
     return annotation | {"meta": {"frame_type": f"{split}_known"}}
 
 
@@ -93,16 +94,16 @@ def _write_scene(
     index, split = place
     scene = draw_category(category, seed, index, frames, light)
     name = f"{index:05d}_{scene.family}"
-    for folder in writing.FOLDERS:
+    for folder in category_writers.FOLDERS:
         (root / name / folder).mkdir(parents=True)
     annotations = [_write_frame(root, (category, name, frame), scene, size, split) for frame in range(frames)]
     points = scene.unit * scene.points + scene.origin
-    writing.write_points(root / name / "pointcloud.ply", points, to_uint8(scene.point_colors))
+    category_writers.write_points(root / name / "pointcloud.ply", points, to_uint8(scene.point_colors))
     if split == "test":
         _write_modes(root / name, scene, size)
     record = {"family": scene.family, "hidden": scene.patch_color, "chances": scene.chances.tolist()}
     (root / name / DESCRIPTION).write_text(json.dumps(record) + "\n")
-    return split, annotations, writing.sequence_annotation(category, name, len(points))
+    return split, annotations, category_writers.sequence_annotation(category, name, len(points))
 
 
 def _write_modes(folder: Path, scene: ToyScene, size: int) -> None:
@@ -110,7 +111,7 @@ def _write_modes(folder: Path, scene: ToyScene, size: int) -> None:
         (folder / mode).mkdir()
         painted = scene._replace(patch=scene.patch._replace(color=np.array(color)))
         for frame, image in enumerate(sorted((folder / "images").iterdir())):
-            save_jpeg(render_frame(painted, frame, size)[0], in_mode(image, mode))
+            save_jpeg(render_frame(painted, frame, size)[0], category_writers.in_mode(image, mode))
 
 
 def _write_lists(category: Path, written: list[WrittenScene]) -> None:
@@ -118,8 +119,8 @@ def _write_lists(category: Path, written: list[WrittenScene]) -> None:
     for split, frames, _ in written:
         lists[split] += [[f["sequence_name"], f["frame_number"], f["image"]["path"]] for f in frames]
     annotations = [frame for _, frames, _ in written for frame in frames]
-    writing.write_annotations(category, annotations, [sequence for _, _, sequence in written])
-    writing.write_set_list(category, SUBSET, lists)
+    category_writers.write_annotations(category, annotations, [sequence for _, _, sequence in written])
+    category_writers.write_set_list(category, SUBSET, lists)
 
 
 def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed: int, light: Array) -> None:
@@ -176,13 +177,13 @@ def write(
         if reason is not None:
             raise DataError(f"{folder.name}: {name}={number}: {reason}")
     parameters = {"format": FORMAT_VERSION, **numbers} | ({} if tuple(light) == WHITE else {"light": list(light)})
-    if writing.is_written(folder / DESCRIPTION, parameters):
+    if category_writers.is_written(folder / DESCRIPTION, parameters):
         if progress:
             Console().print(f"{folder} already holds these scenes")
         return folder
     out.mkdir(parents=True, exist_ok=True)
     with FileLock(out / f".{folder.name}.lock"):
-        if not writing.is_written(folder / DESCRIPTION, parameters):  # by another process
+        if not category_writers.is_written(folder / DESCRIPTION, parameters):  # by another process
             _write_all(folder, parameters, workers, progress)
     return folder
 
