@@ -66,14 +66,14 @@ class SequenceSource(ABC):
 
     @abstractmethod
     def read(self, name: str) -> PosedSequence:
-        """Read a sequence's cameras, or raise a DataError; `PosedSequence.read` reads its images later."""
+        """Read a sequence's cameras, or raise a DataError. `PosedSequence.read` reads its images later."""
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """Return groups of indices into `names` that are best read one after the other; by default one group."""
+        """Return groups of indices into `names` that are best read one after the other, by default one group."""
         return [list(range(len(names)))]
 
     def verify(self) -> Sequence[DataError]:
-        """Return the files that differ from their checksums; by default there are no checksums."""
+        """Return the files that differ from their checksums. By default there are no checksums."""
         return []
 
     @abstractmethod
@@ -88,7 +88,7 @@ def first_names(names: Sequence[str], most: int = 5) -> str:
 
 
 def spread_places(count: int, most: int | None) -> list[int]:
-    """Return at most `most` of `count` indices, the middles of equal parts; None: all."""
+    """Return at most `most` of `count` indices, the middles of equal parts, or all if `most` is None."""
     if most is None or most >= count:
         return list(range(count))
     return [(2 * part + 1) * count // (2 * most) for part in range(most)]

@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 
 def set_list_path(category: Path, subset: str | None) -> Path | None:
-    """Return the path of the set list `subset`, which must exist; None if the sequences are split by seed."""
+    """Return the path of the set list `subset`, which must exist, or None if the sequences are split by seed."""
     if subset is None:
         return None
     folder = category / "set_lists"
@@ -36,7 +36,7 @@ def set_list_path(category: Path, subset: str | None) -> Path | None:
 
 
 def read_set_list(path: Path, refused: list[DataError]) -> ListedFrames:
-    """Read the frames of each split; errors of single entries are added to `refused`.
+    """Read the frames of each split, and add the errors of single entries to `refused`.
 
     Raises:
         DataError: the file is missing, unreadable, or has no list for a split.
@@ -69,16 +69,14 @@ def remove_test_sequences(path: Path, listed: ListedFrames, rule: SeededSplit) -
     shared = shared_names(names)
     if any("test" in pair for pair in shared):
         advice = "choose another data.subset, or set data.allow_shared_sequences=true"
-        raise SharedSequences("; ".join([*overlaps(shared), advice]), str(path))
+        raise SharedSequences(f"{'; '.join(overlaps(shared))}; {advice}", str(path))
     lost = names["train"] & names["val"]
     train = listed["train"]
     val = {frame for frame in listed["val"] if frame[0] not in lost}
     if not val and len(names["train"]) > 1:
         held_out = set(split_by_hash(sorted(names["train"]), rule.val_fraction, rule.split_seed)[1])
-        logger.warning(
-            "%s lists nothing for validation alone: %d of %d training sequences validate, by seed %d",
-            *(path, len(held_out), len(names["train"]), rule.split_seed),
-        )
+        message = "%s lists nothing for validation alone: %d of %d training sequences validate, by seed %d"
+        logger.warning(message, path, len(held_out), len(names["train"]), rule.split_seed)
         val = {frame for frame in train if frame[0] in held_out}
         lost = lost - held_out
         train = train - val
@@ -116,9 +114,11 @@ class SplitMembers(NamedTuple):
 
     def without(self, names: Collection[str], reason: str) -> "SplitMembers":
         """Return the split without some sequences, which are left out for this reason."""
-        frames = {name: frames for name, frames in self.frames.items() if name not in names}
         lost = [name for name in self.frames if name in names]
-        return self._replace(frames=frames, left_out={**self.left_out, **({reason: lost} if lost else {})})
+        if not lost:
+            return self
+        frames = {name: frames for name, frames in self.frames.items() if name not in names}
+        return self._replace(frames=frames, left_out=self.left_out | {reason: lost})
 
 
 class Category(NamedTuple):
@@ -167,7 +167,7 @@ def read_category(
 
 
 def _refuse_unannotated(frames: Frames, videos: Collection[str], file: Path, refused: list[DataError]) -> None:
-    """Remove the frames of sequences that have no annotation; refuse those sequences, each once."""
+    """Remove the frames of sequences that have no annotation, and refuse those sequences, each once."""
     known = {error.sequence for error in refused if error.frame is None}
     for name in sorted(frames.keys() - videos):
         if name not in known:
@@ -192,18 +192,25 @@ def _members(
     for name, number in sorted(listed):
         if number in frames.get(name, ()):
             members.setdefault(name, []).append(frames[name][number])
-    out = {n: why for n in members if (why := _reason_to_leave_out(len(members[n]), videos[n], filters))}
+    out: dict[str, str] = {}
+    for name, frames_of_split in members.items():
+        reason = _reason_to_leave_out(len(frames_of_split), videos[name], filters)
+        if reason is not None:
+            out[name] = reason
     most = filters.most_training_sequences
     if split == "train" and most is not None:
         best = sorted(members.keys() - out.keys(), key=lambda name: (-(videos[name].viewpoint_quality or 0.0), name))
-        out |= dict.fromkeys(best[most:], f"not among the {most} with the best viewpoint quality")
+        out.update(dict.fromkeys(best[most:], f"not among the {most} with the best viewpoint quality"))
+    left_out: dict[str, list[str]] = {}
+    for name, reason in out.items():
+        left_out.setdefault(reason, []).append(name)
     names = [name for name in members if name not in out]
     return SplitMembers(
         listed=len({name for name, _ in listed}),
         frames={name: members[name] for name in names},
         captured={name: list(frames[name].values()) for name in names},
         point_clouds={name: videos[name].point_cloud for name in names},
-        left_out={why: [name for name in out if out[name] == why] for why in dict.fromkeys(out.values())},
+        left_out=left_out,
     )
 
 

@@ -43,7 +43,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
         epoch = 0 if isinstance(self, RepeatedEpoch) else self.epoch
         # The index after the last belongs to no item, so the order is independent of what the items draw.
         rng = item_generator(self.seed, epoch, sum(map(len, self.groups)))
-        order = []
+        order: list[int] = []
         for group in rng.permutation(len(self.groups)):
             order.extend(rng.permutation(self.groups[group]))
         rank, count = processes()

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import logging
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -130,22 +131,22 @@ def _record_path(path: Path) -> Path:
 
 
 def _plans(sources: Mapping[str, SequenceSource], sequences_per_shard: int) -> list[ShardPlan]:
-    """Assign sequences to shards; a group of a source stays in one shard if it fits."""
+    """Assign sequences to shards. A group of a source stays in one shard if it fits."""
     plans = []
     for split, source in sources.items():
         shards: list[tuple[str, ...]] = []
         for group in source.groups(source.names):
             # A group that exceeds a shard is divided into nearly equal parts.
-            count = -(-len(group) // sequences_per_shard)
-            edges = [round(len(group) * number / count) for number in range(count + 1)] if count else []
+            count = math.ceil(len(group) / sequences_per_shard)
+            edges = [round(len(group) * number / count) for number in range(count + 1) if count]
             for start, end in pairwise(edges):
                 names = tuple(source.names[index] for index in group[start:end])
                 if shards and len(shards[-1]) + len(names) <= sequences_per_shard:
                     shards[-1] += names
                 else:
                     shards.append(names)
-        files = [f"{split}-{number:05d}-of-{len(shards):05d}.arrow" for number in range(len(shards))]
-        plans += [ShardPlan(file, split, names) for file, names in zip(files, shards, strict=True)]
+        for number, names in enumerate(shards):
+            plans.append(ShardPlan(f"{split}-{number:05d}-of-{len(shards):05d}.arrow", split, names))
     return plans
 
 
@@ -253,7 +254,7 @@ def _split(source: SequenceSource, records: Sequence[ShardRecord]) -> Split:
 
 
 def _finish(manifest: PackedManifest, out: Path, max_bad_fraction: float) -> None:
-    """Refuse a store with too many errors or no sequences; else write the manifest and log a summary."""
+    """Write the manifest and log a summary, or refuse a store with too many errors or no sequences."""
     refused = [refusal for split in manifest.splits.values() for refusal in split.refused]
     shards = [shard for split in manifest.splits.values() for shard in split.shards]
     sequences = sum(len(shard.sequences) for shard in shards)

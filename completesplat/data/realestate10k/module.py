@@ -28,7 +28,7 @@ Clips = TextClips | ChunkedClips
 
 
 class ClipFraming(NamedTuple):
-    """Settings of images and cameras; see `RE10KDataModule`."""
+    """Settings of images and cameras, which `RE10KDataModule` explains."""
 
     image_size: int
     crop: str
@@ -47,7 +47,7 @@ def open_clips(folder: Path) -> Clips:
 
 
 class RE10KSource(SequenceSource):
-    """Some clips of one folder; see `SequenceSource`. Several sources may share `clips`."""
+    """Some clips of one folder. Several sources may share `clips`."""
 
     def __init__(self, clips: Clips, names: list[str], framing: ClipFraming) -> None:
         left_out = {"frames are missing": clips.missing} if clips.missing else {}
@@ -63,7 +63,7 @@ class RE10KSource(SequenceSource):
         return self._clips.fingerprint()
 
     def read(self, name: str) -> PosedSequence:
-        """Read one clip's cameras; its images are read by `PosedSequence.read`."""
+        """Read one clip's cameras. `PosedSequence.read` reads its images."""
         clip = self._clips.clip(name)
         framing = self.framing
         count = len(clip.images)
@@ -81,7 +81,10 @@ class RE10KSource(SequenceSource):
 def _square(clip: Clip, crop: str, frame: int) -> Square:
     height, width = clip.cameras.image_size
     with errors_at(clip.source, clip.key, frame):
-        x, y = clip.cameras.intrinsics[frame, :2, 2].tolist() if crop == "principal" else (width / 2, height / 2)
+        x = width / 2
+        y = height / 2
+        if crop == "principal":
+            x, y = clip.cameras.intrinsics[frame, :2, 2].tolist()
         return principal_square((x, y), (height, width))
 
 
@@ -148,7 +151,7 @@ class RE10KDataModule(SceneDataModule):
         return None if self.evaluation_index is None else read_index(self.evaluation_index)
 
     def describe(self) -> dict[str, str]:
-        """Return facts for results; a file is named by its checksum, an index also by its format."""
+        """Return facts for results, in which a file is named by its checksum, and an index also by its format."""
         facts = {
             "data_set": "realestate10k",
             "crop": f"largest square, {self.framing.crop}",
@@ -172,7 +175,10 @@ class RE10KDataModule(SceneDataModule):
         clips = open_clips(self.root / "train")
         train, val = split_by_hash(clips.keys, self.val_fraction, self.val_seed)
         # Both sources share the two chunks in memory.
-        return {"train": RE10KSource(clips, train, self.framing), "val": RE10KSource(clips, val, self.framing)}
+        return {
+            "train": RE10KSource(clips, train, self.framing),
+            "val": RE10KSource(clips, val, self.framing),
+        }
 
     def select_sequences(self, split: str, source: SequenceSource) -> SequenceSource:
         """Select the test clips that are in the evaluation index and in the scene list."""
@@ -195,14 +201,14 @@ class RE10KDataModule(SceneDataModule):
 
     def stackable(self, scenes: EvaluationScenes) -> bool:
         """Decide by the evaluation index, because reading all clips would take hours."""
-        views = self._test_views
-        return len({len(views[name][1]) for name in scenes.store.names if name in views}) <= 1
+        views = [self._test_views[name] for name in scenes.store.names if name in self._test_views]
+        return len({len(targets) for _, targets in views}) <= 1
 
     def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
         return self.views.training(frames, self.targets, epoch, rng)
 
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
-        """Return the views of the evaluation index; without an index, the first frame and frames after it."""
+        """Return the views of the evaluation index or, without one, the first frame and frames after it."""
         if sequence.name not in self._test_views:
             return self.views.evaluation(len(sequence.frames))
         reference, targets = self._test_views[sequence.name]

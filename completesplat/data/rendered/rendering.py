@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -64,12 +65,16 @@ class Asset(NamedTuple):
 class BrokenMesh(Exception):
     """Object that Blender cannot render, or of which no image shows anything.
 
-    It is no CompleteSplatError, so that `atomic_folder` looks whether a full disk is the reason.
+    It is no CompleteSplatError, so that `atomic_folder` looks whether a full disk is the cause.
     """
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
 
 
 def find_meshes(folder: Path) -> list[Asset]:
-    """List the mesh files below a folder by path; a sequence is named after its file's path without suffix, if unique.
+    """List the mesh files below a folder by path. A sequence has its file's path without suffix as name, if unique.
 
     Raises:
         MissingFile: the folder does not exist or has no mesh.
@@ -92,8 +97,10 @@ def check_named_files(mesh: Path, root: Path) -> None:
     Raises:
         BrokenMesh: there is such a file, or an OBJ's material file is missing.
     """
-    names = _uris(mesh) if mesh.suffix.lower() in (".gltf", ".glb") else []
-    for line in _lines(mesh, "mtllib") if mesh.suffix.lower() == ".obj" else ():
+    kind = mesh.suffix.lower()
+    names = _uris(mesh) if kind in (".gltf", ".glb") else []
+    libraries = _lines(mesh, "mtllib") if kind == ".obj" else []
+    for line in libraries:
         library = line.strip('"').replace("\\", "/")
         _check_named_file(mesh, library, root)
         if not os.path.isfile(mesh.parent / library):
@@ -117,25 +124,31 @@ def _check_named_file(mesh: Path, name: str, root: Path) -> None:
 
 
 def _lines(path: Path, *starts: str) -> list[str]:
-    """Return what follows the first word of the lines that start so."""
+    """Return the text after the first word of each line that starts so."""
     with path.open(errors="replace") as lines:
-        return [(line.split(maxsplit=1)[1:] or [""])[0].strip() for line in lines if line.lstrip().startswith(starts)]
+        selected = [line.strip() for line in lines if line.lstrip().startswith(starts)]
+    texts = []
+    for line in selected:
+        _, *rest = line.split(maxsplit=1)
+        texts.append(rest[0] if rest else "")
+    return texts
 
 
 def _uris(mesh: Path) -> list[str]:
-    """Return the files that a glTF names; of one that cannot be read none, because Blender says what is wrong."""
+    """Return the files that a glTF names, none if it cannot be read, because Blender says what is wrong."""
     with mesh.open("rb") as file:
         start = file.read(20)
-        content = file.read(int.from_bytes(start[12:16], "little") if start.startswith(b"glTF") else -1)
-    try:
-        description = json.loads(content if start.startswith(b"glTF") else start + content)
-        return [unquote(x["uri"]) for kind in ("buffers", "images") for x in description.get(kind, ()) if "uri" in x]
-    except (ValueError, TypeError, AttributeError, RecursionError):
-        return []
+        binary = start.startswith(b"glTF")
+        content = file.read(int.from_bytes(start[12:16], "little") if binary else -1)
+    with suppress(ValueError, TypeError, AttributeError, RecursionError):
+        description = json.loads(content if binary else start + content)
+        files = [*description.get("buffers", ()), *description.get("images", ())]
+        return [unquote(file["uri"]) for file in files if "uri" in file]
+    return []
 
 
 def procedural_objects(program: Blender, factory: str, count: int) -> list[Asset]:
-    """List objects of a factory of Infinigen; refuse one that the program's Python does not have."""
+    """List objects of a factory of Infinigen, or refuse one that the program's Python does not have."""
     if not factory.isidentifier():
         raise CompleteSplatError(f"factory={factory}: must be the name of a class, such as SofaFactory")
     with TemporaryDirectory() as folder:
@@ -186,7 +199,8 @@ def render(
             can be rendered; `broken.json` has the reasons.
         DiskError: the disk is full.
     """
-    settings = cast(RenderSettings, {name: x for name, x in job.items() if name in RenderSettings.__annotations__})
+    of_scenes = {name: value for name, value in job.items() if name in RenderSettings.__annotations__}
+    settings = cast(RenderSettings, of_scenes)
     if (meshes is None) == (factory is None):
         raise CompleteSplatError("give either meshes=FOLDER or factory=NAME (of Infinigen, such as SofaFactory)")
     if meshes is not None and out.resolve().is_relative_to(Path(meshes).resolve()):
@@ -206,7 +220,7 @@ def render(
             with atomic_folder(category) as unfinished:
                 (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
     waiting = [asset for asset in mine if not (category / asset.name).exists()]
-    most = MEGABYTE * job["max_megabytes"], job["max_minutes"]
+    most = (MEGABYTE * job["max_megabytes"], job["max_minutes"])
     write_one = partial(_write_object, category, program, settings, most)
     results = track(_in_threads(write_one, waiting, job["workers"]), "Rendering", len(waiting))
     broken = {name: reason for name, reason in sorted(results) if reason}
@@ -218,9 +232,10 @@ def render(
 
 
 def _write_lists(category: Path, objects: Sequence[Asset], broken: dict[str, str], new: int) -> None:
-    """Write reasons for all objects that are left out, and the others' annotations; log how many, `new` by this job."""
+    """Write reasons for all objects that are left out, and annotations of all that are not; `new` ones are logged."""
     path = category / BROKEN
-    reasons = (json.loads(path.read_text()) if path.is_file() else {}) | broken
+    reasons = json.loads(path.read_text()) if path.is_file() else {}
+    reasons |= broken
     missing = sorted(asset.name for asset in objects if not (category / asset.name).exists())
     broken = {name: reasons[name] for name in missing if name in reasons}
     write_text(path, json.dumps(broken, indent=1) + "\n")
@@ -237,7 +252,7 @@ def _write_lists(category: Path, objects: Sequence[Asset], broken: dict[str, str
 def _in_threads(
     function: Callable[[Asset, Event], tuple[str, str]], assets: Sequence[Asset], workers: int | None
 ) -> Iterator[tuple[str, str]]:
-    """Yield the results as they come; at an exception, end those that run and start no others."""
+    """Yield the results as they come. At an exception, end those that run and start no more."""
     stopped = Event()
     with ThreadPoolExecutor(workers or usable_cores()) as pool:
         futures = [pool.submit(function, asset, stopped) for asset in assets]
@@ -252,18 +267,21 @@ def _in_threads(
 def _write_object(
     category: Path, program: Blender, settings: RenderSettings, most: tuple[int, float], asset: Asset, stopped: Event
 ) -> tuple[str, str]:
-    """Render an object into its folder, whole or not at all; return its name, and why it is left out (or "")."""
+    """Render an object into its folder, whole or not at all, and return its name and why it is left out (or "")."""
     mesh = asset.mesh
     most_bytes, minutes = most
     try:
         job, cameras = draw_rendered_scene(asset.key, settings)
         job["factory"] = asset.factory
         if mesh is not None:
-            if (size := mesh.stat().st_size) > most_bytes:
+            size = mesh.stat().st_size
+            if size > most_bytes:
                 raise BrokenMesh(f"{size // MEGABYTE:,} MB, more than max_megabytes={most_bytes // MEGABYTE}")
             root = mesh.parents[asset.key.count("/")].resolve()
             check_named_files(mesh, root)
-            job |= {"mesh": str(mesh.absolute()), "root": str(root), "memory": LEAST_MEMORY + MEMORY_OF_BYTE * size}
+            job["mesh"] = str(mesh.absolute())
+            job["root"] = str(root)
+            job["memory"] = LEAST_MEMORY + MEMORY_OF_BYTE * size
         # Blender's importer would move such vertices to the origin.
         if mesh is not None and mesh.suffix.lower() == ".ply" and not np.isfinite(read_points(mesh)).all():
             raise BrokenMesh("it has vertices that are not finite")
@@ -277,21 +295,19 @@ def _write_object(
                 text = "%s: %d stray faces are left out, far from 99 %% of its surface"
                 logger.warning(text, asset.name, result["left_out"])
             modes = job["hidden"]["modes"] if job["hidden"] else []
-            record = {"source": asset.key, **result, **_write_sequence(folder, asset.name, files, cameras)}
-            record["hidden"] = (*modes, None)[0]
+            record = {"source": asset.key} | result | _write_sequence(folder, asset.name, files, cameras)
+            record["hidden"] = modes[0] if modes else None
             if settings["hidden"] == "modes":
                 _write_modes(folder, modes, files)
             (folder / OBJECT).write_text(json.dumps(record) + "\n")
             shutil.rmtree(files)
-    except BrokenMesh as error:
-        return asset.name, str(error)
-    except UnreadableFile as error:
+    except (BrokenMesh, UnreadableFile) as error:
         return asset.name, error.reason
     return asset.name, ""
 
 
 def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Cameras]) -> dict[str, Any]:
-    """Write images, masks, depths and points from the files of Blender; return the annotations."""
+    """Write images, masks, depths and points from the files of Blender, and return the annotations."""
     for kind in category_writers.FOLDERS:
         (folder / kind).mkdir()
     frames = list[category_writers.Annotation]()
@@ -299,13 +315,14 @@ def _write_sequence(folder: Path, name: str, files: Path, cameras: Sequence[Came
     colors = []
     for number, camera in enumerate(cameras):
         image = _pixels(files / f"{number:04d}.png")
-        depth, seen, coverage = np.moveaxis(np.load(files / f"{number:04d}.npy"), -1, 0)
+        depth, is_object, coverage = np.moveaxis(np.load(files / f"{number:04d}.npy"), -1, 0)
         depth[depth > SKY] = 0
-        place = CATEGORY, name, number
+        place = (CATEGORY, name, number)
+        shown = is_object == 1
         frames.append(category_writers.write_frame(folder, place, image, coverage, depth, _viewpoint(camera)))
-        pixels = pixel_centers(*camera.image_size, dtype=torch.float64)[torch.from_numpy(seen == 1)]
-        points.append(unproject(camera, pixels, torch.from_numpy(depth[seen == 1]).double()).numpy())
-        colors.append(to_uint8(image[seen == 1]))
+        pixels = pixel_centers(*camera.image_size, dtype=torch.float64)[torch.from_numpy(shown)]
+        points.append(unproject(camera, pixels, torch.from_numpy(depth[shown]).double()).numpy())
+        colors.append(to_uint8(image[shown]))
     step = math.ceil(sum(map(len, points)) / MOST_POINTS)
     if not step:
         raise BrokenMesh("no image shows it")

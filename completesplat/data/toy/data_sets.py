@@ -15,9 +15,9 @@ from completesplat.data.co3d import category_writers
 from completesplat.data.co3d.annotations import viewpoint
 from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_mini, draw_object_scene, render_frame
-from completesplat.data.toy.raytracing import WHITE
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
 from completesplat.data.toy.shapes import Array
+from completesplat.data.toy.surroundings import WHITE
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder
@@ -38,7 +38,7 @@ DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
 }
 """Functions that draw a scene, by category: (random generator, number of frames) -> scene."""
 
-KINDS = [*(category.removeprefix("toy_") for category in DRAW), "rooms"]
+KINDS = ["objects", "minis", "marked_minis", "rooms"]
 
 
 class DataSetSize(TypedDict):
@@ -70,7 +70,7 @@ def _write_frame(folder: Path, place: tuple[str, str, int], scene: ToyScene, siz
 
 
 def _splits(scenes: int, rooms: bool) -> list[str]:
-    """Return the split of every scene in order; three or more objects have all splits, rooms have no `val`."""
+    """Return the split of every scene in order. Three or more objects have all splits, and rooms have no `val`."""
     if rooms:
         return ["test" if index % 10 == 0 else "train" for index in range(scenes)]
     test = max(1, round(0.1 * scenes)) if scenes > 1 else 0
@@ -79,7 +79,7 @@ def _splits(scenes: int, rooms: bool) -> list[str]:
 
 
 def draw_category(category: str, seed: int, index: int, frames: int, light: Array) -> ToyScene:
-    """Draw a scene of a category (a key of `DRAW`) from a separate random generator; `light` is `Light.color`."""
+    """Draw a scene of a category (a key of `DRAW`) from a separate random generator, in light of a colour."""
     scene = DRAW[category](np.random.default_rng([seed, index]), frames)
     return scene._replace(light=scene.light._replace(color=light), point_colors=scene.point_colors * light)
 
@@ -87,7 +87,7 @@ def draw_category(category: str, seed: int, index: int, frames: int, light: Arra
 def _write_scene(
     root: Path, place: tuple[int, str], category: str, frames: int, size: int, seed: int, light: Array
 ) -> WrittenScene:
-    """Write one sequence and return its split and annotations; its `toy.json` reveals the colour of the patch.
+    """Write one sequence and return its split and annotations. Its `toy.json` has the colour of the patch.
 
     A test scene has its images with every colour of the patch, too, for `test evaluation=hidden_modes`.
     """
@@ -107,6 +107,7 @@ def _write_scene(
 
 
 def _write_modes(folder: Path, scene: ToyScene, size: int) -> None:
+    """Write the images of a scene with each colour of the patch."""
     for mode, color in PATCH_COLORS.items():
         (folder / mode).mkdir()
         painted = scene._replace(patch=scene.patch._replace(color=np.array(color)))
@@ -115,9 +116,11 @@ def _write_modes(folder: Path, scene: ToyScene, size: int) -> None:
 
 
 def _write_lists(category: Path, written: list[WrittenScene]) -> None:
+    """Write the annotations and the set list of all scenes."""
     lists: dict[str, list[list[str | int]]] = {"train": [], "val": [], "test": []}
     for split, frames, _ in written:
-        lists[split] += [[f["sequence_name"], f["frame_number"], f["image"]["path"]] for f in frames]
+        for frame in frames:
+            lists[split].append([frame["sequence_name"], frame["frame_number"], frame["image"]["path"]])
     annotations = [frame for _, frames, _ in written for frame in frames]
     category_writers.write_annotations(category, annotations, [sequence for _, _, sequence in written])
     category_writers.write_set_list(category, SUBSET, lists)
@@ -144,8 +147,8 @@ def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed
     lines = [f"https://example.com/toy/{key}"]  # no real video
     for frame, row in enumerate(rows.astype(np.float32)):
         time = round((start + frame) * MICROSECONDS / ROOM_FRAMES_PER_SECOND)
-        # Nine digits identify a float32 exactly.
-        lines.append(" ".join([str(time), *(f"{number:.9g}" for number in row)]))
+        numbers = " ".join(f"{number:.9g}" for number in row)  # nine digits identify a float32 exactly
+        lines.append(f"{time} {numbers}")
         save_jpeg(render_room_frame(scene, frame, size, width)[0], images / f"{time}.jpg")
     images.with_suffix(".txt").write_text("\n".join(lines) + "\n")
 
@@ -173,10 +176,13 @@ def write(
     rooms = kind == "rooms"
     rules = {"scenes": Range(1 + rooms), "frames": Range(2, MOST_FRAMES), "size": Range(8)}
     for name, rule in rules.items():
-        reason = rule.refusal(number := numbers[name])  # type: ignore[literal-required]
+        number = numbers[name]  # type: ignore[literal-required]
+        reason = rule.refusal(number)
         if reason is not None:
             raise DataError(f"{folder.name}: {name}={number}: {reason}")
-    parameters = {"format": FORMAT_VERSION, **numbers} | ({} if tuple(light) == WHITE else {"light": list(light)})
+    parameters: dict[str, Any] = {"format": FORMAT_VERSION, **numbers}
+    if tuple(light) != WHITE:
+        parameters["light"] = list(light)
     if category_writers.is_written(folder / DESCRIPTION, parameters):
         if progress:
             Console().print(f"{folder} already holds these scenes")
