@@ -79,7 +79,7 @@ def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]
 
 
 def feature_moments(store: SceneStore) -> dict[str, list[float]]:
-    """Return mean and standard deviation of `image_features` over about 1,024 images, or nothing if none is readable."""
+    """Return mean and standard deviation of `image_features` over about 1,024 images, if some can be read."""
     rows = [image_features(image.double() / 255) for image in _images(store, FEATURE_IMAGES)]
     if not rows:
         return {}
