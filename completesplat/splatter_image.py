@@ -19,7 +19,7 @@ from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_rays
 from completesplat.geometry.harmonics import LARGEST_DEGREE, SH_C0, coefficients
 from completesplat.geometry.rotations import normalize_quaternion
-from completesplat.settings.schema import Few, Range
+from completesplat.quantities import Few, Range
 from completesplat.tensors import TensorDataclass
 
 

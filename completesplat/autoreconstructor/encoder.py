@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from completesplat.autoreconstructor.posterior import LOG_VARIANCE_RANGE, Posterior, from_moments
-from completesplat.settings.schema import Few, Range, Width, Widths
+from completesplat.quantities import Few, Range, Width, Widths
 
 Images = Float[Tensor, "batch 3 height width"]
 Features = list[Float[Tensor, "batch _ _ _"]]

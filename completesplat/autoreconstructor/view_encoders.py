@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.encoder import vae_encoder
 from completesplat.autoreconstructor.model import DepthRange
 from completesplat.geometry.cameras import pixel_centers, project, rays_through
+from completesplat.quantities import Few, Range, Width, Widths
 from completesplat.scene import Views
-from completesplat.settings.schema import Few, Range, Width, Widths
 from completesplat.splatter_image import zeroed
 
 

@@ -17,9 +17,9 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import pixel_centers, project, unproject
 from completesplat.geometry.harmonics import SH_C0
 from completesplat.losses import Prediction, WeightedSum
+from completesplat.quantities import Positive, Range
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
-from completesplat.settings.schema import Positive, Range
 from completesplat.tensors import as_float64
 
 POSITION_RATE = 1.6e-4

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from completesplat.autoreconstructor.encoder import recompute
 from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
-from completesplat.settings.schema import Few, Levels, Share, Width, Widths
+from completesplat.quantities import Few, Levels, Share, Width, Widths
 from completesplat.splatter_image import Parameterization, from_channels, initialize_head
 
 

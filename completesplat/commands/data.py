@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import write_json
-from completesplat.settings.schema import Entries, Positive, Range
+from completesplat.quantities import Entries, Positive, Range
 from completesplat.weights import RUN_CHECKPOINT
 
 logger = logging.getLogger(__name__)

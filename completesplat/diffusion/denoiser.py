@@ -10,7 +10,7 @@ from jaxtyping import Int
 from torch import Tensor, nn
 
 from completesplat.diffusion.guidance import Conditioning, Latents
-from completesplat.settings.schema import Few, Levels, Width, Widths
+from completesplat.quantities import Few, Levels, Width, Widths
 
 
 class Sizes(TypedDict, total=False):

@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.schema import Share, check_value
 
 Latents = Float[Tensor, "batch channel height width"]
 Conditioning = Float[Tensor, "batch feature height width"]
@@ -26,12 +25,18 @@ def allowed_skip_weight(given: float | None, visible: Tensor | None = None) -> f
         CompleteSplatError: the weight lies outside of [0, 1], or is above 0 although something is hidden.
     """
     if given is not None:
-        check_value("skip_weight", Share, given)
+        check_weight("skip_weight", given)
     hidden = visible is not None and bool((visible < 1).any())
     if hidden and given:
         reason = "skips carry its pixels into the scene"
         raise CompleteSplatError(f"skip_weight={given:g}: must be 0 where the image is hidden, as {reason}")
     return (0.0 if hidden else 1.0) if given is None else given
+
+
+def check_weight(name: str, weight: float) -> None:
+    """Raise CompleteSplatError if a weight lies outside of [0, 1]."""
+    if not 0 <= weight <= 1:
+        raise CompleteSplatError(f"{name}={weight:g}: must lie between 0 and 1")
 
 
 def guided_noise(
@@ -45,7 +50,7 @@ def guided_noise(
     Raises:
         CompleteSplatError: w lies outside of [0, 1].
     """
-    check_value("guidance_weight", Share, weight)
+    check_weight("guidance_weight", weight)
     if weight == 0:
         return denoise(noisy_latent, timestep, conditioning)
     nothing = torch.zeros_like(conditioning)

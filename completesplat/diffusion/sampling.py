@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from completesplat.diffusion.guidance import Conditioning, Denoise, Latents, guided_noise
 from completesplat.diffusion.objective import clean_estimate, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.schema import Range
+from completesplat.quantities import Range
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)

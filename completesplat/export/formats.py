@@ -29,8 +29,8 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import transform_points
 from completesplat.geometry.harmonics import SH_C0
 from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.quantities import Format
 from completesplat.rasterizers import Rasterizer
-from completesplat.settings.schema import Format
 from completesplat.version import __version__
 
 FORMATS: tuple[str, ...] = get_args(Format)

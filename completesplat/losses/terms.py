@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Protocol, TypedDict
+from typing import Protocol, TypedDict
 
 import torch
 from jaxtyping import Float
@@ -12,8 +12,8 @@ from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.losses.ssim import structural_similarity
+from completesplat.quantities import Natural, NonNegative
 from completesplat.scene import Views
-from completesplat.settings.schema import Natural, Range
 from completesplat.tensors import TensorDataclass
 
 
@@ -35,7 +35,7 @@ class LossTerm(Protocol):
 class Term(TypedDict, total=False):
     """Loss term, its weight in the sum, and the optimizer step from which on it counts (by default 0)."""
 
-    weight: Annotated[float, Range(0)]
+    weight: NonNegative
     term: LossTerm
     start_step: Natural
 

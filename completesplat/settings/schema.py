@@ -4,66 +4,16 @@ import inspect
 import math
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypedDict
 
 from completesplat.errors import CompleteSplatError
+from completesplat.quantities import CameraPath, Entries, Format, NonNegative, Positive, Range, Seed, Share
 
 MOST_SHOWN = 1e6  # help texts leave out larger bounds
 NUMBERS: Mapping[type, type] = {int: Integral, float: Real}  # NumPy's are such, too
 KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "null"}
-
-
-@dataclass(frozen=True)
-class Range:
-    """Rule for `Annotated`: a finite number between two bounds, both included."""
-
-    least: float
-    most: float = math.inf
-
-    def refusal(self, value: float) -> str | None:
-        if value == math.inf:
-            return "must be finite"
-        if self.least <= value <= self.most:
-            return None
-        if math.isinf(self.most):
-            return f"must be at least {self.least:g}"
-        return f"must lie between {self.least:g} and {self.most:g}"
-
-    def words(self) -> str:
-        return f"at least {self.least:g}" if self.most > MOST_SHOWN else f"{self.least:g} to {self.most:g}"
-
-
-@dataclass(frozen=True)
-class Entries:
-    """Rule for `Annotated`: a list with a minimum and a maximum number of entries."""
-
-    least: int = 0
-    most: float = math.inf
-
-    def refusal(self, value: Sequence[object]) -> str | None:
-        if self.least <= len(value) <= self.most:
-            return None
-        if math.isinf(self.most):
-            return "must not be empty"
-        return f"must have {'' if self.least == self.most else 'at most '}{self.most} entries"
-
-
-Positive = Annotated[int, Range(1)]
-Natural = Annotated[int, Range(0)]
-Seed = Annotated[int, Range(0, 2**63 - 1)]
-Share = Annotated[float, Range(0, 1)]
-Side = Annotated[int, Range(8, 4096)]  # of an image, in pixels
-Format = Literal["ply", "splat", "glb", "mesh", "spz", "sog", "html"]  # of a scene's files
-CameraPath = Literal["orbit", "swipe", "wobble"]  # of a video
-
-# Sizes of networks. Their bounds lie beyond what anyone trains, and protect from configs that strangers wrote.
-Width = Annotated[int, Range(1, 8192)]
-Widths = Annotated[Sequence[Width], Entries(1), Entries(most=8)]
-Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], Entries(most=8)]
-Few = Annotated[int, Range(1, 16)]
 
 
 Precision = Literal["32-true", "bf16-mixed", "16-mixed", 32, "bf16", 16]
@@ -77,7 +27,7 @@ class TrainerSettings(TypedDict):
     accumulate_grad_batches: Positive
     val_check_interval: Annotated[float, Range(1e-6)] | str | Mapping[str, int] | None
     check_val_every_n_epoch: Positive | None
-    gradient_clip_val: Annotated[float, Range(0)] | None
+    gradient_clip_val: NonNegative | None
 
 
 class EvaluationSettings(TypedDict):
@@ -103,15 +53,15 @@ class PlanSettings(FitSettings):
     gpu: str
     devices: Positive
     share: Annotated[float, Range(0.01, 1)]
-    price: Annotated[float, Range(0)]
+    price: NonNegative
     sequences: Positive
     frames: Positive
-    pixel_bytes: Annotated[float, Range(0)]
+    pixel_bytes: NonNegative
     loading_rate: Annotated[float, Range(1e-3)]
     bandwidth_share: Annotated[float, Range(0.01, 1)]
     checkpoint_rate: Annotated[float, Range(1e-3)]
-    gaussian_ns: Annotated[float, Range(0)]
-    operation_us: Annotated[float, Range(0)]
+    gaussian_ns: NonNegative
+    operation_us: NonNegative
     usable: Annotated[float, Range(0.01, 1)]
     gpus: Mapping[str, Mapping[str, Annotated[float, Range(1e-3)]]]
 
@@ -266,8 +216,7 @@ def violations(annotation: object, value: object) -> list[Violation]:
     origin = typing.get_origin(annotation)
     arguments = typing.get_args(annotation)
     if origin is Annotated:
-        kind, *rules = arguments
-        return violations(kind, value) or [Violation("", value, x) for rule in rules if (x := rule.refusal(value))]
+        return _in_bounds(arguments[0], arguments[1:], value)
     if origin is Literal:
         return _in_choice(arguments, value)
     if origin in (typing.Union, UnionType):
@@ -282,6 +231,43 @@ def violations(annotation: object, value: object) -> list[Violation]:
     if value is None and (is_part or origin is Callable):
         return [Violation("", value, "must not be null; leave it out")]
     return []
+
+
+def _in_bounds(kind: object, rules: Sequence[object], value: Any) -> list[Violation]:
+    unfit = violations(kind, value)
+    if unfit:
+        return unfit
+    for rule in rules:
+        reason = None
+        if isinstance(rule, Range):
+            reason = _range_reason(rule, value)
+        elif isinstance(rule, Entries):
+            reason = _entries_reason(rule, len(value))
+        if reason is not None:
+            unfit.append(Violation("", value, reason))
+    return unfit
+
+
+def _range_reason(allowed: Range, value: float) -> str | None:
+    """Return why a number lies outside of a range, or None."""
+    if value == math.inf:
+        return "must be finite"
+    if allowed.least <= value <= allowed.most:
+        return None
+    if math.isinf(allowed.most):
+        return f"must be at least {allowed.least:g}"
+    return f"must lie between {allowed.least:g} and {allowed.most:g}"
+
+
+def _entries_reason(allowed: Entries, count: int) -> str | None:
+    """Return why a list has too few or too many entries, or None."""
+    if allowed.least <= count <= allowed.most:
+        return None
+    if math.isinf(allowed.most):
+        return "must not be empty"
+    if allowed.least == allowed.most:
+        return f"must have {allowed.most} entries"
+    return f"must have at most {allowed.most} entries"
 
 
 def _in_choice(choices: Sequence[object], value: object) -> list[Violation]:
@@ -328,7 +314,7 @@ def described(annotation: object) -> str:
     arguments = typing.get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
-        ranges = [rule.words() for rule in rules if isinstance(rule, Range)]
+        ranges = [_range_words(rule) for rule in rules if isinstance(rule, Range)]
         return ", ".join(filter(None, [described(kind), *ranges]))
     if origin in (typing.Union, UnionType):
         return " or ".join(dict.fromkeys(filter(None, map(described, arguments))))
@@ -339,6 +325,12 @@ def described(annotation: object) -> str:
     if origin is Mapping or typing.is_typeddict(annotation):
         return "mapping"
     return KINDS.get(annotation, "").removeprefix("a ") if isinstance(annotation, type) else ""
+
+
+def _range_words(allowed: Range) -> str:
+    if allowed.most > MOST_SHOWN:
+        return f"at least {allowed.least:g}"
+    return f"{allowed.least:g} to {allowed.most:g}"
 
 
 def _is_a(kind: type, value: object) -> bool:

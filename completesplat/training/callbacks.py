@@ -19,8 +19,8 @@ from torch.optim import Optimizer
 
 from completesplat.data.loading.distributed import gather_values, mean_of_processes
 from completesplat.errors import DivergenceError
+from completesplat.quantities import Positive, Share
 from completesplat.scene import Batch
-from completesplat.settings.schema import Positive, Share
 from completesplat.training.stage import Stage
 
 BAD_STEPS = "train/bad_steps"

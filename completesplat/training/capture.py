@@ -23,8 +23,8 @@ from completesplat.export.prediction import FileUnits, OutputFiles, Shot, write_
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import Prediction, WeightedSum
+from completesplat.quantities import CameraPath, Format, NonNegative, Positive, Range, Share
 from completesplat.scene import Batch, SceneBatch, Views
-from completesplat.settings.schema import CameraPath, Format, Positive, Range, Share
 from completesplat.tensors import stack
 from completesplat.training.optimization import Schedule, constant
 from completesplat.training.scoring import Renders
@@ -53,11 +53,11 @@ class CaptureSettings:
     opacity: fitting.Translucent = 0.1
     refine_every: Positive = 50
     growth: Share = 0.05
-    opacity_weight: Annotated[float, Range(0)] = 0.01
-    scale_weight: Annotated[float, Range(0)] = 0.01
+    opacity_weight: NonNegative = 0.01
+    scale_weight: NonNegative = 0.01
     position_rate: Annotated[float, Range(1e-3)] = 10.0
-    opacity_rate: Annotated[float, Range(0)] = 1.0
-    other_rates: Annotated[float, Range(0)] = 4.0
+    opacity_rate: NonNegative = 1.0
+    other_rates: NonNegative = 4.0
 
 
 class CaptureFit(Stage):

@@ -18,7 +18,7 @@ from torch import Tensor
 from completesplat.data.loading.distributed import gather_values
 from completesplat.errors import DivergenceError, WeightsError
 from completesplat.files import atomic_path, make_folder
-from completesplat.settings.schema import Positive
+from completesplat.quantities import Positive
 from completesplat.signals import keep_signals
 from completesplat.training.loggers import ContinuedCSVLogger
 from completesplat.training.stopping import agreed_signal, end_training

@@ -24,9 +24,9 @@ from completesplat.files import make_folder, write_json
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import diversity
+from completesplat.quantities import Positive
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Positive
 from completesplat.tensors import stack
 from completesplat.training.callbacks import ExponentialMovingAverage
 from completesplat.training.stage import Stage

@@ -9,13 +9,13 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from completesplat.settings.schema import Natural, Range, Share
+from completesplat.quantities import Natural, NonNegative, Range, Share
 
 
 def muon(
     parameters: Iterable[Tensor],
-    lr: Annotated[float, Range(0)],
-    adam_lr: Annotated[float, Range(0)],
+    lr: NonNegative,
+    adam_lr: NonNegative,
     adam_betas: tuple[Share, Share] = (0.9, 0.99),
 ) -> Optimizer:
     """Build Muon (Jordan 2024; library pytorch_optimizer) for matrices and kernels, with Adam for biases and norms.

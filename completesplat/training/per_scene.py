@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -25,8 +25,8 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.losses import WeightedSum
+from completesplat.quantities import NonNegative
 from completesplat.scene import SceneBatch, Views
-from completesplat.settings.schema import Range
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import stack
 from completesplat.training.scoring import Renders, Scorer
@@ -193,8 +193,8 @@ class PreoptimizedVAE(Preoptimized, Stage):
         vae: SparseVAE,
         folder: str,
         normalization_batches: int,
-        opacity_weight: Annotated[float, Range(0)],
-        kl_weight: Annotated[float, Range(0)],
+        opacity_weight: NonNegative,
+        kl_weight: NonNegative,
         **preoptimized: Any,
     ) -> None:
         super().__init__(parameterization=vae.reconstructor.parameterization, **preoptimized)

@@ -27,9 +27,9 @@ from completesplat.files import by_numbers, safe_name
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.scoring import MODEL, REGIONS, Evaluation
+from completesplat.quantities import Share
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
-from completesplat.settings.schema import Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 

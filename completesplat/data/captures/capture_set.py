@@ -11,7 +11,7 @@ from completesplat.data.packed.manifest import Scalar
 from completesplat.data.splits import SPLITS, SeededSplit, split_by_seed
 from completesplat.data.validation import field, read_json, require_file
 from completesplat.errors import BadAnnotation, MissingFile, SharedSequences, errors_at
-from completesplat.settings.schema import Natural, Share
+from completesplat.quantities import Natural, Share
 
 SPLITS_FILE = "splits.json"
 MARKS = {"keyframes"}.union(TRANSFORMS, (model.split("/")[0] for model in MODELS))  # a folder with one is a capture

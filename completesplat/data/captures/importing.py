@@ -21,7 +21,7 @@ from completesplat.data.sequences import first_names
 from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import DataError, refused_to
 from completesplat.files import atomic_folder, by_numbers, counted, folder_names
-from completesplat.settings.schema import Positive
+from completesplat.quantities import Positive
 
 logger = logging.getLogger(__name__)
 leave_out = partial(logger.warning, "left out: %s")

@@ -21,7 +21,7 @@ from completesplat.data.placement import ObjectFraming, from_cameras, from_point
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.data.splits import SPLITS
 from completesplat.errors import DataError, MissingFile, errors_at, refused_to
-from completesplat.settings.schema import Range
+from completesplat.quantities import Range
 
 logger = logging.getLogger(__name__)
 

@@ -28,7 +28,7 @@ from completesplat.data.validation import field, read_json
 from completesplat.errors import BadAnnotation, BadImage, DataError, ImageError, MissingFile, TooFewFrames, refused_to
 from completesplat.files import counted, writing
 from completesplat.geometry.cameras import Cameras, invert_rigid, look_at, mirror
-from completesplat.settings.schema import Range
+from completesplat.quantities import Range
 
 logger = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from completesplat.data.loading.object_data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.splits import SeededSplit
 from completesplat.errors import DataError, MissingFile
-from completesplat.settings.schema import Natural, Positive, Range, Share
+from completesplat.quantities import Natural, Positive, Range, Share
 
 
 class CO3DDataModule(ObjectDataModule):

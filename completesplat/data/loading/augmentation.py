@@ -12,9 +12,10 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import mirror, pixel_centers
+from completesplat.quantities import Entries, Positive, Range, Share
 from completesplat.rasterizers.kernels.compilation import helper, kernel
 from completesplat.scene import SceneBatch, Views
-from completesplat.settings.schema import Entries, Positive, Range, Share, check_value, hints_of
+from completesplat.settings.schema import check_value, hints_of
 
 Images = Float[Tensor, "view 3 height width"]
 Plane = Float32[ndarray, " pixel"]

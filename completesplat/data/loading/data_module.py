@@ -18,7 +18,7 @@ from completesplat.data.loading.training_statistics import feature_moments
 from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import counted
-from completesplat.settings.schema import Natural, Positive, Range
+from completesplat.quantities import Natural, Positive, Range
 
 MOST_WORKERS = 4  # if data.workers is null
 SPLITS_OF_STAGE = {

@@ -18,7 +18,7 @@ from completesplat.data.packed.source import PackedSource, local_root
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.tolerance import ErrorTolerance, OnBad
 from completesplat.errors import CompleteSplatError, DataError, errors_at
-from completesplat.settings.schema import Range, Share, Side
+from completesplat.quantities import Range, Share, Side
 
 logger = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.view_selection import Choice, ObjectViews
 from completesplat.data.placement import ObjectFraming
 from completesplat.data.sequences import PosedSequence
-from completesplat.settings.schema import Positive
+from completesplat.quantities import Positive
 
 
 class ObjectDataModule(SceneDataModule):

@@ -20,7 +20,7 @@ from completesplat.data.splits import split_by_hash
 from completesplat.data.validation import require_file
 from completesplat.errors import CompleteSplatError, DataError, errors_at, refused_to
 from completesplat.geometry.cameras import crop_resize
-from completesplat.settings.schema import Natural, Positive, Share
+from completesplat.quantities import Natural, Positive, Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 

@@ -15,7 +15,7 @@ from completesplat.data.captures.transforms_json import read_cameras
 from completesplat.data.validation import require_file
 from completesplat.errors import CompleteSplatError, MissingFile
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
-from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
+from completesplat.quantities import Entries, Natural, Positive, Range, Side
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 # Distance at which the ball around the object touches the image's border, times this.

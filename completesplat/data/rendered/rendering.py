@@ -34,7 +34,7 @@ from completesplat.data.validation.processes import share_of, usable_cores
 from completesplat.errors import CompleteSplatError, DataError, MissingFile, UnreadableFile
 from completesplat.files import atomic_folder, counted, folder_names, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
-from completesplat.settings.schema import Natural, Positive, Range
+from completesplat.quantities import Natural, Positive, Range
 
 logger = logging.getLogger(__name__)
 

@@ -21,7 +21,8 @@ from completesplat.data.toy.surroundings import WHITE
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder
-from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
+from completesplat.quantities import Entries, Natural, Positive, Range, Side
+from completesplat.settings.schema import violations
 
 FORMAT_VERSION = 3
 DESCRIPTION = "toy.json"
@@ -176,10 +177,9 @@ def write(
     rooms = kind == "rooms"
     rules = {"scenes": Range(1 + rooms), "frames": Range(2, MOST_FRAMES), "size": Range(8)}
     for name, rule in rules.items():
-        number = numbers[name]  # type: ignore[literal-required]
-        reason = rule.refusal(number)
-        if reason is not None:
-            raise DataError(f"{folder.name}: {name}={number}: {reason}")
+        unfit = violations(Annotated[int, rule], numbers[name])  # type: ignore[literal-required]
+        if unfit:
+            raise DataError(f"{folder.name}: {name}={unfit[0].value}: {unfit[0].reason}")
     parameters: dict[str, Any] = {"format": FORMAT_VERSION, **numbers}
     if tuple(light) != WHITE:
         parameters["light"] = list(light)

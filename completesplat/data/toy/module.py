@@ -9,7 +9,7 @@ from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.data_sets import DESCRIPTION, ROOMS, SUBSET, DataSetSize, write
 from completesplat.data.toy.object_scene import PATCH_COLORS
 from completesplat.errors import MissingFile
-from completesplat.settings.schema import Natural, Positive, Side
+from completesplat.quantities import Natural, Positive, Side
 
 OWN_PLACE = Path("outputs/data")
 """Folder below which toy data are written without `make`; `data.root` of `conf/data/toy_*.yaml` lies there."""
