@@ -124,8 +124,8 @@ def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
     if not photos:
         photos = [photo for path in below for photo in files.image_files(path, formats)]
         folders = below if photos else [folder, *below]
-    there = {path for searched in folders for path in searched.glob("[!.]*") if path.is_file()}
-    unread = sorted({path.name for path in there.difference(photos)})
+    present = {path for searched in folders for path in searched.glob("[!.]*") if path.is_file()}
+    unread = sorted({path.name for path in present.difference(photos)})
     if unread:
         advice = "" if "HEIF" in formats else files.NEEDS_HEIC
         logger.warning("left out: %s of other formats: %s%s", counted(len(unread), "file"), first_names(unread), advice)

@@ -110,7 +110,7 @@ class CO3DDataModule(ObjectDataModule):
         return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}
 
     def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
-        """Return the test scenes with the modes that were written beside their images; see `HiddenModeScenes`."""
+        """Return the test scenes with the modes that were written beside their images."""
         if not self.chances:
             return super().hidden_modes(views, spread_views)
         store = self.store("test")

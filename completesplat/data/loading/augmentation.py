@@ -225,7 +225,7 @@ class Augmentation:
         camera_jitter: Mapping[str, Any] | None,
         horizontal_flip: bool,
     ) -> "Augmentation":
-        """Build the parts of an augmentation from their settings; None: the part is off.
+        """Build the parts of an augmentation from their settings. None: the part is off.
 
         Raises:
             CompleteSplatError: a setting is unknown or out of its range.
@@ -271,7 +271,7 @@ class Augmentation:
 
 
 def mirrored(scene: SceneBatch) -> SceneBatch:
-    """Mirror images, masks, depths and cameras left to right; the reference camera's frame remains the world frame."""
+    """Mirror images, masks, depths and cameras left to right. The reference camera's frame remains the world frame."""
 
     def flipped(views: Views) -> Views:
         depths = None if views.depths is None else views.depths.flip(-1)

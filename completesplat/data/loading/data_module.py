@@ -85,7 +85,7 @@ class SceneDataModule(SceneDataSet, LightningDataModule):
             raise CompleteSplatError(f"data.latent_cache is of images as they are: set {UNCHANGED}")
 
     def check_test(self) -> None:
-        """Raise DataError for a test that cannot work, before its model is trained; by default, nothing is checked."""
+        """Raise DataError for a test that cannot work, before its model is trained. By default, nothing is checked."""
 
     def setup(self, stage: str | None = None) -> None:
         """List the sequences (images are read later).
@@ -173,7 +173,7 @@ class SceneDataModule(SceneDataSet, LightningDataModule):
         return dict(self.trained_on)
 
     def load_state_dict(self, state_dict: dict[str, str | int]) -> None:
-        """Compare the training data with those of the run that is resumed; with `allow_changed`, only warn.
+        """Compare the training data with those of the run that is resumed. With `allow_changed`, only warn.
 
         Raises:
             DataError: the training data have changed.

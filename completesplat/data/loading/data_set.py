@@ -62,7 +62,7 @@ class SceneDataSet(ABC):
 
     @abstractmethod
     def packed_settings(self) -> Mapping[str, Scalar]:
-        """Return the settings that determine images, cameras and splits; prepared data must have the same."""
+        """Return the settings that determine images, cameras and splits. Prepared data must have the same."""
 
     @abstractmethod
     def describe(self) -> Mapping[str, str | None]:
@@ -70,7 +70,7 @@ class SceneDataSet(ABC):
 
     @abstractmethod
     def open(self, split: str) -> Mapping[str, SequenceSource]:
-        """Open the data set's own files; return the sequences of this split, and of splits that are read with it.
+        """Open the data set's own files. Return the sequences of this split, and of splits that are read with it.
 
         Raises:
             DataError: the files are missing or unreadable as a whole.
@@ -89,7 +89,7 @@ class SceneDataSet(ABC):
         """
 
     def select_sequences(self, split: str, source: SequenceSource) -> SequenceSource:
-        """Select the sequences of a split that are used; by default all."""
+        """Select the sequences of a split that are used. By default all."""
         return source
 
     def stackable(self, scenes: EvaluationScenes) -> bool:
@@ -123,7 +123,7 @@ class SceneDataSet(ABC):
         return source
 
     def store(self, split: str) -> SceneStore:
-        """Return the scenes of a split, which must have sequences that can be used; errors as in `source`."""
+        """Return the scenes of a split, which must have sequences that can be used. Errors as in `source`."""
         if split not in self._stores:
             source = self.source(split)
             selected = self.select_sequences(split, source)

@@ -49,7 +49,7 @@ class HiddenModes(TensorDataclass):
 
 
 class HiddenModeScenes:
-    """Sequence of scenes in all their modes, each read when it is indexed; see `SceneDataSet.hidden_modes`.
+    """Sequence of scenes in all their modes, each read when it is indexed.
 
     The reference is a sequence's first frame, as in any test.
 

@@ -20,7 +20,7 @@ logger = logging.getLogger(__name__)
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
-    """Sampler of (epoch, item), one group after the other; (seed, epoch) determines the order of groups and items.
+    """Sampler of (epoch, item), one group after the other. (seed, epoch) determines the order of groups and items.
 
     Lightning calls `set_epoch` before every epoch, also after a resume. Several processes get different items, all
     equally many (the last few items may be left out).
@@ -52,7 +52,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
 
 
 class RepeatedEpoch(EpochSampler, SequentialSampler):  # type: ignore[misc]
-    """Sampler of the first epoch's items in all epochs, for `trainer.overfit_batches`; Lightning asks for its base."""
+    """Sampler of the first epoch's items in all epochs, for `trainer.overfit_batches`. Lightning asks for its base."""
 
 
 class SceneLoader:
@@ -159,7 +159,7 @@ class SceneLoader:
         self._resume = dict(state)
 
     def account(self, refused: Sequence[DataError], empty: bool) -> None:
-        """Count items that cannot be read; raise DataError if they are too many, or nothing is left (`empty`)."""
+        """Count items that cannot be read. Raise DataError if they are too many, or nothing is left (`empty`)."""
         for error in refused:
             self.tolerance.check(error)
         self.refused += refused

@@ -97,7 +97,7 @@ def _as_floats(images: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, 
 
 @dataclass(eq=False)
 class TrainingScenes(Dataset[LoadedScenes]):
-    """Dataset of scenes with random views; a key is (epoch, index), see `EpochSampler`.
+    """Dataset of scenes with random views. A key is (epoch, index), see `EpochSampler`.
 
     An item that cannot be read is replaced by another one. All random choices depend on (seed, epoch, index) only.
 
@@ -145,7 +145,7 @@ class TrainingScenes(Dataset[LoadedScenes]):
         return self.choose(frames, epoch, rng)
 
     def groups(self) -> list[list[int]]:
-        """Return groups of item indices; the items of a group are best loaded one after the other."""
+        """Return groups of item indices. The items of a group are best loaded one after the other."""
         groups = []
         for sequences in self.store.source.groups(self.store.names):
             firsts = [sequence * self.references for sequence in sequences]

@@ -67,7 +67,7 @@ class Split:
 
 @dataclass(frozen=True)
 class PackedManifest:
-    """Manifest of a whole store; its images and cameras depend on `settings`."""
+    """Manifest of a whole store. Its images and cameras depend on `settings`."""
 
     codec: str
     settings: dict[str, Scalar]

@@ -66,7 +66,7 @@ class ShardRecord:
 
 @dataclass(frozen=True)
 class ShardWriter:
-    """Writer of shards in `folder`; it is pickled for the worker processes, with its sources."""
+    """Writer of shards in `folder`. It is pickled for the worker processes, with its sources."""
 
     sources: Mapping[str, SequenceSource]
     folder: Path

@@ -47,7 +47,7 @@ none. `checksum` covers the other columns. A mask may be null. Types are large b
 
 
 def encode(image: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
-    """Return an image file with three channels (colour) or one (grey); PNG and BMP are lossless."""
+    """Return an image file with three channels (colour) or one (grey). PNG and BMP are lossless."""
     # NumPy reorders the channels, here and below, because starting PyTorch's threads costs more than the work itself.
     pixels = np.ascontiguousarray(image.numpy().transpose(1, 2, 0))
     grey_or_rgb = Image.fromarray(pixels.squeeze(-1) if len(image) == 1 else pixels)

@@ -232,7 +232,7 @@ def render(
 
 
 def _write_lists(category: Path, objects: Sequence[Asset], broken: dict[str, str], new: int) -> None:
-    """Write reasons for all objects that are left out, and annotations of all that are not; `new` ones are logged."""
+    """Write reasons for all objects that are left out, and annotations of all that are not. `new` ones are logged."""
     path = category / BROKEN
     reasons = json.loads(path.read_text()) if path.is_file() else {}
     reasons |= broken

@@ -12,7 +12,7 @@ from completesplat.errors import MissingFile
 from completesplat.quantities import Natural, Positive, Side
 
 OWN_PLACE = Path("outputs/data")
-"""Folder below which toy data are written without `make`; `data.root` of `conf/data/toy_*.yaml` lies there."""
+"""Folder below which toy data are written without `make`. `data.root` of `conf/data/toy_*.yaml` lies there."""
 
 
 def _provide(kind: str, root: Path, make: bool, numbers: DataSetSize) -> None:

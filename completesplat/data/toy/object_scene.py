@@ -322,9 +322,9 @@ def _surface(
         radius = np.sqrt(rng.uniform(0, 1, SURFACE_RAYS))
         rays = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(SURFACE_RAYS, 20.0)], axis=-1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        seen, coverage, distances = trace(shapes, light, (dome, patch), pose, rays[:, None])
+        traced, coverage, distances = trace(shapes, light, (dome, patch), pose, rays[:, None])
         points.append((pose[:3, 3] + distances[:, None] * rays @ pose[:3, :3].T)[coverage > 0])
-        colors.append(seen[coverage > 0])
+        colors.append(traced[coverage > 0])
     return np.concatenate(points), np.concatenate(colors)
 
 

@@ -240,7 +240,7 @@ def _furniture_color(shapes, solid, lx, ly, lz, hx, hy, hz):
 
 @inlined
 def _face_color(room, face, x, y, z):
-    """Return the colour of a point on a face of the room; later decals cover earlier ones."""
+    """Return the colour of a point on a face of the room. Later decals cover earlier ones."""
     u, v = (z, y) if face < 2 else ((x, z) if face < 4 else (x, y))
     for i in range(len(room.decals) - 1, -1, -1):
         decal = room.decals[i]
@@ -355,7 +355,7 @@ def _shade(shapes, light, dome, patch, room, ox, oy, oz, dx, dy, dz):
 
 @compiled
 def _trace(shapes, light, dome, patch, room, pose, rays):
-    """Render the pixels of `trace`, with either a dome and a patch or a room; the rest is None."""
+    """Render the pixels of `trace`, with either a dome and a patch or a room. The rest is None."""
     pixels, samples, _ = rays.shape
     colors = np.zeros((pixels, 3))
     coverage = np.zeros(pixels)

@@ -45,7 +45,7 @@ class AuditReport:
     shared: dict[str, list[str]]
 
     def by_kind(self) -> dict[str, list[DataError]]:
-        """Group errors by kind, and sequences left out by reason; the most frequent group comes first."""
+        """Group errors by kind, and sequences left out by reason. The most frequent group comes first."""
         kinds: dict[str, list[DataError]] = {}
         for error in self.refused:
             kind = f"{error.kind}: {error.reason}" if isinstance(error, ExcludedSequence) else error.kind
@@ -91,13 +91,13 @@ def _report(
     sources: Sources, sequences: Sequence["_Sequence"], refused: list[DataError], splits_share_sequences: bool
 ) -> AuditReport:
     """Return the findings about sequences, which were read, and about sources, which refused some before."""
-    found = refused + [error for sequence in sequences for error in sequence.refused]
-    explained = {error.sequence for error in found}
+    errors = refused + [error for sequence in sequences for error in sequence.refused]
+    explained = {error.sequence for error in errors}
     for sequence in sequences:
         if len(sequence.usable) < FEWEST_FRAMES and sequence.name not in explained:
             reason = f"{len(sequence.usable)} usable, {FEWEST_FRAMES} are needed"
-            found.append(TooFewFrames(reason, sequence=sequence.name))
-    unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in found}
+            errors.append(TooFewFrames(reason, sequence=sequence.name))
+    unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in errors}
     splits = {}
     for split in sources:
         splits[split] = _numbers([sequence.usable & sequence.frames.get(split, set()) for sequence in sequences])

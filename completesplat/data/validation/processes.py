@@ -23,7 +23,7 @@ def usable_cores() -> int:
 
 
 def share_of(items: Sequence[Item], shard: int, shards: int) -> Sequence[Item]:
-    """Return every `shards`-th item from number `shard` on; raise CompleteSplatError if there is no such shard."""
+    """Return every `shards`-th item from number `shard` on. Raise CompleteSplatError if there is no such shard."""
     if not 0 <= shard < shards:
         raise CompleteSplatError(f"shard={shard}: must lie between 0 and {shards - 1}, for shards={shards}")
     return items[shard::shards]
