@@ -124,7 +124,8 @@ class CaptureFit(Stage):
     def on_fit_start(self) -> None:
         """Place the first Gaussians, unless a run is continued."""
         self.refuse_average()
-        if changed := [key for key, value in self.data.augment.keywords.items() if value]:
+        changed = self.data.augmentation.active()
+        if changed:
             raise CompleteSplatError(f"data.{changed[0]}: model=capture fits the photos as they are; turn it off")
         sequence = self.sequence("train")
         if self.count:
