@@ -54,7 +54,7 @@ def independent_depths(raw: LayerMaps, near: Tensor, far: Tensor) -> LayerMaps:
 
 
 def incremental_depths(raw: LayerMaps, near: Tensor, far: Tensor) -> LayerMaps:
-    """Return the first layer as `independent_depths` does; each further one lies exp(raw) behind the last (Flash3D).
+    """Return the first layer as `independent_depths` does, and each further one exp(raw) behind the last (Flash3D).
 
     `initialize_head` makes that distance `Parameterization.layer_step` at first.
     """

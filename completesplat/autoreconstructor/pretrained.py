@@ -101,7 +101,7 @@ def _needed_settings(config: Mapping[str, object], part: str) -> str:
 
 
 def _vae_file(source: str, part: str) -> Path:
-    """Return the file of the VAE's tensors; download it from the hub if `source` is not a file or folder."""
+    """Return the file of the VAE's tensors, downloaded from the hub if `source` is not a file or folder."""
     local = Path(source).expanduser()
     is_id = MODEL_ID.fullmatch(source) is not None
     hub_id = source if is_id and not local.exists() else "CompVis/stable-diffusion-v1-4"

@@ -68,7 +68,7 @@ class RawGaussians:
     harmonics: Float[Tensor, "batch gaussian 3"]
 
     def gaussians(self) -> Gaussians:
-        """Apply 3DGS's activations; the quaternions may have any length."""
+        """Apply 3DGS's activations to raw values, whose quaternions may have any length."""
         colors = (0.5 + SH_C0 * self.harmonics).clamp(min=0)
         return Gaussians(self.means, self.quaternions, self.log_scales.exp(), self.logits.sigmoid(), colors)
 
@@ -165,7 +165,7 @@ def fit_gaussians(
 def adam(
     raw: Mapping[str, Tensor], depth_ranges: Float[Tensor, "_ 2"], positions: float, opacities: float, others: float
 ) -> torch.optim.Adam:
-    """Return Adam for tensors of `RawGaussians` by name, with factors on 3DGS's rates; the positions come first.
+    """Return Adam for tensors of `RawGaussians` by name, the positions first, with factors on 3DGS's rates.
 
     Its epsilon is 3DGS's (`gaussian_model.py`), which is small compared with a Gaussian's gradients.
     """

@@ -118,7 +118,7 @@ class PerceptualDistance(nn.Module):
         return torch.stack([differences.mean((1, 2, 3)) for differences in maps]).sum(0)
 
     def directions(self, images: Images) -> list[Float[Tensor, "image _ _ _"]]:
-        """Return each layer's activations with unit length over the channels; zero where no channel is active."""
+        """Return each layer's activations with unit length over the channels, or zeros where no channel is active."""
         activations = self.features((2 * images - 1 - self.shift) / self.scale)
         # Where all channels are zero, the gradient of this norm is zero; that of a square root of a sum is not finite.
         norms = [torch.linalg.vector_norm(layer, dim=1, keepdim=True) for layer in activations]
@@ -135,7 +135,7 @@ def load_heads() -> list[Head]:
 
 
 class PerceptualTerm:
-    """Loss term: a `PerceptualDistance`, averaged over the views; always in float32.
+    """Loss term: a `PerceptualDistance`, averaged over the views, always in float32.
 
     The network is not part of the trained module, so no checkpoint holds it.
     """

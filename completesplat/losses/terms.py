@@ -87,7 +87,7 @@ class MeanAbsoluteError:
 
 
 class StructuralDissimilarity:
-    """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term; the paper may mean half of it)."""
+    """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term). The paper may mean half of it."""
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
         return 1 - structural_similarity(prediction.images.flatten(0, 1), truth.images.flatten(0, 1)).mean()

@@ -69,7 +69,10 @@ class CudaRasterizer:
 
     @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Render scenes [batch] from cameras [batch view]; CPU tensors are copied to the GPU and the images back."""
+        """Render scenes [batch] from cameras [batch view].
+
+        CPU tensors are copied to the GPU, and their images back.
+        """
         home = gaussians.means.device
         if home.type != DEVICE:
             return self(gaussians.to(DEVICE), cameras.to(DEVICE)).to(home)

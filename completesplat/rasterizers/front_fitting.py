@@ -73,7 +73,7 @@ def fit_front(
 
 
 def _moved(gaussians: Gaussians, colors: Tensor, opacities: Tensor, scales: Tensor) -> Gaussians:
-    """Return Gaussians with changed values; where a change is 0, the value stays exactly as it is."""
+    """Return Gaussians with changed values. Where a change is 0, the value stays exactly as it is."""
     logits = torch.logit(gaussians.opacities, SMALLEST)
     return replace(
         gaussians,
