@@ -102,8 +102,9 @@ class Parameterization:
     @property
     def groups(self) -> dict[str, Group]:
         """Return the groups of a layer's raw values, in order."""
-        further = {"harmonics": Group(3 * coefficients(self.harmonics), HARMONICS_GAIN, 0.0)} if self.harmonics else {}
-        return GROUPS | further
+        if self.harmonics == 0:
+            return GROUPS
+        return GROUPS | {"harmonics": Group(3 * coefficients(self.harmonics), HARMONICS_GAIN, 0.0)}
 
     @property
     def layer_channels(self) -> int:

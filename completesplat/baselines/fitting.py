@@ -171,9 +171,11 @@ def adam(
     """
     # Half of the mean depth range: the spread of the initial Gaussians (3DGS uses the spread of the cameras).
     extent = (0.5 * (depth_ranges[:, 1] - depth_ranges[:, 0])).mean().item()
-    rates = {"means": positions * POSITION_RATE * extent}
-    rates |= {name: (opacities if name == "logits" else others) * rate for name, rate in RATES.items()}
-    return torch.optim.Adam([{"params": [raw[name]], "lr": rate} for name, rate in rates.items()], eps=1e-15)
+    groups = [{"params": [raw["means"]], "lr": positions * POSITION_RATE * extent}]
+    for name, rate in RATES.items():
+        factor = opacities if name == "logits" else others
+        groups.append({"params": [raw[name]], "lr": factor * rate})
+    return torch.optim.Adam(groups, eps=1e-15)
 
 
 def opacity_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:

@@ -61,7 +61,7 @@ def read_gaussians(path: str | Path) -> Gaussians:
 
 
 def _packed_format(path: Path) -> str | None:
-    """Return the name of a format that `splat-transform` unpacks, or None for those that `read_ply` reads or refuses."""
+    """Return the name of a format that `splat-transform` unpacks, or None for one that `read_ply` reads or refuses."""
     if path.suffix.lower() in (".sog", ".ksplat"):
         return path.suffix[1:].upper()
     if not path.is_file() or not os.access(path, os.R_OK):

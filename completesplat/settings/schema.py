@@ -158,9 +158,9 @@ def check_settings(function: object, settings: Mapping[str, object]) -> None:
         CompleteSplatError: a setting does not fit. The message names the first one, and the values that it may have.
     """
     hints = hints_of(function)
-    for name, value in settings.items():
-        if name in hints:
-            check_value(name, hints[name], value)
+    for name in settings:
+        if name in hints:  # others may be missing in a config
+            check_value(name, hints[name], settings[name])
 
 
 def check_value(key: str, annotation: object, value: object) -> None:

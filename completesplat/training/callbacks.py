@@ -274,12 +274,12 @@ class Throughput(Callback):
         self.scenes = 0
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
-        self.begun: float | None = time.perf_counter()
+        self.started: float | None = time.perf_counter()
         if self.ended is not None:
-            self.waits.append(self.begun - self.ended)
+            self.waits.append(self.started - self.ended)
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: object) -> None:
-        self.begun = None
+        self.started = None
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.ended = None
@@ -288,8 +288,8 @@ class Throughput(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
     ) -> None:
         self.ended = time.perf_counter()
-        if self.begun is not None:
-            self.batches.append(self.ended - self.begun)
+        if self.started is not None:
+            self.batches.append(self.ended - self.started)
             self.scenes += len(batch.names)
         stepped = trainer.global_step != self.step
         self.step = trainer.global_step

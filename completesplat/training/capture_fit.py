@@ -89,7 +89,7 @@ class CaptureFit(Stage):
         self.loss = loss
         self.fitting = fitting
         self.scene_folder = None if scene_folder is None else Path(scene_folder)
-        self.wanted = OutputFiles(formats, videos, frames, self.background)
+        self.files = OutputFiles(formats, videos, frames, self.background)
         self.raw = nn.ParameterDict(
             {
                 "means": torch.zeros(fitting.most, 3),
@@ -206,7 +206,8 @@ class CaptureFit(Stage):
         def constant_rate(step: int) -> float:
             return 1.0
 
-        decays: list[Callable[[int], float]] = [decay] + [constant_rate] * (len(self.raw) - 1)
+        decays: list[Callable[[int], float]] = [constant_rate] * len(self.raw)
+        decays[0] = decay
         schedule = Schedule(optimizer, decays)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
@@ -251,13 +252,13 @@ class CaptureFit(Stage):
         reference, targets = self.data.evaluation_views(sequence, "test")
         photos = tuple(sequence.photos[index] for index in (reference, *targets))
         shot = Shot(scene, placed[0], up, FileUnits(sequence.scale, sequence.origin), photos)
-        files = dict[str, str]()
+        names = dict[str, str]()
         comments = [f"scene {name}"]
         on_file = partial(logger.info, "writing %s")
         # Each format is written on its own, so that one that fails leaves the others.
-        parts = [replace(self.wanted, formats=())]
-        for scene_format in self.wanted.formats:
-            parts.append(replace(self.wanted, formats=[scene_format], videos=()))
+        parts = [replace(self.files, formats=())]
+        for scene_format in self.files.formats:
+            parts.append(replace(self.files, formats=[scene_format], videos=()))
         for part in parts:
             try:
                 *_, written = write_scene(
@@ -266,7 +267,7 @@ class CaptureFit(Stage):
             except CompleteSplatError as error:
                 logger.warning("left out: %s", error)
             else:
-                files.update(written)
+                names.update(written)
         title = f"{name}: held-out photos, Gaussians fitted to the {len(self.sequence('train').frames)} others"
         seed = self.evaluation.scene_seed(name)
-        write_fitted_scene(self.scene_folder, name, title, shot, images[0], truth.images, seed, files)
+        write_fitted_scene(self.scene_folder, name, title, shot, images[0], truth.images, seed, names)

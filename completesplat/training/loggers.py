@@ -50,7 +50,7 @@ class MetricsFile(ExperimentWriter):
     def __init__(self, log_dir: str) -> None:
         super().__init__(log_dir)
         self.path = Path(self.metrics_file_path)
-        self.begun = False
+        self.has_header = False  # written by this process
         self.goes_on_from: int | None = None
 
     def _check_log_dir_exists(self) -> None:
@@ -66,7 +66,7 @@ class MetricsFile(ExperimentWriter):
             return
         new = set().union(*self.metrics) - set(self.metrics_keys)
         text = io.StringIO(newline="")
-        if new or not self.begun:
+        if new or not self.has_header:
             old = self._rows_to_keep()
             self.metrics_keys = sorted(new.union(self.metrics_keys, *old))
             writer = csv.DictWriter(text, self.metrics_keys)
@@ -78,7 +78,7 @@ class MetricsFile(ExperimentWriter):
             with writing(self.path), self.path.open("a", newline="") as file:
                 file.write(text.getvalue())
         self.metrics = []
-        self.begun = True
+        self.has_header = True
 
     def _rows_to_keep(self) -> list[dict[str, str]]:
         if not self.path.is_file():
@@ -86,7 +86,7 @@ class MetricsFile(ExperimentWriter):
         with self.path.open(newline="") as file:
             # The last line of a killed process may be incomplete.
             rows = list(csv.DictReader(line for line in file if line.endswith("\n")))
-        if self.begun:
+        if self.has_header:
             return rows
         first = min(row["step"] for row in self.metrics)
         if self.goes_on_from is not None:

@@ -135,7 +135,7 @@ class Scorer(LightningModule):
     def test_step(self, scenes: SceneBatch, index: int) -> None:
         evaluation = self.evaluation
         names = scenes.names
-        seen = scenes if scenes.seen is None else scenes.seen
+        seen = scenes if scenes.small is None else scenes.small
         seeds = [evaluation.scene_seed(name) for name in names]
         gaussians = self.timed("inference", lambda: self.draw(seen, seeds, evaluation.samples), len(names))
         truth = scenes.all_views()

@@ -178,16 +178,16 @@ class Page:
         self.saver = saver
         self.scenes = scenes
         self.complete: Callable[[Path, str, viser.ClientHandle | None], None] | None = None
-        self.told: Exception | None = None
+        self.last_error: Exception | None = None
         self.worker = Worker(self.tell)
-        self.opening = panel.add_opening(server.gui, [*scenes])
-        self.opening.upload.on_upload(self._upload)
-        self.opening.chosen.on_update(self._choose)
+        self.file_controls = panel.add_file_controls(server.gui, [*scenes])
+        self.file_controls.upload.on_upload(self._upload)
+        self.file_controls.chosen.on_update(self._choose)
         self.photo = server.gui.add_html("", order=0.4)
-        self.looking = panel.add_looking(server.gui)
-        self._connect_looking()
-        self.saving = panel.add_saving(server.gui, FORMATS)
-        self.saving.save.on_click(self._save)
+        self.view_controls = panel.add_view_controls(server.gui)
+        self._connect_view_controls()
+        self.save_controls = panel.add_save_controls(server.gui, FORMATS)
+        self.save_controls.save.on_click(self._save)
         self._thumbnails: list[panel.Pixels] = []
         self.show(view.samples)
 
@@ -196,10 +196,10 @@ class Page:
         self.view.show(samples)
         numbers = range(1, max(1, len(samples)) + 1)
         options = (*(f"sample {number}" for number in numbers), panel.SIDE_BY_SIDE)
-        if self.looking.chosen.options != options:
-            self.looking.chosen.options = options
+        if self.view_controls.chosen.options != options:
+            self.view_controls.chosen.options = options
         layers = max((sample.layers for sample in samples), default=0)
-        for i, box in enumerate(self.looking.layers):
+        for i, box in enumerate(self.view_controls.layers):
             box.visible = i < layers
         show_status(self.server, status)
         if all(sample.finished for sample in samples):
@@ -228,14 +228,14 @@ class Page:
                 self.photo.content = panel.preview_of(pixels, "photo")
 
     def _choose(self, event: viser.GuiEvent[Any]) -> None:
-        name = self.opening.chosen.value
+        name = self.file_controls.chosen.value
         if name in self.scenes:
-            self.opening.chosen.options = tuple(self.scenes)
+            self.file_controls.chosen.options = tuple(self.scenes)
             self.submit(SHOWN, event.client, partial(self.open, self.scenes[name], name))
 
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
         """Show an uploaded scene, or complete an uploaded image, when the scene that is being drawn is finished."""
-        file = self.opening.upload.value
+        file = self.file_controls.upload.value
         name = printable(file.name)
         content = file.content
         file.content = b""  # which the button would keep until the next upload
@@ -260,7 +260,7 @@ class Page:
 
     def _let_choose_another(self, name: str) -> None:
         """Name an uploaded scene in the choice, so that each of `scenes` can be chosen next."""
-        chosen = self.opening.chosen
+        chosen = self.file_controls.chosen
         uploaded = f"loaded: {name}"
         chosen.options = (uploaded, *self.scenes)
         chosen.visible = bool(self.scenes)
@@ -274,8 +274,8 @@ class Page:
 
     def _mark_thumbnail(self) -> None:
         row = panel.thumbnail_row(self._thumbnails, self.view.chosen) if self._thumbnails else ""
-        if self.looking.thumbnails.content != row:
-            self.looking.thumbnails.content = row
+        if self.view_controls.thumbnails.content != row:
+            self.view_controls.thumbnails.content = row
 
     def submit(self, kind: Hashable, client: viser.ClientHandle | None, job: Task) -> None:
         """Let the worker do a job (`Worker.submit`) whose errors go to one browser (None: to all)."""
@@ -291,7 +291,7 @@ class Page:
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
         """Show an error in one browser or in all, and keep it. A fault of the program is logged as well."""
         show_status(self.server, "")  # what was waited for
-        self.told = error
+        self.last_error = error
         text = str(error)
         if not isinstance(error, CompleteSplatError):
             text = f"{type(error).__name__}: {text}"
@@ -304,34 +304,34 @@ class Page:
         self.worker.close()
         stop_server(self.server)
 
-    def _connect_looking(self) -> None:
-        looking = self.looking
+    def _connect_view_controls(self) -> None:
+        controls = self.view_controls
         view = self.view
 
         def changed(_: viser.GuiEvent[Any]) -> None:
-            index = looking.chosen.options.index(looking.chosen.value)
-            last = len(looking.chosen.options) - 1
+            index = controls.chosen.options.index(controls.chosen.value)
+            last = len(controls.chosen.options) - 1
             view.chosen = None if index == last else index
-            view.hidden_layers = {i for i, layer in enumerate(looking.layers) if not layer.value}
-            view.depth = looking.depth.value
-            view.cameras = {name for name, box in looking.cameras.items() if box.value}
+            view.hidden_layers = {i for i, layer in enumerate(controls.layers) if not layer.value}
+            view.depth = controls.depth.value
+            view.cameras = {name for name, box in controls.cameras.items() if box.value}
             view.refresh()
             self._mark_thumbnail()
 
         def pressed(index: int, _: viser.CommandEvent) -> None:
-            if index < len(looking.chosen.options) - 1:  # key 0, which is -1, chooses all
-                looking.chosen.value = looking.chosen.options[index]
+            if index < len(controls.chosen.options) - 1:  # key 0, which is -1, chooses all
+                controls.chosen.value = controls.chosen.options[index]
 
-        for digit, command in looking.keys.items():
+        for digit, command in controls.keys.items():
             command.on_trigger(partial(pressed, int(digit) - 1))
-        looking.chosen.on_update(changed)
-        for box in (*looking.layers, looking.depth, *looking.cameras.values()):
+        controls.chosen.on_update(changed)
+        for box in (*controls.layers, controls.depth, *controls.cameras.values()):
             box.on_update(changed)
-        looking.front.on_click(lambda event: view.look_from_the_front(event.client))
+        controls.front.on_click(lambda event: view.look_from_the_front(event.client))
 
     def _save(self, event: viser.GuiEvent[Any]) -> None:
         client = event.client
-        kind = self.saving.kind.value
+        kind = self.save_controls.kind.value
         samples = list(self.view.visible)
         if client is None:
             return

@@ -37,7 +37,7 @@ CHOOSE = "this.dispatchEvent(new KeyboardEvent('keydown',{{key:'{0}',code:'Digit
 Pixels = UInt8[np.ndarray, "_ _ 3"]
 
 
-def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> SimpleNamespace:
+def add_completion_controls(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> SimpleNamespace:
     """Add the folders `Photograph` and `Completion`, and return viser's handles.
 
     The controls of drawing are hidden if the model draws no samples.
@@ -78,7 +78,7 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
         )
 
 
-def add_opening(gui: viser.GuiApi, scenes: Sequence[str]) -> SimpleNamespace:
+def add_file_controls(gui: viser.GuiApi, scenes: Sequence[str]) -> SimpleNamespace:
     """Add controls that load files, and return handles of `upload` and of `chosen`, which chooses one of the scenes."""
     return SimpleNamespace(
         chosen=gui.add_dropdown("Scene", scenes or [""], visible=len(scenes) > 1, order=0.2),
@@ -86,7 +86,7 @@ def add_opening(gui: viser.GuiApi, scenes: Sequence[str]) -> SimpleNamespace:
     )
 
 
-def add_looking(gui: viser.GuiApi) -> SimpleNamespace:
+def add_view_controls(gui: viser.GuiApi) -> SimpleNamespace:
     """Add the folder `View`, and return its handles.
 
     They are the `chosen` sample, `layers` by number, `cameras` by name, `thumbnails` above all folders, which
@@ -108,7 +108,7 @@ def add_looking(gui: viser.GuiApi) -> SimpleNamespace:
         )
 
 
-def add_saving(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
+def add_save_controls(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
     """Add the folder `Save`, and return handles of the file's `kind` (a format or a video) and of the button `save`."""
     with gui.add_folder("Save", order=4):
         kind = gui.add_dropdown("Format", (*formats, VIDEO), hint="spz and sog need Node.js, mesh completesplat[mesh]")

@@ -124,8 +124,8 @@ def test_a_model_sees_images_made_as_its_training_images_were_whatever_size_is_s
     large.at_model_size = small
     for batch, truth, seen in zip(large.test_dataloader(), expected, small.test_dataloader(), strict=True):
         assert same(batch, truth)
-        assert same(batch.seen, seen)
-        assert same(batch[0].seen, seen[0])
+        assert same(batch.small, seen)
+        assert same(batch[0].small, seen[0])
 
 
 def test_the_evaluation_index_and_the_scene_list_decide(root, tmp_path, caplog):

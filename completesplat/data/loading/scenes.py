@@ -176,7 +176,7 @@ class EvaluationScenes(Dataset[LoadedScenes]):
             views = self.choose(sequence)
             scene = self.store.scene(sequence, *views)
             if self.seen is not None:
-                scene = replace(scene, seen=self.seen.scene(self.seen.source.read(name), *views))
+                scene = replace(scene, small=self.seen.scene(self.seen.source.read(name), *views))
         except DataError as error:
             return LoadedScenes(None, (error,))
         try:
