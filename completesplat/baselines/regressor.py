@@ -68,6 +68,6 @@ class SplatterImageUNet(ReconstructionModel):
         self.network = network
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Reconstruction:
-        """Reconstruct from sRGB images in [0, 1]; there is no posterior."""
+        """Reconstruct from sRGB images in [0, 1], without a posterior."""
         output = self.network(images * 2 - 1, timestep=0).sample
         return Reconstruction(from_channels(output.float(), self.parameterization), posterior=None)

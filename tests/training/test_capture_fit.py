@@ -13,7 +13,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export import prediction
 from completesplat.export.ply import read_ply
 from completesplat.export.reading import read_gaussians
-from completesplat.training.capture import CaptureFit
+from completesplat.training.capture_fit import CaptureFit
 
 FRAMES, STEPS = 9, 8
 FITTING = {"initial": 200, "most": 260, "refine_every": 2}
