@@ -88,7 +88,7 @@ class TensorDataclass:
 def stack(items: Sequence[T]) -> T:
     """Stack equal-shaped dataclasses along a new leading axis (the collate function of the data loaders).
 
-    Strings are collected into a tuple; other static values must be the same in all items.
+    Strings are collected into a tuple. Other static values must be the same in all items.
 
     Raises:
         ValueError: there are no items, or a static value differs between them.

@@ -118,8 +118,8 @@ class SparseVAE(nn.Module):
     """VAE from a Splatter Image to a Splatter Image, made of the autoreconstructor's blocks without skips.
 
     A place is one layer of one pixel. For each place the encoder sees 15 normalised raw values (zeros if the place is
-    empty), and whether it is occupied. The decoder's outputs are normalised raw values; a low opacity marks an empty
-    place. In training a latent is drawn from the posterior; in evaluation its mode is used.
+    empty), and whether it is occupied. The decoder's outputs are normalised raw values. A low opacity marks an empty
+    place. In training a latent is drawn from the posterior. In evaluation its mode is used.
 
     Args:
         encoder: builds an `Encoder` from a number of `in_channels`.
@@ -170,14 +170,14 @@ class SparseVAE(nn.Module):
         mean = total / count.clamp(min=1)
         variance = squares / count.clamp(min=1) - mean.square()
         self.mean.copy_(mean)
-        # A channel that does not vary is only centred; a layer without Gaussians is not normalised.
+        # A channel that does not vary is only centred. A layer without Gaussians is not normalised.
         self.std.copy_(torch.where(variance > 1e-8, variance, 1.0).sqrt())
 
     def errors(self, predicted: SplatterImage, truth: SplatterImage) -> dict[str, Float[Tensor, ""]]:
         """Return the reconstruction error of each group of raw values.
 
-        It is the mean squared error of the normalised values over occupied places; for "opacity", the binary cross
-        entropy over all places in nats, where an empty place has opacity 0.
+        It is the mean squared error of the normalised values over occupied places. That of "opacity" is the binary
+        cross entropy over all places in nats, where an empty place has opacity 0.
         """
         mask = occupied(truth)[:, :, None]
         squared = torch.where(mask, self.normalize(predicted.raw) - self.normalize(truth.raw), 0.0).square()
@@ -186,4 +186,5 @@ class SparseVAE(nn.Module):
         errors = {name: group.sum() / (places * group.shape[2]) for name, group in groups.items()}
         logits = predicted.split()["opacity"]
         opacities = truth.split()["opacity"].sigmoid()
-        return errors | {"opacity": nn.functional.binary_cross_entropy_with_logits(logits, opacities)}
+        errors["opacity"] = nn.functional.binary_cross_entropy_with_logits(logits, opacities)
+        return errors
