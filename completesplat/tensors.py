@@ -95,7 +95,9 @@ def stack(items: Sequence[T]) -> T:
     """
     if not items:
         raise ValueError("cannot stack an empty sequence")
-    merged = {field.name: _merge([getattr(item, field.name) for item in items]) for field in fields(items[0])}
+    merged = {}
+    for field in fields(items[0]):
+        merged[field.name] = _merge([getattr(item, field.name) for item in items])
     return replace(items[0], **merged)
 
 
@@ -107,7 +109,9 @@ def concatenate(items: Sequence[T], axis: int = 0) -> T:
             return torch.cat(values, dim=axis)
         return concatenate(values, axis) if isinstance(values[0], TensorDataclass) else values[0]
 
-    joined = {field.name: join([getattr(item, field.name) for item in items]) for field in fields(items[0])}
+    joined = {}
+    for field in fields(items[0]):
+        joined[field.name] = join([getattr(item, field.name) for item in items])
     return replace(items[0], **joined)
 
 

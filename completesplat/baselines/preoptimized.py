@@ -147,8 +147,8 @@ class SparseVAE(nn.Module):
 
     def forward(self, image: SplatterImage) -> Reconstruction:
         mask = occupied(image)[:, :, None]
-        seen = torch.cat([torch.where(mask, self.normalize(image.raw), 0.0), mask.float()], dim=2)
-        posterior, _ = self.encoder.encode(seen.flatten(1, 2))
+        inputs = torch.cat([torch.where(mask, self.normalize(image.raw), 0.0), mask.float()], dim=2)
+        posterior, _ = self.encoder.encode(inputs.flatten(1, 2))
         latent = posterior.sample() if self.training else posterior.mode()
         decoded = self.reconstructor(latent, ())
         return Reconstruction(SplatterImage(decoded.raw * self.std + self.mean, decoded.parameterization), posterior)
@@ -160,7 +160,9 @@ class SparseVAE(nn.Module):
     @torch.no_grad()
     def measure(self, images: Iterable[SplatterImage]) -> None:
         """Set the normalisation to the mean and standard deviation over the occupied places of these images."""
-        count, total, squares = (torch.zeros_like(as_float64(self.mean)) for _ in range(3))
+        count = torch.zeros_like(as_float64(self.mean))
+        total = torch.zeros_like(count)
+        squares = torch.zeros_like(count)
         for image in images:
             mask = occupied(image)[:, :, None]
             raw = as_float64(torch.where(mask, image.raw, 0.0))

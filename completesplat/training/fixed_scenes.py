@@ -273,7 +273,9 @@ class Samples(DrawsFixedScenes):
             images = rendering.over(module.background).clamp(0, 1)
             drawings.append(SceneDrawings(views.images[0], images, rendering.expected_depth()[:1]))
         scores = [drawing.scores() for drawing in drawings]
-        means = {f"samples/{name}": sum(values[name] for values in scores) / len(scores) for name in scores[0]}
+        means = {}
+        for name in scores[0]:
+            means[f"samples/{name}"] = sum(values[name] for values in scores) / len(scores)
         return samples_sheet(drawings), means
 
 
