@@ -102,7 +102,7 @@ class _Rasterize(torch.autograd.Function):
         filled = []
         for image, gradient in zip(images, image_gradients, strict=True):
             if gradient is None:
-                # NumPy's zeros, because torch would wake its threads, which then spin on the kernels' cores for a while.
+                # NumPy's zeros: torch would wake its threads, which then spin on the kernels' cores for a while.
                 gradient = torch.from_numpy(np.zeros(image.shape, np.float32))
             filled.append(gradient.contiguous())
         gradients = ctx.rendering.backward(RenderedImages(*_arrays(images)), RenderedImages(*_arrays(filled)))
