@@ -67,7 +67,7 @@ def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
     larger: SceneDataModule = instantiate(run_config.data, image_size=resolution, _convert_="all")
     if is_packed(data.root):
         settings_must_match(larger.root, larger.packed_settings())
-    larger.at_model_size = data
+    larger.low_resolution = data
     return larger
 
 

@@ -136,9 +136,9 @@ class CaptureFit(Stage):
     def on_fit_start(self) -> None:
         """Place the first Gaussians, unless a run is continued."""
         self.refuse_average()
-        for name, value in self.data.augment.keywords.items():
-            if value:
-                raise CompleteSplatError(f"data.{name}: model=capture fits the photos as they are; turn it off")
+        changed = self.data.augmentation.active()
+        if changed:
+            raise CompleteSplatError(f"data.{changed[0]}: model=capture fits the photos as they are; turn it off")
         sequence = self.sequence("train")
         if self.count:
             return

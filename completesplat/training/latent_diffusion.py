@@ -1,6 +1,7 @@
 """Stage 2: latent diffusion over the frozen autoreconstructor's latents (paper, Section 3.3)."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,6 +20,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.quantities import Natural, Positive, Share
 from completesplat.scene import Batch, SceneBatch
+from completesplat.scene_model import Sampling
 from completesplat.training.encoding import check_cache
 from completesplat.training.scoring import Scorer
 from completesplat.training.stage import Compile, Stage, prepare_network
@@ -56,20 +58,23 @@ class DiffusionScorer(Scorer):
 
     def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int, batch: int | None = None) -> Gaussians:
         """Draw samples as `Scorer.draw` does. The samples of an image depend on no other image."""
-        return self.reconstruct(scenes, seeds, samples=samples, batch=batch)
+        return self.sample(scenes, Sampling(samples=samples, seed=seeds, batch=batch))
 
-    def reconstruct(self, scenes: SceneBatch, seed: int | Sequence[int], **settings: Any) -> Gaussians:
-        """Draw one sample for each reference image, or several by `settings` of `CompleteSplat.generate`."""
-        return self.completesplat.generate(
-            scenes.reference.images,
-            scenes.reference.cameras,
-            scenes.depth_range,
+    def reconstruct(self, scenes: SceneBatch, seed: int) -> Gaussians:
+        """Draw one sample for each reference image."""
+        return self.sample(scenes, Sampling(seed=seed))
+
+    def sample(self, scenes: SceneBatch, sampling: Sampling) -> Gaussians:
+        """Draw samples for each reference image, with the weights and fits of this scorer."""
+        sampling = replace(
+            sampling,
             skip_weight=self.skip_weight,
             guidance_weight=self.guidance_weight,
             color_fits=self.color_fits,
-            visible=scenes.visible,
-            seed=seed,
-            **settings,
+        )
+        reference = scenes.reference
+        return self.completesplat.generate(
+            reference.images, reference.cameras, scenes.depth_range, sampling, scenes.visible
         )
 
 

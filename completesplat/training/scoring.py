@@ -135,11 +135,11 @@ class Scorer(LightningModule):
     def test_step(self, scenes: SceneBatch, index: int) -> None:
         evaluation = self.evaluation
         names = scenes.names
-        seen = scenes if scenes.small is None else scenes.small
+        model_input = scenes if scenes.low_resolution is None else scenes.low_resolution
         seeds = [evaluation.scene_seed(name) for name in names]
-        gaussians = self.timed("inference", lambda: self.draw(seen, seeds, evaluation.samples), len(names))
+        gaussians = self.timed("inference", lambda: self.draw(model_input, seeds, evaluation.samples), len(names))
         truth = scenes.all_views()
-        cameras = seen.all_views().cameras
+        cameras = model_input.all_views().cameras
         for b, name in enumerate(names):
             samples = gaussians[b * evaluation.samples : (b + 1) * evaluation.samples]
             rendered = self.timed("rendering", partial(self.render_from, samples, cameras[b]), evaluation.samples)

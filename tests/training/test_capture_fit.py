@@ -6,7 +6,7 @@ from PIL import Image
 from support import compose_config, interrupted_at, strict_json, write_capture
 
 from completesplat.commands.fit import refuse_without_effect
-from completesplat.data.captures.capture import CapturedFrame
+from completesplat.data.captures.captured_frames import CapturedFrame
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_transforms
 from completesplat.errors import CompleteSplatError
