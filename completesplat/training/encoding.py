@@ -128,7 +128,7 @@ class FrameEncoder:
             encoder,
             features,
             source,
-            data.packed_settings(),
+            dict(data.packed_settings()),
             data.image_size,
             frames,
             views,
