@@ -40,12 +40,12 @@ class CaptureSettings:
     """Settings of the Gaussians of a capture.
 
     Attributes:
-        initial, most: first and largest number of Gaussians; the first is at most that of the points.
+        initial, most: first and largest number of Gaussians. The first is at most that of the points.
         opacity: initial opacity of all Gaussians.
         refine_every: steps between relocations of dead Gaussians, which add the share `growth` of new ones.
         opacity_weight, scale_weight: weights of mean opacity and mean scale in the loss.
         position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
-        opacity_rate: factor on the opacities' learning rate; with 4, captures of flat floors and walls collapse.
+        opacity_rate: factor on the opacities' learning rate. With 4, captures of flat floors and walls collapse.
     """
 
     initial: fitting.Count = 20_000

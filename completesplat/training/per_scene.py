@@ -90,7 +90,7 @@ class Preoptimized(PerScene):
     """Fitted Gaussians, as many as a Splatter Image of the reference view has room for.
 
     Like `PerScene`, it has seen the views that it is scored on. The results of a test have the share of pixels without
-    any Gaussian as `empty_pixels`, a mean over scenes; the paper reports 80 %.
+    any Gaussian as `empty_pixels`, a mean over scenes. The paper reports 80 %.
     """
 
     def __init__(self, parameterization: Parameterization, **fitting_and_rendering: Any) -> None:
@@ -135,9 +135,9 @@ class FittedScenes:
     One sequence at a time is in memory (16 bytes a pixel, and Gaussians). A file takes 56 bytes for each Gaussian.
 
     Args:
-        folder: folder of the files, which several processes may share; scenes in it are not fitted again.
+        folder: folder of the files, which several processes may share. Scenes in it are not fitted again.
         fit: a batch of one scene -> its Gaussians, in the reference camera's frame.
-        settings: text of all settings that the fit depends on; another text means other files.
+        settings: text of all settings that the fit depends on. Another text means other files.
     """
 
     def __init__(
