@@ -92,7 +92,7 @@ def in_front(count: int = 40, seed: int = 0) -> Gaussians:
 
 def drawn(folder: Path, scenes: SceneBatch, samples: int, frame: str = "opencv", align: str = "none") -> Gaussians:
     stage = SceneFiles(str(folder), frame, align, None, rasterizer=ReferenceRasterizer())
-    stage.find(scenes.names, samples)
+    stage.find_files(scenes.names, samples)
     return stage.draw(scenes, [0], samples)
 
 

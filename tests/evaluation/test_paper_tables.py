@@ -261,7 +261,7 @@ def test_a_sweep_of_an_earlier_version_whose_records_do_not_name_it_counts_as_si
         put("run.json", "sweep", ...)(record.parent)
     by_name = made(runs)
     assert list(by_name) == [*PAPERS, "own_1"]
-    assert len(ours(by_name["own_1"])) == 2
+    assert len(ours(by_name["own_1"])) == 3  # both models, and the mean image once
     assert ours(by_name["ablations"]) == []
 
 

@@ -7,7 +7,7 @@ square error of the samples' mean is (k + 1) / k times their variance (Fortin et
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -31,35 +31,64 @@ def calibration_rows(renderer: SampleRenderer, scenes: Scenes, tick: OnProgress,
     `spread` and `error` are the roots of the means of `squares`; `bins` has them for `BINS` equally large groups of
     values, ordered by the samples' variance. The settings are skip and guidance weight (`CompleteSplat.generate`).
     """
-    measured = defaultdict[str, list[Any]](list)
+    measured = defaultdict[str, list[SceneCalibration]](list)
     for index, scene in enumerate(scenes):
         tick(scene.names[0])
         images = renderer(scene, seed=renderer.seed + index, **settings)[:, 1:]  # new noise for each scene
         for region, (samples, true) in novel_values(images, scene.all_views()[0]).items():
-            scores = energies(samples, true) | {"crps": crps(samples, true)}
-            means = torch.stack(squares(samples, true)).double().mean(1)
-            measured[region].append((scores, rank_histogram(samples, true), means, halves(samples, true)))
-    results = []
-    for region, of_scenes in measured.items():
-        scores_of_scenes, *others = zip(*of_scenes, strict=True)
-        ranks, (spread, error) = (torch.stack(values).mean(0).tolist() for values in others[:2])
-        row = {"region": region, "scenes": len(of_scenes), **mean_over_scenes(scores_of_scenes)}
-        row |= {"below_all": ranks[0], "above_all": ranks[-1], "spread": spread**0.5, "error": error**0.5}
-        row |= {"spread_over_error": (spread / error) ** 0.5 if error else None}
-        results.append(row | {"ranks": ranks, "bins": binned(*torch.cat(others[2], 1))})
-    return results
+            measured[region].append(measure_scene(samples, true))
+    return [_row(region, of_scenes) for region, of_scenes in measured.items()]
+
+
+class SceneCalibration(NamedTuple):
+    """Measurements of one scene: scores by name, shares of ranks, means of `squares`, and `halves`."""
+
+    scores: dict[str, float | None]
+    ranks: Float[Tensor, " rank"]
+    squares: Float[Tensor, "2"]
+    halves: Float[Tensor, "3 value"]
+
+
+def measure_scene(samples: SampledValues, truth: TrueValues) -> SceneCalibration:
+    """Measure the samples of one scene against the truth."""
+    scores: dict[str, float | None] = {**energies(samples, truth)}
+    scores["crps"] = crps(samples, truth)
+    means = torch.stack(squares(samples, truth)).double().mean(1)
+    return SceneCalibration(scores, rank_histogram(samples, truth), means, halves(samples, truth))
+
+
+def _row(region: str, scenes: Sequence[SceneCalibration]) -> Row:
+    ranks = torch.stack([scene.ranks for scene in scenes]).mean(0).tolist()
+    spread, error = torch.stack([scene.squares for scene in scenes]).mean(0).tolist()
+    row: Row = {"region": region, "scenes": len(scenes)}
+    row |= mean_over_scenes([scene.scores for scene in scenes])
+    row["below_all"] = ranks[0]
+    row["above_all"] = ranks[-1]
+    row["spread"] = spread**0.5
+    row["error"] = error**0.5
+    row["spread_over_error"] = (spread / error) ** 0.5 if error else None
+    row["ranks"] = ranks
+    row["bins"] = binned(*torch.cat([scene.halves for scene in scenes], 1))
+    return row
 
 
 def energies(samples: SampledValues, truth: TrueValues) -> dict[str, float]:
     """Return the fair energy scores of 2, 4, 8, ... and all samples: means over disjoint groups of this size."""
-    counts = {2**power: 1 for power in range(1, len(samples).bit_length())} | {len(samples): 1}
-    groups = {n: samples[: len(samples) // n * n].view(-1, n, len(truth)) for n in counts}
-    return {f"energy_{n}": sum(energy_score(part, truth) for part in parts) / len(parts) for n, parts in groups.items()}
+    counts = [2**power for power in range(1, len(samples).bit_length())]
+    if len(samples) not in counts:
+        counts.append(len(samples))
+    scores = {}
+    for n in counts:
+        groups = samples[: len(samples) // n * n].view(-1, n, len(truth))
+        scores[f"energy_{n}"] = sum(energy_score(group, truth) for group in groups) / len(groups)
+    return scores
 
 
 def squares(samples: SampledValues, truth: TrueValues) -> tuple[TrueValues, TrueValues]:
-    """Return the variance of k samples times (k + 1) / k, and the squared error of their mean; ideally equal."""
-    return samples.var(0) * (len(samples) + 1) / len(samples), (samples.mean(0) - truth).square()
+    """Return the variance of k samples times (k + 1) / k and the squared error of their mean: ideally equal."""
+    variance = samples.var(0) * (len(samples) + 1) / len(samples)
+    error = (samples.mean(0) - truth).square()
+    return variance, error
 
 
 def halves(samples: SampledValues, truth: TrueValues) -> Float[Tensor, "3 value"]:
@@ -81,7 +110,8 @@ def binned(order: TrueValues, spreads: TrueValues, errors: TrueValues) -> list[l
 def plot_calibration(rows: Sequence[Row], path: Path, title: str) -> None:
     """Write a PNG with three panels for each region: ranks, spread against error, and energy by number of samples."""
     with written_figure(path, title, (13, 0.5 + 3.7 * len(rows))) as figure:
-        for (ranks, bins, energy), row in zip(figure.subplots(len(rows), 3, squeeze=False), rows, strict=True):
+        panels = figure.subplots(len(rows), 3, squeeze=False)
+        for (ranks, bins, energy), row in zip(panels, rows, strict=True):
             name = f"novel views, {row['region']}"
             count = len(row["ranks"])
             end = 1.05 * max(map(max, row["bins"]))

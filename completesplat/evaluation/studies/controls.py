@@ -16,7 +16,7 @@ from completesplat.evaluation.studies.samples import (
     near_reference,
     object_psnr,
 )
-from completesplat.export.images import Sheet, SheetCell, strip
+from completesplat.export.images import Sheet, strip
 from completesplat.metrics.images import psnr
 from completesplat.metrics.sample_scores import diversity
 from completesplat.scene import SceneBatch
@@ -49,10 +49,10 @@ def controls_rows(
         images = renderer(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
         reference = scene.reference
         targets = scene.targets[0]
-        seen = near_reference(reference.cameras[0], targets.cameras, near_degrees)
+        near = near_reference(reference.cameras[0], targets.cameras, near_degrees)
         return {
             "reference_psnr": psnr(images[:, 0], reference.images.expand_as(images[:, 0])).mean().item(),
-            "near_object_psnr": object_psnr(images[:, 1:][:, seen], targets.images[seen], targets.masks[seen]),
+            "near_object_psnr": object_psnr(images[:, 1:][:, near], targets.images[near], targets.masks[near]),
             "diversity": diversity(images[:, 1:]),
         }
 
@@ -76,17 +76,20 @@ def controls_strips(renderer: SampleRenderer, settings: WeightPairs, scene: Scen
     The far view is the target whose direction differs most from the reference's. The first row is the truth.
     """
     far = farthest(scene)
-    skips, weights = (sorted(set(values)) for values in zip(*settings, strict=True))
+    skips = sorted({skip for skip, _ in settings})
+    weights = sorted({weight for _, weight in settings})
     rows = [strip(scene.all_views().images[0, [0, far]], "truth: reference, far")]
     for skip in skips[::-1]:
         rows.append([])
         for weight in weights:
-            cells: list[SheetCell | None] = [None] * (1 + samples)
-            if (skip, weight) in settings:
-                images = renderer(scene, skip_weight=skip, guidance_weight=weight)
-                label = f"{'paper: ' if (skip, weight) in PAPER else ''}skip {skip:g}, guidance {weight:g}"
-                cells = strip(torch.cat([images[:1, 0], images[:samples, far]]), label, 1 + samples)
-            rows[-1] += cells
+            if (skip, weight) not in settings:
+                rows[-1] += [None] * (1 + samples)
+                continue
+            images = renderer(scene, skip_weight=skip, guidance_weight=weight)
+            label = f"skip {skip:g}, guidance {weight:g}"
+            if (skip, weight) in PAPER:
+                label = f"paper: {label}"
+            rows[-1] += strip(torch.cat([images[:1, 0], images[:samples, far]]), label, 1 + samples)
     return rows
 
 

@@ -52,21 +52,11 @@ def _rungs(renderer: SampleRenderer, scene: SceneBatch, fits: int) -> Iterator[t
     latent = seeing.mode()
     decoder = deepcopy(stage1.reconstructor).requires_grad_()
     start = stage1.reconstructor(latent, features).map(Tensor.detach)
-    free_raw, free_latent = (tensor.clone().requires_grad_() for tensor in (start.raw, latent))
+    free_raw = start.raw.clone().requires_grad_()
+    free_latent = latent.clone().requires_grad_()
 
     def fitted(parameters: Iterable[Tensor], rate: float, make: Callable[[], SplatterImage]) -> Gaussians:
-        """Return the Gaussians after steps of Adam on the mean square error of some views each, with a falling rate."""
-        optimizer = torch.optim.Adam(parameters, lr=rate)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, fits)
-        generator = torch.Generator().manual_seed(renderer.seed)
-        for _ in range(fits):
-            chosen = torch.randperm(views.images.shape[1], generator=generator)[:VIEWS_OF_A_STEP]
-            drawn = renderer.rasterizer(make().gaussians(*inputs), views.cameras[:, chosen]).over(renderer.background)
-            optimizer.zero_grad()
-            (drawn - views.images[:, chosen]).square().mean().backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
-            schedule.step()
-        return make().gaussians(*inputs)
+        return _fitted(renderer, scene, fits, parameters, rate, lambda: make().gaussians(*inputs))
 
     yield "raw values fitted", fitted([free_raw], RAW_RATE, lambda: replace(start, raw=free_raw))
     yield "decoder fitted", fitted(decoder.parameters(), DECODER_RATE, lambda: decoder(latent, features))
@@ -77,18 +67,44 @@ def _rungs(renderer: SampleRenderer, scene: SceneBatch, fits: int) -> Iterator[t
     yield "reference alone", stage1.reconstructor(alone.mode(), features).map(Tensor.detach).gaussians(*inputs)
 
 
+def _fitted(
+    renderer: SampleRenderer,
+    scene: SceneBatch,
+    fits: int,
+    parameters: Iterable[Tensor],
+    rate: float,
+    make: Callable[[], Gaussians],
+) -> Gaussians:
+    """Return the Gaussians after steps of Adam on the mean square error of some views each, with a falling rate."""
+    views = scene.all_views()
+    optimizer = torch.optim.Adam(parameters, lr=rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, fits)
+    generator = torch.Generator().manual_seed(renderer.seed)
+    for _ in range(fits):
+        chosen = torch.randperm(views.images.shape[1], generator=generator)[:VIEWS_OF_A_STEP]
+        drawn = renderer.rasterizer(make(), views.cameras[:, chosen]).over(renderer.background)
+        optimizer.zero_grad()
+        (drawn - views.images[:, chosen]).square().mean().backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        schedule.step()
+    return make()
+
+
 @torch.no_grad()
 def _scores(renderer: SampleRenderer, scene: SceneBatch, gaussians: Gaussians) -> dict[str, float | None]:
     """Return the means over samples of the scores that `ladder_rows` explains."""
     views = scene.all_views()[0]
     rendering = renderer.rasterizer(gaussians, views.cameras.repeated(len(gaussians.means)))
     images = renderer.over_background(rendering)
-    behind = ~near_reference(scene.reference.cameras[0], views.cameras, BEHIND)
-    counted = torch.ones_like(views.images[behind][:, :1], dtype=torch.bool)
-    sharp = [sharpness(sample[behind], views.images[behind], counted) for sample in images] if behind.any() else [None]
     quality = torch.stack([psnr(sample, views.images) for sample in images])
-    return {
-        "psnr": quality.mean().item(),
-        "behind": quality[:, behind].mean().item() if behind.any() else None,
-        "sharpness_behind": None if None in sharp else sum(sharp) / len(sharp),  # type: ignore[arg-type]
-    }
+    scores: dict[str, float | None] = {"psnr": quality.mean().item(), "behind": None, "sharpness_behind": None}
+    behind = ~near_reference(scene.reference.cameras[0], views.cameras, BEHIND)
+    if not behind.any():
+        return scores
+    scores["behind"] = quality[:, behind].mean().item()
+    counted = torch.ones_like(views.images[behind][:, :1], dtype=torch.bool)
+    by_sample = [sharpness(sample[behind], views.images[behind], counted) for sample in images]
+    known = [sharp for sharp in by_sample if sharp is not None]
+    if known:  # else the truth has no gradient
+        scores["sharpness_behind"] = sum(known) / len(known)
+    return scores

@@ -65,8 +65,10 @@ def object_psnr(
 ) -> float | None:
     """Return the samples' PSNR (dB) over the true object's pixels of all views together; None without pixels."""
     inside = (masks > 0.5).expand_as(true)
-    error = (images - true).square().mean(0)[inside].mean().item()  # NaN without pixels
-    return -10 * math.log10(max(error, 10 ** (-PSNR_LIMIT / 10))) if inside.any() else None
+    if not inside.any():
+        return None
+    error = (images - true).square().mean(0)[inside].mean().item()
+    return -10 * math.log10(max(error, 10 ** (-PSNR_LIMIT / 10)))
 
 
 def near_reference(reference: Cameras, targets: Cameras, degrees: float) -> Bool[Tensor, " view"]:
@@ -88,6 +90,6 @@ def mean_over_scenes(measured: Sequence[Mapping[str, float | None]]) -> dict[str
     """Return the mean of each figure over the scenes that have it; None if none has."""
     means: dict[str, float | None] = {}
     for key in measured[0]:
-        values = [value for row in measured if (value := row[key]) is not None]
+        values = [value for value in (row[key] for row in measured) if value is not None]
         means[key] = sum(values) / len(values) if values else None
     return means

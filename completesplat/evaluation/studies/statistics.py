@@ -44,26 +44,38 @@ def statistics(sequences: Mapping[str, Iterable[PosedSequence]]) -> dict[str, An
     """
     rows = {split: [_measure(sequence) for sequence in members] for split, members in sequences.items()}
     return {
-        "splits": {
-            split: {"sequences": len(members), "frames": sum(int(row["frames_per_sequence"][0]) for row in members)}
-            | {key: _merged([row[key] for row in members]) for key, _, _ in MEASURES}
-            for split, members in rows.items()
-        },
+        "splits": {split: _of_split(members) for split, members in rows.items()},
         "histograms": {key: _histogram(key, rows) for key, _, _ in MEASURES},
     }
+
+
+def _of_split(rows: list[Row]) -> dict[str, Any]:
+    figures: dict[str, Any] = {
+        "sequences": len(rows),
+        "frames": sum(int(row["frames_per_sequence"][0]) for row in rows),
+    }
+    for key, _, _ in MEASURES:
+        figures[key] = _merged([row[key] for row in rows])
+    return figures
 
 
 def show_statistics(results: dict[str, Any]) -> None:
     """Print the splits side by side."""
     splits = results["splits"]
-    counts = [{"split": split, "sequences": s["sequences"], "frames": s["frames"]} for split, s in splits.items()]
+    counts = []
     columns = {"": Heading("", figures=False)}
-    columns |= {f"{split} {part}": Heading(part, split) for split in splits for part in PARTS}
+    for split, summary in splits.items():
+        counts.append({"split": split, "sequences": summary["sequences"], "frames": summary["frames"]})
+        for part in PARTS:
+            columns[f"{split} {part}"] = Heading(part, split)
     ranges: list[dict[str, object]] = []
     for key, label, form in MEASURES:
-        values = {f"{split} {part}": summary[key][part] for split, summary in splits.items() for part in PARTS}
-        written = {name: "-" if x is None else format(x, form) for name, x in values.items()}
-        ranges.append({"": label, **written})
+        row: dict[str, object] = {"": label}
+        for split, summary in splits.items():
+            for part in PARTS:
+                value = summary[key][part]
+                row[f"{split} {part}"] = "-" if value is None else format(value, form)
+        ranges.append(row)
     show(records_table("Sequences and frames", counts), records_table("Smallest, median and largest", ranges, columns))
 
 
