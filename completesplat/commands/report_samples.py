@@ -22,8 +22,9 @@ from completesplat.evaluation.studies.samples import SampleRenderer, first_scene
 from completesplat.evaluation.tables import records_table, show
 from completesplat.export.images import image_sheet, write_png
 from completesplat.files import counted, write_json
+from completesplat.quantities import Entries, Positive, Range, Share
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Entries, ModelSettings, Positive, Range, Share
+from completesplat.settings.schema import ModelSettings
 
 Weights = Annotated[Sequence[Share], Entries(1)]
 

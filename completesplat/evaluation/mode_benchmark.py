@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.data.loading.data_module import SceneDataModule
+from completesplat.data.loading.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.evaluation.mode_predictors import OTHER_SCENE, Predictor, Renders, predictors
 from completesplat.evaluation.protocol import sampler_settings
@@ -23,7 +23,7 @@ from completesplat.export.images import Sheet, SheetCell, image_sheet, write_png
 from completesplat.files import counted, write_json
 from completesplat.metrics.mode_coverage import REJECTED, classify, draw_modes, mean_of, scores
 from completesplat.metrics.proper_scores import energy_score
-from completesplat.settings.schema import Natural, Positive, Range
+from completesplat.quantities import Natural, Positive, Range
 
 
 class HiddenModesEvaluation(TypedDict):

@@ -71,7 +71,7 @@ def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
     larger: SceneDataModule = instantiate(run_config.data, image_size=resolution, _convert_="all")
     if is_packed(data.root):
         settings_must_match(larger.root, larger.packed_settings())
-    larger.at_model_size = data
+    larger.low_resolution = data
     return larger
 
 
@@ -87,7 +87,7 @@ def describe_test(
 ) -> dict[str, Any]:
     """Describe what was measured and how, in a test by a config of `conf/evaluation/` with results in `out`."""
     scores = module.evaluation
-    model_size = data if data.at_model_size is None else data.at_model_size
+    model_size = data if data.low_resolution is None else data.low_resolution
     described: dict[str, Any] = {"name": evaluation["name"], "method": module.method}
     described |= data.describe()
     described["image_size"] = model_size.image_size

@@ -21,9 +21,9 @@ from completesplat.evaluation.regions import REGIONS
 from completesplat.evaluation.scene_scores import MODEL, SceneScores
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
+from completesplat.quantities import Share
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
-from completesplat.settings.schema import Share
 
 Result = TypeVar("Result")
 Renders = Float[Tensor, "batch view 3 height width"]
@@ -128,7 +128,7 @@ class Scorer(LightningModule):
         evaluation = self.evaluation
         names = scenes.names
         # A test at a larger size than the model's has the model's smaller images as well.
-        inputs = scenes if scenes.seen is None else scenes.seen
+        inputs = scenes if scenes.low_resolution is None else scenes.low_resolution
         seeds = [evaluation.scene_seed(name) for name in names]
         gaussians = self.timed("inference", lambda: self.draw(inputs, seeds, evaluation.samples), len(names))
         truth = scenes.all_views()

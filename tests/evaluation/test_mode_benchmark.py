@@ -7,7 +7,7 @@ import torch
 from scenes_for_training import scene_batch
 from support import tiny_generator
 
-from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
+from completesplat.data.loading.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.evaluation.mode_benchmark import measure, predictors, usable_scenes
 from completesplat.gaussians import Gaussians
