@@ -19,6 +19,7 @@ from completesplat.baselines import fitting
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.sequences import PosedSequence, first_names
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.scorer import Renders
 from completesplat.export.prediction import FileUnits, OutputFiles, Shot, write_fitted_scene, write_scene
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -27,7 +28,6 @@ from completesplat.quantities import CameraPath, Format, NonNegative, Positive, 
 from completesplat.scene import Batch, SceneBatch, Views
 from completesplat.tensors import stack
 from completesplat.training.optimization import Schedule, constant
-from completesplat.training.scoring import Renders
 from completesplat.training.stage import Stage
 
 REFINED_SHARE = 0.8  # of the run, in which Gaussians move and are added (25,000 of 30,000 steps in 3DGS-MCMC)
@@ -73,7 +73,7 @@ class CaptureFit(Stage):
     """
 
     first_novel = 0  # all held-out photos count as one
-    without_effect = ("optimizer", "schedule")
+    unused_settings = ("optimizer", "schedule")
 
     def __init__(
         self,

@@ -23,7 +23,7 @@ from completesplat.export.prediction import plain_camera
 from completesplat.files import make_folder, write_json
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
-from completesplat.metrics.scoring import diversity
+from completesplat.metrics.sample_scores import diversity
 from completesplat.quantities import Positive
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch

@@ -19,6 +19,7 @@ from completesplat.baselines.preoptimized import SparseVAE, project_to_splatter_
 from completesplat.data.loading.distributed import gather_values, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.scorer import Renders, Scorer
 from completesplat.export.prediction import Shot, write_fitted_scene
 from completesplat.files import counted, make_folder, safe_name, write_bytes
 from completesplat.gaussians import Gaussians
@@ -29,7 +30,6 @@ from completesplat.quantities import NonNegative
 from completesplat.scene import SceneBatch, Views
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import stack
-from completesplat.training.scoring import Renders, Scorer
 from completesplat.training.stage import Stage
 
 logger = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ class PerScene(Scorer):
 
     upper_bound = True
     fitted_to = "each scene's test views, the ones that it is scored on"
-    without_effect: tuple[str, ...] = ("optimizer", "schedule", "trainer.max_", "trainer.val_check")
+    unused_settings: tuple[str, ...] = ("optimizer", "schedule", "trainer.max_", "trainer.val_check")
 
     def __init__(
         self, loss: WeightedSum, fitting: FittingSettings, scenes_folder: str | None = None, **others: Any
@@ -204,7 +204,7 @@ class PreoptimizedVAE(Preoptimized, Stage):
         **preoptimized: see `Preoptimized`.
     """
 
-    without_effect = ()
+    unused_settings = ()
 
     def __init__(
         self,
