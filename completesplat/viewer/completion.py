@@ -8,11 +8,11 @@ from typing import Any
 
 import viser
 
-from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.export.images import to_pixels
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
+from completesplat.photo.reading import Photograph
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.access import show_status
 from completesplat.viewer.page import SHOWN, Page

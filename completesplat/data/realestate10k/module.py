@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
-from completesplat.data.images.crop import Square, principal_square
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import EvaluationScenes
 from completesplat.data.loading.view_selection import Choice, GrowingGap, evaluation_views_within, nearby_views
@@ -19,6 +18,7 @@ from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSou
 from completesplat.data.validation import require_file
 from completesplat.errors import CompleteSplatError, DataError, errors_at, refused_to
 from completesplat.geometry.cameras import crop_resize
+from completesplat.photo.crop import Square, principal_square
 from completesplat.settings.schema import Natural, Positive, Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of

@@ -26,7 +26,6 @@ from completesplat.data.co3d import writing
 from completesplat.data.co3d.annotations import viewpoint
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.hidden_modes import in_mode
-from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
 from completesplat.data.rendered.drawing import PAINTS, RenderSettings, check_surroundings, draw_rendered_scene
 from completesplat.data.validation import read_points
@@ -34,6 +33,7 @@ from completesplat.data.validation.processes import share_of, usable_cores
 from completesplat.errors import CompleteSplatError, DataError, MissingFile, UnreadableFile
 from completesplat.files import atomic_folder, counted, folder_names, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
+from completesplat.photo.saving import save_jpeg, to_uint8
 from completesplat.settings.schema import Natural, Positive, Range
 
 logger = logging.getLogger(__name__)
