@@ -18,8 +18,8 @@ from completesplat.export.video import render_views, write_video
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.trajectories import PATHS
+from completesplat.quantities import CameraPath, Format
 from completesplat.rasterizers import Rasterizer
-from completesplat.settings.schema import CameraPath, Format
 
 
 @dataclass(frozen=True)

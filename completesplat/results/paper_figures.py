@@ -161,11 +161,11 @@ def published_tables(tree: RunTree | None) -> list[tables.Table]:
 
 
 def _ablation_sweeps(tree: RunTree) -> dict[Path, list[Job]]:
-    """Return the tested jobs of each sweep over options of the published ablation tables, by the sweep's folder."""
+    """Return the tested jobs of each sweep over ablations, with a published row or without, by the sweep's folder."""
     options = {option for table in read_tables() for option in table.get("options", [])}
     sweeps = {}
     for folder in tree.sweeps:
         tested = [job for job in collect(folder) if job.protocol]
-        if any(options & set(job.label.split(", ")) for job in tested):
+        if any({*options, job.overrides.get("ablation")} & set(job.label.split(", ")) for job in tested):
             sweeps[folder] = tested
     return sweeps

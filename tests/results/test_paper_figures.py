@@ -254,7 +254,18 @@ def test_names_that_are_no_text_are_escaped(runs, run) -> None:
     assert any(line.startswith("[1] bad\\udcff\\n: ") for line in made(runs)["own_1"].below())
 
 
-def test_a_sweep_without_ablations_counts_as_single_runs(runs, job) -> None:
-    job("nothing_of_the_paper", 0, 20.0)
-    job("nothing_of_the_paper", 1, 21.0)
+def test_ablations_without_a_row_in_the_paper_stand_below_its_rows(runs, job) -> None:
+    job("no_kl", 0, 20.0)
+    job("fewer_layers", 0, 21.0)
+    by_name = made(runs)
+    assert list(by_name) == PAPERS
+    rows = [next(iter(row.values())).partition(",")[0] for row in ours(by_name["ablations"])]
+    assert {"completesplat: fewer_layers", "completesplat: no_kl"} <= set(rows)
+
+
+def test_a_sweep_without_ablations_counts_as_single_runs(runs, sweep, job) -> None:
+    for channels in (32, 64):
+        test = {"protocol": SWEPT, "model": {"scenes": 9, "views": 9, "full": {"novel": {"psnr": 20.0}}}}
+        sweep.add(f"denoiser.channels=[{channels}]", test=test)
+    sweep.plan([])
     assert [table.name for table in published_tables(find_results(runs))] == [*PAPERS, "own_1"]
