@@ -17,9 +17,9 @@ from PIL import Image
 from torch import Tensor
 
 from completesplat.export.cleaning import storable, with_screen_space_dilation
+from completesplat.export.description import plain_camera
 from completesplat.export.images import Sheet, SheetCell, color_depth, image_sheet, strip, write_png
 from completesplat.export.ply import write_ply
-from completesplat.export.prediction import plain_camera
 from completesplat.files import make_folder, write_json
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr

@@ -20,7 +20,8 @@ from completesplat.data.loading.distributed import gather_values, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.scorer import Renders, Scorer
-from completesplat.export.prediction import Shot, write_fitted_scene
+from completesplat.export.fitted_scene import FittedViews, write_fitted_scene
+from completesplat.export.placed_scene import PlacedScene
 from completesplat.files import counted, make_folder, safe_name, write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -66,7 +67,8 @@ class PerScene(Scorer):
             make_folder(self.scenes_folder)
             make_folder(folder)
             title = f"{name}: fitted to these views"
-            write_fitted_scene(folder, name, title, Shot(gaussians[0], cameras[0]), images[0], truth.images, seed)
+            scene = PlacedScene(gaussians[0], cameras[0])
+            write_fitted_scene(folder, name, title, scene, FittedViews(images[0], truth.images), seed)
         except CompleteSplatError as error:
             logger.warning("%s: %s", folder, error)
 
