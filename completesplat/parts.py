@@ -36,8 +36,9 @@ from completesplat.diffusion.denoiser import Denoiser, TextlessStableDiffusion
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import WeightsError
 from completesplat.files import SHORT, printable
+from completesplat.quantities import Entries, Range, Share
 from completesplat.settings.checks import HYDRA_KEYS
-from completesplat.settings.schema import Entries, Range, Share, hints_of, start_weights, violations
+from completesplat.settings.schema import hints_of, start_weights, violations
 from completesplat.splatter_image import Parameterization
 
 # The classes that each setting may name, for settings that are parts of a model.

@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,18 +21,53 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import make_folder, write_bytes, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
+from completesplat.quantities import Natural, Positive, Seed
 from completesplat.rasterizers.front_fitting import fit_front
 from completesplat.rasterizers.selection import auto
 from completesplat.scene import Views
 from completesplat.settings.composition import has_bfloat16
-from completesplat.settings.schema import Natural, check_settings
+from completesplat.settings.schema import check_settings
 from completesplat.splatter_image import Parameterization
 from completesplat.tensors import concatenate, in_float32
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, read_small, shipped, write_sums
 
 Visible = Float[Tensor, "batch 1 height width"]  # masks that are 0 where an image is hidden, and 1 elsewhere
+OnScenes = Callable[[int, int, Gaussians], None]
+"""Callback: (number of the denoiser call, timestep, scenes as they are estimated now) -> None."""
 OBJECT_SHARE = 0.9  # of the image's side that an object on a background fills, as on imported turntables
 _rasterizer = cache(auto)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Settings of the scenes that a model makes of one image.
+
+    Models that draw no samples use only `samples`, which must be 1, and `color_fits`.
+
+    Attributes:
+        samples: number of scenes of each image.
+        steps: denoising steps; by default the sampler's number.
+        guidance_weight: share of the unconditional prediction; more gives more diverse samples.
+        skip_weight: default 1, the most faithful (supplement, "Diverse Sampling"), or 0 if something is hidden.
+        seed: seed of all noise, or one for each image, whose samples then do not depend on the other images.
+        color_fits: rounds of fitting to the image (`fit_front`); 0 in the paper.
+        batch: the largest number of latents at a time; it changes only rounding. By default all, or fewer if a GPU's
+            memory does not suffice; a small denoiser on a CPU draws `part_of` them unless the steps are watched.
+        bfloat16: compute the denoiser in bfloat16; a call with a photo does, where the device computes in it. Renders
+            then change about as little as by rounding to 8 bits.
+    """
+
+    samples: Positive = 1
+    steps: int | None = None
+    guidance_weight: float = 0.0
+    skip_weight: float | None = None
+    seed: Seed | Sequence[Seed] = 0
+    color_fits: Natural = 0
+    batch: Positive | None = None
+    bfloat16: bool = False
+
+
+DEFAULT_SAMPLING = Sampling()
 
 
 class SceneModel(nn.Module):
@@ -79,29 +114,26 @@ class SceneModel(nn.Module):
         images: Images,
         cameras: Cameras,
         depth_range: DepthRange,
-        *,
-        samples: int = 1,
+        sampling: Sampling = DEFAULT_SAMPLING,
         visible: Visible | None = None,
-        color_fits: Natural = 0,
-        **settings: object,
+        on_step: OnScenes | None = None,
     ) -> Gaussians:
         """Reconstruct the scene of each image, in its camera's frame.
 
         Args:
             visible: 0 where an image is hidden; hidden pixels have no influence.
-            color_fits: rounds of fitting to the image (`fit_front`); 0 in the paper.
-            **settings: sampling options of `CompleteSplat.generate`; they have no effect.
+            on_step: never called, because these models have no denoising steps.
 
         Raises:
             CompleteSplatError: several samples are asked for.
         """
-        if samples != 1:
-            raise CompleteSplatError(f"samples={samples}: this model draws none, it gives one answer")
+        if sampling.samples != 1:
+            raise CompleteSplatError(f"samples={sampling.samples}: this model draws none, it gives one answer")
         if visible is not None:
             images = images * visible + (self.background or 0) * (1 - visible)
         reconstruction: Reconstruction = self.eval().reconstruction_model(images)
         scenes = reconstruction.splatter_image.gaussians(cameras, depth_range)
-        return self.fitted(scenes, images, cameras, visible, color_fits)
+        return self.fitted(scenes, images, cameras, visible, sampling.color_fits)
 
     def fitted(
         self, scenes: Gaussians, images: Images, cameras: Cameras, visible: Visible | None, color_fits: int
@@ -110,12 +142,13 @@ class SceneModel(nn.Module):
         if not color_fits:
             return scenes
         background = 0.5 if self.background is None else self.background
+        samples = len(scenes.means) // len(images)
         parts = []
         for i in range(len(scenes.means)):  # one after the other, for the memory
-            photo = slice(j := i * len(images) // len(scenes.means), j + 1)
+            photo = slice(i // samples, i // samples + 1)
             mask = None if visible is None else visible[photo]
-            image = cameras[photo], images[photo]
-            parts.append(fit_front(scenes[i : i + 1], *image, _rasterizer(), color_fits, background, mask))
+            scene = scenes[i : i + 1]
+            parts.append(fit_front(scene, cameras[photo], images[photo], _rasterizer(), color_fits, background, mask))
         return concatenate(parts)
 
     @property
@@ -132,25 +165,32 @@ class SceneModel(nn.Module):
 
     @in_float32()
     def forward(
-        self, image: Photograph | ImageLike, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any
+        self,
+        image: Photograph | ImageLike,
+        visible: Float[Tensor, "1 _ _"] | None = None,
+        on_step: OnScenes | None = None,
+        **settings: Any,
     ) -> list[Gaussians]:
         """Generate complete scenes from one photo, in its camera's frame (+x right, +y down, +z forward).
 
         Args:
             image: a file, a PIL image, an array or a tensor (see `read`), or what `read` returned.
             visible: 0 where the image is hidden; see `completesplat.data.images.photograph`.
-            **settings: `samples`, `skip_weight`, `color_fits`, `steps`, `seed`, ...: see `generate`.
+            on_step: called after each denoising step; see `CompleteSplat.generate`.
+            **settings: `samples`, `skip_weight`, `color_fits`, `steps`, `seed`, ...: see `Sampling`.
 
         Raises:
-            CompleteSplatError: the image is not readable, the weights are not float32, or `visible` or an option of
-                `generate` is not as needed.
+            CompleteSplatError: the image is not readable, the weights are not float32, or `visible` or a setting is
+                not as needed.
         """
-        if (dtype := self.up.dtype) != torch.float32:
+        dtype = self.up.dtype
+        if dtype != torch.float32:
             message = f"the model's weights are {dtype}; model.float() makes them float32, which scenes need"
             raise CompleteSplatError(message)
-        check_settings(self.generate, settings)
-        photograph = image if isinstance(image, Photograph) else self.read(image)
+        check_settings(Sampling, settings)
         device = self.up.device
+        sampling = Sampling(**{"bfloat16": has_bfloat16(device.type), **settings})
+        photograph = image if isinstance(image, Photograph) else self.read(image)
         shape = (1, self.image_size, self.image_size)
         if visible is not None and (visible.shape != shape or not ((visible >= 0) & (visible <= 1)).all()):
             raise CompleteSplatError(f"visible: needs values from 0 to 1 in shape {list(shape)}")
@@ -158,8 +198,9 @@ class SceneModel(nn.Module):
             photograph.image[None].to(device),
             self.camera(photograph)[None],
             self.depth_range_of(photograph)[None],
+            sampling,
             visible=None if visible is None else visible[None].to(device),
-            **{"bfloat16": has_bfloat16(device.type), **settings},
+            on_step=on_step,
         )
         return [scenes[i] for i in range(len(scenes.means))]
 

@@ -21,8 +21,8 @@ TREES = {path: ast.parse(text, path) for path, text in FILES.items()}
 # A module imports from its own floor and from those before it; nothing from the benchmarks, which are no part of the
 # method.
 LAYERS = """
-    imports version errors signals files settings ply_files weights tensors geometry gaussians splatter_image scene
-    rasterizers
+    imports version errors quantities signals files settings ply_files weights tensors
+    geometry gaussians splatter_image scene rasterizers
     data autoreconstructor diffusion losses metrics scene_model baselines parts run_configs generator export
     training viewer results studies commands cli
     benchmarks

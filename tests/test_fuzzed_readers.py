@@ -36,7 +36,7 @@ from readers import READERS, put, read_frames
 from splats_of_others import FILES
 from support import some_gaussians
 
-from completesplat.data.captures.capture import CapturedFrame, Lens
+from completesplat.data.captures.captured_frames import CapturedFrame, Lens
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.images.exif import ORIENTATION
 from completesplat.data.images.files import decode_image, read_depth, stored_size

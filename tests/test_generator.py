@@ -19,6 +19,7 @@ from completesplat.commands.predict import photo_warnings
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
+from completesplat.scene_model import Sampling
 from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE
 
 
@@ -154,10 +155,11 @@ def test_samples_of_a_batch_stand_next_to_each_other(model, photo):
     images = torch.stack([photograph.image, photograph.image.flip(-1)])
     cameras = model.camera(photograph)[None].map(lambda tensor: tensor.expand(2, *tensor.shape[1:]))
     ranges = model.depth_range.expand(2, 2)
-    scenes = model.generate(images, cameras, ranges, samples=3, skip_weight=1.0, steps=2)
+    scenes = model.generate(images, cameras, ranges, Sampling(samples=3, skip_weight=1.0, steps=2))
     assert scenes.means.shape[0] == 6
     # With one skip of weight one the image reaches its own samples only: a changed second image moves those alone.
-    changed = model.generate(images * torch.tensor([1.0, 0.5]).view(2, 1, 1, 1), cameras, ranges, samples=3, steps=2)
+    darker = images * torch.tensor([1.0, 0.5]).view(2, 1, 1, 1)
+    changed = model.generate(darker, cameras, ranges, Sampling(samples=3, steps=2))
     moved = (changed.means - scenes.means).abs().amax((1, 2)) > 1e-6
     assert moved.tolist() == [False] * 3 + [True] * 3
 
@@ -191,7 +193,7 @@ def calls_of(model, **settings) -> dict[str, list[int]]:
     ]
     size = model.image_size
     camera = Cameras(torch.eye(4), pinhole(50.0, size), (size, size))[None]
-    model.generate(torch.rand(1, 3, size, size), camera, model.depth_range[None], **settings)
+    model.generate(torch.rand(1, 3, size, size), camera, model.depth_range[None], Sampling(**settings))
     for hook in hooks:
         hook.remove()
     return {name: seen for name, seen in sizes.items() if seen}

@@ -12,8 +12,8 @@ from completesplat.autoreconstructor.encoder import Encoder, Features, Images
 from completesplat.autoreconstructor.posterior import Posterior, from_moments
 from completesplat.autoreconstructor.pretrained import load_pretrained
 from completesplat.autoreconstructor.reconstructor import Reconstructor
+from completesplat.quantities import Share
 from completesplat.scene import Views
-from completesplat.settings.schema import Share
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import TensorDataclass
 
@@ -22,7 +22,7 @@ DepthRange = Float[Tensor, "batch 2"]
 
 @dataclass(frozen=True)
 class Reconstruction(TensorDataclass):
-    """Prediction of a reconstruction model from one image; regression baselines have no posterior."""
+    """Prediction of a reconstruction model from one image. Regression baselines have no posterior."""
 
     splatter_image: SplatterImage
     posterior: Posterior | None

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import recompute
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.schema import Few, Levels, Width, Widths
+from completesplat.quantities import Few, Levels, Width, Widths
 from completesplat.splatter_image import Parameterization, SplatterImage, from_channels, initialize_head, zeroed
 
 

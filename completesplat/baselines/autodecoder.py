@@ -57,7 +57,11 @@ class AutoDecoder(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *others)
 
     def codes_of(self, names: Sequence[str], frames: Int64[Tensor, " batch"]) -> Codes:
-        """Return the codes of images, given by sequence and place; raise CompleteSplatError if the table is full."""
+        """Return the codes of images, given by sequence and place.
+
+        Raises:
+            CompleteSplatError: the table is full.
+        """
         return self.codes[[self._row(*key) for key in zip(names, frames.tolist(), strict=True)]]
 
     def new_codes(self, count: int, seed: int) -> Codes:

@@ -106,7 +106,7 @@ def _places(gaussians: Gaussians, cameras: Cameras, layers: int) -> tuple[Int64[
 
 
 def _raw_depths(depths: LayerMaps, near: Tensor, far: Tensor, layer_depths: str) -> LayerMaps:
-    """Return raw values that activate close to these depths; the offset represents the rest."""
+    """Return raw values that activate close to these depths. The offset represents the rest."""
     shares = ((depths - near) / (far - near)).logit(CERTAINTY)
     if layer_depths == "independent":
         return shares

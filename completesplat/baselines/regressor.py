@@ -8,7 +8,7 @@ from torch import Tensor
 
 from completesplat.autoreconstructor.encoder import recompute
 from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
-from completesplat.settings.schema import Few, Levels, Share, Width, Widths
+from completesplat.quantities import Few, Levels, Share, Width, Widths
 from completesplat.splatter_image import Parameterization, from_channels, initialize_head
 
 
@@ -68,6 +68,6 @@ class SplatterImageUNet(ReconstructionModel):
         self.network = network
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Reconstruction:
-        """Reconstruct from sRGB images in [0, 1]; there is no posterior."""
+        """Reconstruct from sRGB images in [0, 1], without a posterior."""
         output = self.network(images * 2 - 1, timestep=0).sample
         return Reconstruction(from_channels(output.float(), self.parameterization), posterior=None)

@@ -22,10 +22,11 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.files import counted, printable, write_json
+from completesplat.quantities import Natural, Positive, Range
 from completesplat.results.measured import MODE_COLUMNS, evaluation_table
 from completesplat.results.runs import MODEL, read_record
 from completesplat.results.tables import records_table, show
-from completesplat.settings.schema import EvaluationSettings, Natural, Positive, Range, TestSettings
+from completesplat.settings.schema import EvaluationSettings, TestSettings
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.scoring import Scorer
 from completesplat.training.stopping import stopped_together
@@ -66,7 +67,7 @@ def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
     larger: SceneDataModule = instantiate(run_config.data, image_size=resolution, _convert_="all")
     if is_packed(data.root):
         settings_must_match(larger.root, larger.packed_settings())
-    larger.at_model_size = data
+    larger.low_resolution = data
     return larger
 
 

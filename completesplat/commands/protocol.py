@@ -50,7 +50,7 @@ def protocol(evaluation: Config, module: Any, data: Any, results: dict[str, Any]
         "name": evaluation["name"],
         "method": module.method,
         **data.describe(),
-        "image_size": (data.at_model_size or data).image_size,
+        "image_size": (data.low_resolution or data).image_size,
         "resolution": data.image_size,
         **({} if data.background is None else {"background": data.background}),
         "precision": evaluation["precision"],

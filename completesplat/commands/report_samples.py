@@ -16,9 +16,10 @@ from completesplat.commands import quieten
 from completesplat.commands.trained import TrainedModel, diffusion_of
 from completesplat.export.images import image_sheet, write_png
 from completesplat.files import counted, write_json
+from completesplat.quantities import Entries, Positive, Range, Share
 from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Entries, ModelSettings, Positive, Range, Share
+from completesplat.settings.schema import ModelSettings
 from completesplat.studies.calibration import calibration_rows, plot_calibration
 from completesplat.studies.controls import OnProgress, controls_rows, controls_strips, grid, plot_controls
 from completesplat.studies.depth import depth_rows, depth_strips

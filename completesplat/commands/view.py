@@ -182,5 +182,5 @@ def export(page: Any, path: Path) -> None:
 
     page.worker.wait()
     if not page.view.samples:
-        raise page.told or CompleteSplatError("there is nothing to export: give a scene, or an image and weights")
+        raise page.last_error or CompleteSplatError("there is nothing to export: give a scene, or an image and weights")
     print(write_viewer_page(page.server, path))

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import Encoder, vae_encoder
 from completesplat.autoreconstructor.pretrained import load_pretrained
-from completesplat.settings.schema import Few, Width, Widths
+from completesplat.quantities import Few, Width, Widths
 
 STABLE_DIFFUSION_SCALE = 0.18215
 """Scale of Stable Diffusion's latents (CompVis `configs/stable-diffusion/v1-inference.yaml`, scale_factor)."""

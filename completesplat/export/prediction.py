@@ -29,8 +29,8 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.geometry.trajectories import PATHS
+from completesplat.quantities import CameraPath, Format
 from completesplat.rasterizers import Rasterizer
-from completesplat.settings.schema import CameraPath, Format
 
 logger = logging.getLogger(__name__)
 

@@ -2,14 +2,12 @@
 
 import math
 from dataclasses import replace
-from typing import get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.geometry.cameras import Cameras, look_at
-from completesplat.settings.schema import CameraPath
 
 Vector = Float[Tensor, "3"]
 
@@ -62,7 +60,7 @@ def wobble(reference: Cameras, pivot: Vector, up: Vector, frames: int, radius: f
     return _looking_at(reference, eyes, pivot, up)
 
 
-PATHS = dict(zip(get_args(CameraPath), (orbit, swipe, wobble), strict=True))
+PATHS = {"orbit": orbit, "swipe": swipe, "wobble": wobble}
 
 
 def _full_turn(frames: int, like: Tensor) -> Float[Tensor, " frame"]:

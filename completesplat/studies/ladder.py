@@ -11,6 +11,7 @@ from torch import Tensor
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr, sharpness
 from completesplat.scene import SceneBatch
+from completesplat.scene_model import Sampling
 from completesplat.splatter_image import SplatterImage
 from completesplat.studies.controls import OnProgress, Scenes
 from completesplat.studies.samples import SampleRenderer, mean_over_scenes, near_reference
@@ -73,7 +74,8 @@ def _rungs(renderer: SampleRenderer, scene: SceneBatch, fits: int) -> Iterator[t
     yield "latent fitted", fitted([free_latent], LATENT_RATE, lambda: stage1.reconstructor(free_latent, features))
     if stage1.sees_views:
         yield "posterior, all views", start.gaussians(*inputs)
-    yield "samples", renderer.model.generate(images, *inputs, samples=renderer.samples, seed=renderer.seed)
+    sampling = Sampling(samples=renderer.samples, seed=renderer.seed)
+    yield "samples", renderer.model.generate(images, *inputs, sampling)
     yield "reference alone", stage1.reconstructor(alone.mode(), features).map(Tensor.detach).gaussians(*inputs)
 
 

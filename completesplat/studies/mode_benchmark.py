@@ -12,7 +12,7 @@ from torch import Tensor
 from completesplat.autoreconstructor.encoder import Features
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
+from completesplat.data.loading.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.diffusion.sampling import in_parts
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.export.images import Sheet, SheetCell, image_sheet, write_png

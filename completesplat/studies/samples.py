@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -17,6 +17,7 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.metrics import PSNR_LIMIT
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
+from completesplat.scene_model import Sampling
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,14 @@ class SampleRenderer:
 
     @torch.no_grad()
     def render(self, scene: SceneBatch, **settings: Any) -> Rendering:
-        """Render colour, depth and opacity [sample view] of one scene (a batch of one); settings are `generate`'s."""
-        inputs = scene.reference.images, scene.reference.cameras, scene.depth_range
-        gaussians = self.model.generate(*inputs, **{"samples": self.samples, "seed": self.seed, **settings})
+        """Render colour, depth and opacity [sample view] of one scene (a batch of one).
+
+        Args:
+            **settings: fields of `Sampling`.
+        """
+        reference = scene.reference
+        sampling = replace(Sampling(samples=self.samples, seed=self.seed), **settings)
+        gaussians = self.model.generate(reference.images, reference.cameras, scene.depth_range, sampling)
         return self.rasterizer(gaussians, scene.all_views().cameras[0].repeated(len(gaussians.means)))
 
 

@@ -27,9 +27,9 @@ from completesplat.files import by_numbers, safe_name
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.scoring import MODEL, REGIONS, Evaluation
+from completesplat.quantities import Share
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
-from completesplat.settings.schema import Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 
@@ -135,11 +135,11 @@ class Scorer(LightningModule):
     def test_step(self, scenes: SceneBatch, index: int) -> None:
         evaluation = self.evaluation
         names = scenes.names
-        seen = scenes if scenes.seen is None else scenes.seen
+        model_input = scenes if scenes.low_resolution is None else scenes.low_resolution
         seeds = [evaluation.scene_seed(name) for name in names]
-        gaussians = self.timed("inference", lambda: self.draw(seen, seeds, evaluation.samples), len(names))
+        gaussians = self.timed("inference", lambda: self.draw(model_input, seeds, evaluation.samples), len(names))
         truth = scenes.all_views()
-        cameras = seen.all_views().cameras
+        cameras = model_input.all_views().cameras
         for b, name in enumerate(names):
             samples = gaussians[b * evaluation.samples : (b + 1) * evaluation.samples]
             rendered = self.timed("rendering", partial(self.render_from, samples, cameras[b]), evaluation.samples)

@@ -16,7 +16,7 @@ from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.access import show_status
 from completesplat.viewer.page import SHOWN, Page
-from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps, preview_of
+from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_completion_controls, nearest_steps, preview_of
 from completesplat.viewer.sample import Sample
 
 PAUSE = 0.2  # seconds between two images of a scene that forms
@@ -29,7 +29,7 @@ class Completion:
         self.page = page
         self.model = model
         self.photograph: tuple[str, Photograph] | None = None
-        self.controls = add_drawing(page.server.gui, model, start)
+        self.controls = add_completion_controls(page.server.gui, model, start)
         page.complete = self.complete
         self.controls.draw.on_click(lambda event: self.request(event.client))
         for name in SLIDERS:

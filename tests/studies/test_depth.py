@@ -42,9 +42,10 @@ class Splats(CompleteSplat):
         torch.nn.Module.__init__(self)
         self.shift = shift
 
-    def generate(self, *_, samples=1, skip_weight=1.0, **__):
+    def generate(self, images, cameras, depth_range, sampling):
+        samples = sampling.samples
         splats = some_gaussians(samples, scale=2.0, opacity=0.9)
-        depth = AWAY + (1 - skip_weight) * self.shift * torch.arange(samples)[:, None, None]
+        depth = AWAY + (1 - sampling.skip_weight) * self.shift * torch.arange(samples)[:, None, None]
         thin = splats.scales * torch.tensor([1, 1, 1e-3])
         return replace(splats, means=depth * torch.tensor([0.0, 0, 1]).expand(samples, 2, 3), scales=thin)
 

@@ -7,7 +7,7 @@ import torch
 from scenes_for_training import scene_batch
 from support import tiny_generator
 
-from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
+from completesplat.data.loading.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras

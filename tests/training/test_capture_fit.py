@@ -6,14 +6,14 @@ from PIL import Image
 from support import compose_config, interrupted_at, strict_json, write_capture
 
 from completesplat.commands.fit import refuse_without_effect
-from completesplat.data.captures.capture import CapturedFrame
+from completesplat.data.captures.captured_frames import CapturedFrame
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_transforms
 from completesplat.errors import CompleteSplatError
 from completesplat.export import prediction
 from completesplat.export.ply import read_ply
 from completesplat.export.reading import read_gaussians
-from completesplat.training.capture import CaptureFit
+from completesplat.training.capture_fit import CaptureFit
 
 FRAMES, STEPS = 9, 8
 FITTING = {"initial": 200, "most": 260, "refine_every": 2}

@@ -29,8 +29,9 @@ from completesplat.errors import CompleteSplatError, TensorFileError, WeightsErr
 from completesplat.files import SHORT, atomic_path, make_folder, printable, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
+from completesplat.quantities import Entries, Few, Natural, Range, Width
 from completesplat.scene_model import SceneModel
-from completesplat.settings.schema import Entries, Few, Natural, Range, Width, violations
+from completesplat.settings.schema import violations
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.weights import RUN_WEIGHTS, from_hub, read_small
 from completesplat.weights.checkpoint_reading import mismatch, read_tensor_file

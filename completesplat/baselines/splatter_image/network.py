@@ -41,7 +41,7 @@ class ScaledConvolution(nn.Conv2d):
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions beside a shortcut, then optional attention with one head; each sum is scaled by sqrt(1/2)."""
+    """Two convolutions beside a shortcut, then optional attention with one head. Each sum is scaled by sqrt(1/2)."""
 
     def __init__(self, inputs: int, outputs: int, scale: str = "", attends: bool = False) -> None:
         super().__init__()

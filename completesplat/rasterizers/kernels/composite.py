@@ -338,7 +338,7 @@ def alpha_at(exponent, log2_min_alpha, max_alpha):
 
 @helper
 def attenuate(transmittance, alpha, min_transmittance):
-    """Return weight, transmittance behind, and a mask of contributing pixels; a pixel that stops is left with 0."""
+    """Return weight, transmittance behind (0 if a pixel stops), and a mask of the pixels that are contributed to."""
     weight = transmittance * alpha
     behind = transmittance - weight
     passes = behind > min_transmittance

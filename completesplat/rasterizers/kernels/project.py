@@ -66,7 +66,7 @@ def prepare(
 
 @helper
 def lane_shapes(quaternions, scales, start, last):
-    """Return quaternions and scales of the Gaussians start..start + 15; the last one repeats beyond the end."""
+    """Return quaternions and scales of the Gaussians start..start + 15. The last one repeats beyond the end."""
     quaternion = gather_four(quaternions.reshape(-1), 4, 0, start, last)
     return quaternion, gather_three(scales.reshape(-1), 3, 0, start, last)
 
@@ -150,7 +150,7 @@ def depth_key(z):
 
 @helper
 def radix_sort(depths, keys, order, count):
-    """Sort depths[:count], which share the memory of keys[0], stably; the result is order[PASSES % 2]."""
+    """Sort depths[:count], which share the memory of keys[0], stably. The result is order[PASSES % 2]."""
     starts = np.zeros((PASSES, BUCKETS), np.int32)
     for i in range(count):
         order[0, i] = i

@@ -37,7 +37,7 @@ LARGEST_SIDE = 2.0
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics in pixels with OpenCV's distortion; the outer corner of the top left pixel is at (0, 0)."""
+    """Intrinsics in pixels with OpenCV's distortion, where the outer corner of the top left pixel is at (0, 0)."""
 
     focal: tuple[float, float]  # along x and y
     center: tuple[float, float]  # the principal point (x, y)
@@ -56,8 +56,10 @@ class Lens:
 
     def resized(self, image_size: tuple[int, int]) -> "Lens":
         """Return the lens of images that are resized to (height, width)."""
-        down, across = (new / old for new, old in zip(image_size, self.image_size, strict=True))
-        focal, center = ((x * across, y * down) for x, y in (self.focal, self.center))
+        down = image_size[0] / self.image_size[0]
+        across = image_size[1] / self.image_size[1]
+        focal = (self.focal[0] * across, self.focal[1] * down)
+        center = (self.center[0] * across, self.center[1] * down)
         return replace(self, focal=focal, center=center, image_size=image_size)
 
 
@@ -81,7 +83,7 @@ class CapturedFrame:
     orientation: Literal["ignored", "refused", "unknown"] = "refused"
 
     def camera(self) -> Cameras:
-        """Return the pinhole camera (float64) of the undistorted image; errors as in `undistorted_lens`."""
+        """Return the pinhole camera (float64) of the undistorted image, with the errors of `undistorted_lens`."""
         with errors_at(self.image, frame=self.number):
             lens = undistorted_lens(self.lens)
         fx, fy = lens.focal
@@ -114,10 +116,12 @@ class CapturedFrame:
                 mask = files.decode_image(self.mask, str(self.mask), "L")
                 mask = mask.resize(image.size, Image.Resampling.BILINEAR)
             image = undistort(image, self.lens)
-            return image, Image.new("L", image.size, 255) if mask is None else undistort(mask, self.lens)
+            if mask is None:
+                return image, Image.new("L", image.size, 255)
+            return image, undistort(mask, self.lens)
 
     def check(self) -> object:
-        """Check the headers of image and mask; `read` also finds damaged contents.
+        """Check the headers of image and mask. (`read` also finds damaged contents.)
 
         Returns:
             The EXIF orientation by which the image is to be turned; None: its pixels stay as they are stored.
@@ -159,12 +163,12 @@ class Capture:
 
 
 def in_order(frames: Sequence[CapturedFrame]) -> tuple[CapturedFrame, ...]:
-    """Sort frames by file name, `r_2` before `r_10`; refuse fewer than 6 frames, or an image that occurs twice."""
+    """Sort frames by file name, `r_2` before `r_10`, and refuse fewer than 6 frames, or an image that occurs twice."""
     if len(frames) < FEWEST_FRAMES:
         raise TooFewFrames(f"{len(frames)} frames; a capture needs at least {FEWEST_FRAMES}")
-    seen: dict[Path, int] = {}
+    numbers: dict[Path, int] = {}
     for frame in frames:
-        first = seen.setdefault(frame.image.resolve(), frame.number)
+        first = numbers.setdefault(frame.image.resolve(), frame.number)
         if first != frame.number:
             raise BadAnnotation(f"the same image as frame {first}: {frame.image}", frame=frame.number)
     return tuple(sorted(frames, key=lambda frame: by_numbers(frame.image)))
@@ -195,7 +199,8 @@ def fit_lens(frame: CapturedFrame) -> CapturedFrame:
 
 def _same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Return whether one size is a multiple of the other, up to the rounding of a side."""
-    down, across = (side / other_side for side, other_side in zip(size, other, strict=True))
+    down = size[0] / other[0]
+    across = size[1] / other[1]
     return abs(down - across) <= max(1, down, across) / min(other)
 
 
@@ -211,15 +216,16 @@ def undistorted_lens(lens: Lens) -> Lens:
     pycolmap = import_pycolmap()
     height, width = lens.image_size
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), _distorted(lens))
-    size = pinhole.height, pinhole.width
-    sides = size[0] / height, size[1] / width
-    if sides[0] * sides[1] < SMALLEST_AREA or max(sides) >= LARGEST_SIDE:
+    down = pinhole.height / height
+    across = pinhole.width / width
+    if down * across < SMALLEST_AREA or max(down, across) >= LARGEST_SIDE:
         raise BadCamera(f"distortion {lens.distortion} leaves no usable image")
     fx, fy, x, y = map(float, pinhole.params)
-    return replace(lens, focal=(fx, fy), center=(x, y), image_size=size, distortion=(0.0,) * 5)
+    return Lens(focal=(fx, fy), center=(x, y), image_size=(pinhole.height, pinhole.width))
 
 
 def undistort(image: Image.Image, lens: Lens) -> Image.Image:
+    """Return an undistorted image, or the image itself if its lens does not distort."""
     if not any(lens.distortion):
         return image
     pycolmap = import_pycolmap()

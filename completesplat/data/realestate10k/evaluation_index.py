@@ -29,7 +29,7 @@ class EvaluationIndex:
 class ChosenSource(SequenceSource):
     """Clips by the name of their test, which is the clip's key, or `KEY#1`, `KEY#2` ... for several tests of a clip.
 
-    `views` has reference and targets by name if there is an index; see `SequenceSource` for the other attributes.
+    `views` has reference and targets by name if there is an index.
     """
 
     def __init__(self, source: SequenceSource, clips: dict[str, str], views: dict[str, Choice], listed: int) -> None:
@@ -39,7 +39,7 @@ class ChosenSource(SequenceSource):
         self._clips = clips
 
     def read(self, name: str) -> PosedSequence:
-        """Return the clip of a test; refuse it if it lacks a frame of the test's views."""
+        """Return the clip of a test, or refuse it if it lacks a frame of the test's views."""
         sequence = replace(self._source.read(self._clips[name]), name=name)
         reference, targets = self.views.get(name, (sequence.frames[0], []))
         for frame in (reference, *targets):
@@ -89,7 +89,7 @@ def read_keys(path: Path) -> list[str]:
 
 
 def choose_clips(source: SequenceSource, index: EvaluationIndex | None, listed: list[str] | None) -> ChosenSource:
-    """Select the clips that both lists name; a list that is None names all.
+    """Select the clips that both lists name, where None is a list of all.
 
     Log the number of tests and the clips that are left out, as a warning if some of them are missing in the data.
     """
@@ -100,40 +100,46 @@ def choose_clips(source: SequenceSource, index: EvaluationIndex | None, listed: 
     if index is not None:
         left_out["null in the index"] = [key for key in tests if not tests[key]]
         keys = [key for key in keys if tests.get(key) != []]
-    wanted = {"index": None if index is None else [key for key in tests if tests[key]], "list": listed}
+    wanted = {}
+    if index is not None:
+        wanted["index"] = [key for key in tests if tests[key]]
+    if listed is not None:
+        wanted["list"] = listed
+    known = set(source.names)
     for what, names in wanted.items():
-        if names is not None:
-            selected = set(names)
-            known = set(source.names)
-            missing = [name for name in dict.fromkeys(names) if name not in known]
-            left_out[f"in the {what}, not in the data"] = missing
-            left_out[f"not in the {what}"] = [key for key in keys if key not in selected]
-            keys = [key for key in keys if key in selected]
-            absent.update(missing)
+        selected = set(names)
+        missing = [name for name in dict.fromkeys(names) if name not in known]
+        left_out[f"in the {what}, not in the data"] = missing
+        left_out[f"not in the {what}"] = [key for key in keys if key not in selected]
+        keys = [key for key in keys if key in selected]
+        absent.update(missing)
     clips, views = _named_tests(keys, tests)
     _report(len(clips), len(keys), left_out, logging.WARNING if absent else logging.INFO)
     return ChosenSource(source, clips, views, len(clips) + len(absent))
 
 
 def _named_tests(keys: Sequence[str], tests: Mapping[str, list[Choice]]) -> tuple[dict[str, str], dict[str, Choice]]:
-    """Return clips and views by the name of their test; clips without an index are their own tests."""
+    """Return clips and views by the name of their test. Clips without an index are their own tests."""
     clips = dict[str, str]()
     views = dict[str, Choice]()
     for key in keys:
         choices = tests.get(key, [])
         names = [key] if len(choices) < 2 else [f"{key}#{number}" for number in range(1, len(choices) + 1)]
-        clips |= dict.fromkeys(names, key)
-        views |= dict(zip(names, choices, strict=False))  # without an index there are no choices
+        clips.update(dict.fromkeys(names, key))
+        views.update(zip(names, choices, strict=False))  # without an index there are no choices
     return clips, views
 
 
 def _report(scenes: int, clips: int, left_out: Mapping[str, list[str]], level: int) -> None:
     """Log the number of tests, and the clips that are left out by reason."""
-    parts = [
-        f"{len(names)} {reason}" + (f" ({first_names(names)})" if names else "") for reason, names in left_out.items()
-    ]
-    counted = f"{scenes} scenes of {clips} clips" if clips < scenes else f"{clips} clips"
-    logger.log(level, "%s to test%s", counted, f"; left out: {', '.join(parts)}" if parts else "")
+    parts = []
+    for reason, names in left_out.items():
+        examples = f" ({first_names(names)})" if names else ""
+        parts.append(f"{len(names)} {reason}{examples}")
+    message = f"{scenes} scenes of {clips} clips to test" if clips < scenes else f"{clips} clips to test"
+    if parts:
+        message = f"{message}; left out: {', '.join(parts)}"
+    logger.log(level, message)
 
 
 def _from_table(content: object) -> EvaluationIndex:
@@ -143,11 +149,14 @@ def _from_table(content: object) -> EvaluationIndex:
     views = dict[str, list[Choice]]()
     for key, value in content.items():
         with errors_at(sequence=key):
-            entries = [] if value is None else value if isinstance(value, list) else [value]
-            views[key] = [_choice(entry) for entry in entries]
-            if value is not None:
-                scored = any(SCORED in entry for entry in entries)
-                forms["latentSplat" if isinstance(value, list) else "MVSplat360" if scored else "pixelSplat"] = None
+            if value is None:
+                views[key] = []
+            elif isinstance(value, list):
+                views[key] = [_choice(entry) for entry in value]
+                forms["latentSplat"] = None
+            else:
+                views[key] = [_choice(value)]
+                forms["MVSplat360" if SCORED in value else "pixelSplat"] = None
             if len(forms) > 1:
                 raise BadAnnotation(f"formats of several works: {', '.join(forms)}")
     if not any(views.values()):

@@ -3,6 +3,7 @@
 import gzip
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -64,11 +65,28 @@ def write_frame(
     }
 
 
+def in_mode(image: Path, mode: str) -> Path:
+    """Return the path of an image in a mode of the hidden part, given that of the image in `images`.
+
+    Beside its `images`, a sequence has a folder with the same images in each mode, named after the mode.
+    """
+    return image.parent.parent / mode / image.name
+
+
 def sequence_annotation(category: str, name: str, points: int) -> Annotation:
-    """Return the annotation of a sequence without a video; with points, its cloud is `name`/pointcloud.ply."""
-    cloud = {"path": f"{category}/{name}/pointcloud.ply", "quality_score": 1.0, "n_points": points}
-    sequence = {"sequence_name": name, "category": category, "video": None, "point_cloud": cloud if points else None}
-    return sequence | {"viewpoint_quality_score": 1.0}
+    """Return the annotation of a sequence without a video. If it has points, its cloud is `name`/pointcloud.ply."""
+    cloud = {
+        "path": f"{category}/{name}/pointcloud.ply",
+        "quality_score": 1.0,
+        "n_points": points,
+    }
+    return {
+        "sequence_name": name,
+        "category": category,
+        "video": None,
+        "point_cloud": cloud if points else None,
+        "viewpoint_quality_score": 1.0,
+    }
 
 
 def write_points(path: Path, points: Float[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"]) -> None:
@@ -86,19 +104,22 @@ def write_annotations(category: Path, frames: Sequence[Annotation], sequences: S
 
 
 def write_set_list(category: Path, subset: str, lists: Mapping[str, Sequence[Sequence[object]]]) -> None:
-    """Write set list `subset`; `lists` has [sequence, frame number, image] by split."""
+    """Write set list `subset`, where `lists` has [sequence, frame number, image] by split."""
     (category / "set_lists").mkdir()
     write_text(category / "set_lists" / f"set_lists_{subset}.json", json.dumps(lists))
 
 
 def is_written(description: Path, parameters: Mapping[str, Any]) -> bool:
-    """Return whether the folder of a description has data of these parameters; raise DataError if of others."""
+    """Return whether the folder of a description has data of these parameters.
+
+    Raises:
+        DataError: the folder holds something else.
+    """
     if not description.parent.exists():
         return False
-    try:
+    existing = None
+    with suppress(OSError, ValueError):
         existing = json.loads(description.read_text())
-    except (OSError, ValueError):
-        existing = None
     if existing != parameters:
         raise DataError(f"{description.parent} already holds something else: remove it or choose another folder")
     return True

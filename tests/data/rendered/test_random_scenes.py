@@ -8,11 +8,12 @@ import meshes
 import numpy as np
 import pytest
 import torch
+from completesplat.data.rendered.assets import BrokenMesh, check_named_files, find_meshes
 from support import change_json, write_capture
 
 from completesplat.data.captures.transforms_json import read_cameras, read_transforms
 from completesplat.data.rendered import rendering
-from completesplat.data.rendered.drawing import (
+from completesplat.data.rendered.random_scenes import (
     PAINTS,
     draw_back,
     draw_cameras,
@@ -21,7 +22,7 @@ from completesplat.data.rendered.drawing import (
     room_size,
     textures_of,
 )
-from completesplat.data.rendered.rendering import OBJECT, BrokenMesh, check_named_files, find_meshes
+from completesplat.data.rendered.rendering import OBJECT
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.tensors import stack
@@ -174,7 +175,7 @@ def test_a_mesh_that_another_one_renames_is_not_twice_in_the_data(tmp_path, monk
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes/chair.glb").touch()
     written = Mock()
-    monkeypatch.setattr(rendering.writing, "write_annotations", written)
+    monkeypatch.setattr(rendering.category_writers, "write_annotations", written)
     for names in (["chair"], ["chair.glb", "chair.obj"]):
         objects = find_meshes(tmp_path / "meshes")
         for mesh in objects:

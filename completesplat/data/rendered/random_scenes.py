@@ -15,7 +15,7 @@ from completesplat.data.captures.transforms_json import read_cameras
 from completesplat.data.validation import require_file
 from completesplat.errors import CompleteSplatError, MissingFile
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
-from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
+from completesplat.quantities import Entries, Natural, Positive, Range, Side
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 # Distance at which the ball around the object touches the image's border, times this.
@@ -25,7 +25,7 @@ ROOM = 1.3
 SMALLEST_ROOM = 3.0  # half size of a room: relative to the farthest camera, and at least
 TEXTURES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 ENVIRONMENTS = (".hdr", ".exr")
-WHITE_FLOOR = 0.5, 1.1
+WHITE_FLOOR = (0.5, 1.1)
 ASIDE = 45.0
 """Largest angle in degrees between the first camera's azimuth and the object's front."""
 
@@ -48,7 +48,7 @@ Angles = Float[np.ndarray, " view"]
 
 
 class RenderSettings(TypedDict):
-    """Settings of all scenes; see `draw_cameras`, `draw_light` and `draw_surface`."""
+    """Settings of all scenes, for `draw_cameras`, `draw_light` and `draw_surface`."""
 
     views: Annotated[int, Range(2, 1000)]
     size: Side
@@ -64,7 +64,7 @@ class RenderSettings(TypedDict):
 
 
 def draw_rendered_scene(name: str, settings: RenderSettings) -> tuple[dict[str, Any], list[Cameras]]:
-    """Draw surroundings and cameras by the seed and an object's name; return them for `_scene_script.py`."""
+    """Draw surroundings and cameras by the seed and an object's name, and return them for `_scene_script.py`."""
     digest = hashlib.sha256(name.encode()).digest()
     rng = np.random.default_rng([settings["seed"], int.from_bytes(digest[:8])])
     views = settings["views"]
@@ -85,16 +85,18 @@ def draw_rendered_scene(name: str, settings: RenderSettings) -> tuple[dict[str, 
 
 
 def _view(camera: Cameras) -> dict[str, Any]:
-    focal = camera.intrinsics[0, 0].item()
-    center = camera.intrinsics[:2, 2].tolist()
-    size = camera.image_size[::-1]
-    return {"world_to_camera": camera.world_to_camera.tolist(), "focal": focal, "center": center, "size": size}
+    return {
+        "world_to_camera": camera.world_to_camera.tolist(),
+        "focal": camera.intrinsics[0, 0].item(),
+        "center": camera.intrinsics[:2, 2].tolist(),
+        "size": camera.image_size[::-1],
+    }
 
 
 def draw_cameras(
     rng: np.random.Generator, kind: str, views: int, fov: Sequence[float], size: int, front: float | None = None
 ) -> list[Cameras]:
-    """Draw the cameras of an object whose farthest vertex has distance 1 from the origin; z points up.
+    """Draw the cameras of an object whose farthest vertex has distance 1 from the origin, with z up.
 
     Args:
         kind: `turn`: around the object at varying heights, as people film for CO3D; `hemisphere`: from random
@@ -188,7 +190,9 @@ def draw_back(rng: np.random.Generator, first: Cameras, hidden: str) -> dict[str
     if hidden == "none":
         return None
     drawn = str(rng.choice(list(PAINTS), p=[paint.chance for paint in PAINTS.values()]))
-    names = [drawn, *(name for name in PAINTS if name != drawn and hidden == "modes")]
+    names = [drawn]
+    if hidden == "modes":
+        names.extend(name for name in PAINTS if name != drawn)
     distance = first.centers.norm().item()
     toward = (first.centers / distance).tolist()
     colors = [PAINTS[name].color for name in names]
@@ -196,6 +200,7 @@ def draw_back(rng: np.random.Generator, first: Cameras, hidden: str) -> dict[str
 
 
 def textures_of(folder: Path) -> list[str]:
+    """Return the paths of the images in a folder, at least one."""
     paths = [path for path in folder.glob("[!.]*") if path.suffix.lower() in TEXTURES and path.is_file()]
     if not paths:
         raise MissingFile(f"no textures there ({', '.join(TEXTURES)})", str(folder))

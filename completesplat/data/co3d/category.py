@@ -2,36 +2,28 @@
 
 import logging
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 from completesplat.data.co3d.annotations import CO3DFrame, CO3DVideo, Frames, read_frames, read_videos
-from completesplat.data.sequences import SPLITS, overlaps, shared_names, split_by_hash
+from completesplat.data.splits import (
+    SPLITS,
+    ListedFrames,
+    SeededSplit,
+    overlaps,
+    shared_names,
+    split_by_hash,
+    split_by_seed,
+)
 from completesplat.data.validation import field, path_below, read_json
 from completesplat.errors import BadAnnotation, DataError, SharedSequences, errors_at, refused_to
-from completesplat.files import counted
-
-Listed = dict[str, set[tuple[str, int]]]
-"""(sequence name, frame number) of each split."""
 
 logger = logging.getLogger(__name__)
 
 
-class SeededSplit(NamedTuple):
-    """Shares of the sequences that are held out by seed, at least one sequence for each share.
-
-    Without a set list, they are shares of all sequences; without validation in a list, `val_fraction` is taken from
-    training.
-    """
-
-    val_fraction: float
-    test_fraction: float
-    split_seed: int
-
-
 def set_list_path(category: Path, subset: str | None) -> Path | None:
-    """Return the path of the set list `subset`, which must exist; None if the sequences are split by seed."""
+    """Return the path of the set list `subset`, which must exist, or None if the sequences are split by seed."""
     if subset is None:
         return None
     folder = category / "set_lists"
@@ -43,14 +35,14 @@ def set_list_path(category: Path, subset: str | None) -> Path | None:
     return folder / f"set_lists_{subset}.json"
 
 
-def read_set_list(path: Path, refused: list[DataError]) -> Listed:
-    """Read the frames of each split; errors of single entries are added to `refused`.
+def read_set_list(path: Path, refused: list[DataError]) -> ListedFrames:
+    """Read the frames of each split, and add the errors of single entries to `refused`.
 
     Raises:
         DataError: the file is missing, unreadable, or has no list for a split.
     """
     content = read_json(path)
-    splits: Listed = {}
+    splits: ListedFrames = {}
     for split in SPLITS:
         with errors_at(path):
             members = field(content, split, list)
@@ -63,7 +55,7 @@ def read_set_list(path: Path, refused: list[DataError]) -> Listed:
     return splits
 
 
-def remove_test_sequences(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, list[str]]:
+def remove_test_sequences(path: Path, listed: ListedFrames, rule: SeededSplit) -> tuple[ListedFrames, list[str]]:
     """Return a set list whose splits share no sequence, and the names removed from validation.
 
     CO3D's `fewview_train` tests on all its training sequences (facebookresearch/co3d, issue 49); Splatter Image uses
@@ -77,33 +69,18 @@ def remove_test_sequences(path: Path, listed: Listed, rule: SeededSplit) -> tupl
     shared = shared_names(names)
     if any("test" in pair for pair in shared):
         advice = "choose another data.subset, or set data.allow_shared_sequences=true"
-        raise SharedSequences("; ".join([*overlaps(shared), advice]), str(path))
+        raise SharedSequences(f"{'; '.join(overlaps(shared))}; {advice}", str(path))
     lost = names["train"] & names["val"]
     train = listed["train"]
     val = {frame for frame in listed["val"] if frame[0] not in lost}
     if not val and len(names["train"]) > 1:
         held_out = set(split_by_hash(sorted(names["train"]), rule.val_fraction, rule.split_seed)[1])
-        logger.warning(
-            "%s lists nothing for validation alone: %d of %d training sequences validate, by seed %d",
-            *(path, len(held_out), len(names["train"]), rule.split_seed),
-        )
+        message = "%s lists nothing for validation alone: %d of %d training sequences validate, by seed %d"
+        logger.warning(message, path, len(held_out), len(names["train"]), rule.split_seed)
         val = {frame for frame in train if frame[0] in held_out}
         lost = lost - held_out
         train = train - val
     return {"train": train, "val": val, "test": listed["test"]}, sorted(lost)
-
-
-def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Listed:
-    """Split at least three sequences by seed, each as a whole; a `test_fraction` of 1 tests all, however many."""
-    if len(frames) < 3 and rule.test_fraction < 1:
-        objects = counted(len(frames), "object")
-        raise DataError(f"{objects} cannot be split into train, val and test; write a list (data.splits=FILE)")
-    kept = 1 if rule.test_fraction < 1 else 0  # at least, in training and in validation
-    rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.split_seed, 2 * kept)
-    # The hashes of the remaining names lie above the test fraction; validation gets the next interval.
-    train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.split_seed, kept)
-    names = {"train": train, "val": val, "test": test}
-    return {split: {(name, number) for name in names[split] for number in frames[name]} for split in SPLITS}
 
 
 class Filters(NamedTuple):
@@ -137,9 +114,11 @@ class SplitMembers(NamedTuple):
 
     def without(self, names: Collection[str], reason: str) -> "SplitMembers":
         """Return the split without some sequences, which are left out for this reason."""
-        frames = {name: frames for name, frames in self.frames.items() if name not in names}
         lost = [name for name in self.frames if name in names]
-        return self._replace(frames=frames, left_out={**self.left_out, **({reason: lost} if lost else {})})
+        if not lost:
+            return self
+        frames = {name: frames for name, frames in self.frames.items() if name not in names}
+        return self._replace(frames=frames, left_out=self.left_out | {reason: lost})
 
 
 class Category(NamedTuple):
@@ -188,7 +167,7 @@ def read_category(
 
 
 def _refuse_unannotated(frames: Frames, videos: Collection[str], file: Path, refused: list[DataError]) -> None:
-    """Remove the frames of sequences that have no annotation; refuse those sequences, each once."""
+    """Remove the frames of sequences that have no annotation, and refuse those sequences, each once."""
     known = {error.sequence for error in refused if error.frame is None}
     for name in sorted(frames.keys() - videos):
         if name not in known:
@@ -213,18 +192,25 @@ def _members(
     for name, number in sorted(listed):
         if number in frames.get(name, ()):
             members.setdefault(name, []).append(frames[name][number])
-    out = {n: why for n in members if (why := _reason_to_leave_out(len(members[n]), videos[n], filters))}
+    out: dict[str, str] = {}
+    for name, frames_of_split in members.items():
+        reason = _reason_to_leave_out(len(frames_of_split), videos[name], filters)
+        if reason is not None:
+            out[name] = reason
     most = filters.most_training_sequences
     if split == "train" and most is not None:
         best = sorted(members.keys() - out.keys(), key=lambda name: (-(videos[name].viewpoint_quality or 0.0), name))
-        out |= dict.fromkeys(best[most:], f"not among the {most} with the best viewpoint quality")
+        out.update(dict.fromkeys(best[most:], f"not among the {most} with the best viewpoint quality"))
+    left_out: dict[str, list[str]] = {}
+    for name, reason in out.items():
+        left_out.setdefault(reason, []).append(name)
     names = [name for name in members if name not in out]
     return SplitMembers(
         listed=len({name for name, _ in listed}),
         frames={name: members[name] for name in names},
         captured={name: list(frames[name].values()) for name in names},
         point_clouds={name: videos[name].point_cloud for name in names},
-        left_out={why: [name for name in out if out[name] == why] for why in dict.fromkeys(out.values())},
+        left_out=left_out,
     )
 
 

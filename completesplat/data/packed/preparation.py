@@ -3,19 +3,22 @@
 import hashlib
 import json
 import logging
+import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import pyarrow as pa
 from rich.filesize import decimal
 from rich.progress import Progress
 
 from completesplat.data.packed.manifest import (
+    FORMAT,
     HEADER,
     MANIFEST,
     PackedManifest,
@@ -27,7 +30,9 @@ from completesplat.data.packed.manifest import (
     is_packed,
 )
 from completesplat.data.packed.rows import CODECS, SCHEMA, encode_image, to_row
-from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource
+from completesplat.data.sequences import PosedSequence, SequenceSource
+from completesplat.data.splits import SPLITS
+from completesplat.data.tolerance import ErrorTolerance
 from completesplat.data.validation import field, parsed, read_json
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import CompleteSplatError, DataError, TooFewFrames, refused_to
@@ -37,8 +42,6 @@ from completesplat.weights import sha256_of
 FEWEST_FRAMES = 2
 UNFINISHED = ".unfinished"
 PLAN = "plan.json"
-
-OnBad = Literal["raise", "skip"]
 
 logger = logging.getLogger(__name__)
 
@@ -63,18 +66,18 @@ class ShardRecord:
 
 @dataclass(frozen=True)
 class ShardWriter:
-    """Writer of shards in `folder`; it is pickled for the worker processes, with its sources."""
+    """Writer of shards in `folder`. It is pickled for the worker processes, with its sources."""
 
     sources: Mapping[str, SequenceSource]
     folder: Path
     codec: str
-    on_bad: OnBad
+    tolerance: ErrorTolerance
 
     def write(self, plan: ShardPlan) -> ShardRecord:
         """Write a shard and then its record, each atomically.
 
         Raises:
-            DataError: something cannot be read, and `on_bad` is "raise".
+            DataError: something cannot be read, and nothing may be skipped.
             DiskError: the disk is full.
         """
         path = self.folder / plan.file
@@ -108,20 +111,19 @@ class ShardWriter:
         return to_row(sequence, usable, images)
 
     def _refuse(self, refused: list[Refusal], error: DataError) -> None:
-        if self.on_bad == "raise":
-            raise error
+        self.tolerance.check(error)
         refused.append(Refusal.of(error))
 
     def finished_record(self, plan: ShardPlan) -> ShardRecord | None:
-        """Return the record of a shard that an earlier run wrote (without errors, if `on_bad` is "raise"), or None."""
+        """Return the record of a shard that an earlier run wrote, or None. It has no errors if none may be skipped."""
         path = self.folder / plan.file
-        try:
+        with suppress(DataError):
             record: ShardRecord = parsed(ShardRecord, read_json(_record_path(path)))
-        except DataError:
-            return None
-        whole = path.is_file() and path.stat().st_size == record.shard.bytes and record.shard.file == plan.file
-        refused = record.refused and self.on_bad == "raise"
-        return record if whole and record.names == plan.names and not refused else None
+            same = record.shard.file == plan.file and record.names == plan.names
+            whole = path.is_file() and path.stat().st_size == record.shard.bytes
+            accepted = not record.refused or self.tolerance.on_bad == "skip"
+            return record if same and whole and accepted else None
+        return None
 
 
 def _record_path(path: Path) -> Path:
@@ -129,22 +131,22 @@ def _record_path(path: Path) -> Path:
 
 
 def _plans(sources: Mapping[str, SequenceSource], sequences_per_shard: int) -> list[ShardPlan]:
-    """Assign sequences to shards; a group of a source stays in one shard if it fits."""
+    """Assign sequences to shards. A group of a source stays in one shard if it fits."""
     plans = []
     for split, source in sources.items():
         shards: list[tuple[str, ...]] = []
         for group in source.groups(source.names):
             # A group that exceeds a shard is divided into nearly equal parts.
-            count = -(-len(group) // sequences_per_shard)
-            edges = [round(len(group) * number / count) for number in range(count + 1)] if count else []
+            count = math.ceil(len(group) / sequences_per_shard)
+            edges = [round(len(group) * number / count) for number in range(count + 1) if count]
             for start, end in pairwise(edges):
                 names = tuple(source.names[index] for index in group[start:end])
                 if shards and len(shards[-1]) + len(names) <= sequences_per_shard:
                     shards[-1] += names
                 else:
                     shards.append(names)
-        files = [f"{split}-{number:05d}-of-{len(shards):05d}.arrow" for number in range(len(shards))]
-        plans += [ShardPlan(file, split, names) for file, names in zip(files, shards, strict=True)]
+        for number, names in enumerate(shards):
+            plans.append(ShardPlan(f"{split}-{number:05d}-of-{len(shards):05d}.arrow", split, names))
     return plans
 
 
@@ -155,7 +157,7 @@ def prepare(
     codec: str = "bmp",
     sequences_per_shard: int = 32,
     workers: int | None = None,
-    policy: tuple[OnBad, float] = ("skip", 0.1),
+    tolerance: ErrorTolerance = ErrorTolerance(),  # noqa: B008
     progress: bool = True,
 ) -> Path:
     """Write sequences into a packed store. Its bytes depend on the input only, not on the number of workers.
@@ -166,7 +168,7 @@ def prepare(
         codec: image codec, a key of `CODECS`: "bmp" (fastest) and "png" (smaller) are lossless, "jpeg" is not.
         sequences_per_shard: the default gives a few hundred MB at 128 x 128 pixels and 200 frames.
         workers: processes; None: one for each core.
-        policy: "skip" and record unreadable frames and sequences, up to this share of each; or "raise".
+        tolerance: rule for unreadable frames and sequences; those that are skipped are recorded.
 
     Raises:
         DataError: the folder holds something else, or too much is unreadable.
@@ -174,8 +176,8 @@ def prepare(
     """
     if codec not in CODECS:
         raise CompleteSplatError(f"codec={codec}: choose one of {', '.join(CODECS)}")
-    on_bad, max_bad_fraction = policy
-    writer = ShardWriter({split: sources[split] for split in sorted(sources, key=SPLITS.index)}, out, codec, on_bad)
+    ordered = {split: sources[split] for split in sorted(sources, key=SPLITS.index)}
+    writer = ShardWriter(ordered, out, codec, tolerance)
     plans = _plans(writer.sources, sequences_per_shard)
     _claim(out, _plan(writer, settings, plans))
     records = {plan: writer.finished_record(plan) for plan in plans}
@@ -186,13 +188,16 @@ def prepare(
     # The old manifest may be wrong until it is written again.
     for path in (out / MANIFEST, *out.glob(f"*{UNFINISHED}")):
         path.unlink(missing_ok=True)
-    bad = [error for source in writer.sources.values() for error in source.refused]
-    if bad and on_bad == "raise":
-        raise bad[0]
+    for source in writer.sources.values():
+        for error in source.refused:
+            tolerance.check(error)
     if missing:
-        records |= _write_shards(writer, missing, workers, progress)
-    splits = {split: _split(split, source, records.values()) for split, source in writer.sources.items()}
-    _finish(PackedManifest(codec, dict(settings), splits), out, max_bad_fraction)
+        records.update(_write_shards(writer, missing, workers, progress))
+    splits = {}
+    for split, source in writer.sources.items():
+        written = [record for record in records.values() if record is not None and record.split == split]
+        splits[split] = _split(source, written)
+    _finish(PackedManifest(codec, dict(settings), splits), out, tolerance.max_bad_fraction)
     return out
 
 
@@ -211,15 +216,11 @@ def _write_shards(
 def _plan(writer: ShardWriter, settings: Mapping[str, Scalar], plans: list[ShardPlan]) -> dict[str, dict[str, Scalar]]:
     """Return everything that determines the shards' bytes."""
     shards = json.dumps([[plan.file, *plan.names] for plan in plans])
-    return {
-        "settings": dict(settings),
-        "made from": {
-            **HEADER,
-            "codec": writer.codec,
-            **{f"fingerprint of {split}": source.fingerprint() for split, source in writer.sources.items()},
-            "shards": hashlib.sha256(shards.encode()).hexdigest(),
-        },
-    }
+    made_from: dict[str, Scalar] = {"format": FORMAT, "codec": writer.codec}
+    for split, source in writer.sources.items():
+        made_from[f"fingerprint of {split}"] = source.fingerprint()
+    made_from["shards"] = hashlib.sha256(shards.encode()).hexdigest()
+    return {"settings": dict(settings), "made from": made_from}
 
 
 def _claim(out: Path, plan: Mapping[str, Mapping[str, Scalar]]) -> None:
@@ -236,21 +237,24 @@ def _claim(out: Path, plan: Mapping[str, Mapping[str, Scalar]]) -> None:
             raise DataError(f"was made with {differing}: choose another folder, or remove this one", str(out))
 
 
-def _split(name: str, source: SequenceSource, made: Iterable[ShardRecord | None]) -> Split:
-    records = [record for record in made if record is not None and record.split == name]
+def _split(source: SequenceSource, records: Sequence[ShardRecord]) -> Split:
+    """Return the manifest's entry of a split from its source and the records of its shards."""
     stored = {name for record in records for name in record.shard.sequences}
+    refused = [Refusal.of(error) for error in source.refused]
+    for record in records:
+        refused.extend(record.refused)
     return Split(
-        source.fingerprint(),
-        source.listed,
-        tuple(name for name in source.names if name in stored),
-        tuple(record.shard for record in records),
-        (*map(Refusal.of, source.refused), *(refusal for record in records for refusal in record.refused)),
-        {reason: len(names) for reason, names in source.left_out.items()},
+        fingerprint=source.fingerprint(),
+        listed=source.listed,
+        names=tuple(name for name in source.names if name in stored),
+        shards=tuple(record.shard for record in records),
+        refused=tuple(refused),
+        left_out={reason: len(names) for reason, names in source.left_out.items()},
     )
 
 
 def _finish(manifest: PackedManifest, out: Path, max_bad_fraction: float) -> None:
-    """Refuse a store with too many errors or no sequences; else write the manifest and log a summary."""
+    """Write the manifest and log a summary, or refuse a store with too many errors or no sequences."""
     refused = [refusal for split in manifest.splits.values() for refusal in split.refused]
     shards = [shard for split in manifest.splits.values() for shard in split.shards]
     sequences = sum(len(shard.sequences) for shard in shards)

@@ -1,19 +1,13 @@
-"""Scenes with known hidden parts: all alternatives for what the reference image hides, with their probabilities.
-
-The data are in CO3D's layout. Beside its `images`, a sequence has a folder with the same images in each mode, named
-after the mode.
-"""
+"""Scenes with known hidden parts: all alternatives for what the reference image hides, with their probabilities."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from completesplat.data.co3d.source import CO3DSource
 from completesplat.data.loading.scenes import SceneStore, with_true_depths
 from completesplat.data.loading.view_selection import evaluation_views
 from completesplat.data.validation import field, finite_array, read_json
@@ -54,17 +48,14 @@ class HiddenModes(TensorDataclass):
     true_mode: int
 
 
-def in_mode(image: Path, mode: str) -> Path:
-    """Return the path of an image in a mode, given that of the image in `images`."""
-    return image.parent.parent / mode / image.name
-
-
 class HiddenModeScenes:
-    """Sequence of scenes in all their modes, each read when it is indexed; see `SceneDataModule.hidden_modes`.
+    """Sequence of scenes in all their modes, each read when it is indexed.
 
-    The reference is a sequence's first frame, as in any test. The store reads data as they were made, not prepared.
+    The reference is a sequence's first frame, as in any test.
 
     Args:
+        store: scenes as they were made, not prepared.
+        modes: the same scenes in each mode, by its name.
         record: name -> JSON file of a sequence: its true mode (`hidden`), and the modes' `chances` if they are its own.
         chances: probabilities of the modes by name.
         views: largest number of views that show the modes.
@@ -72,15 +63,20 @@ class HiddenModeScenes:
     """
 
     def __init__(
-        self, store: SceneStore, record: Callable[[str], Path], chances: Mapping[str, float], views: int, spread: int
+        self,
+        store: SceneStore,
+        modes: Mapping[str, SceneStore],
+        record: Callable[[str], Path],
+        chances: Mapping[str, float],
+        views: int,
+        spread: int,
     ) -> None:
-        assert isinstance(store.source, CO3DSource)
         self.store = store
+        self.modes = modes
         self.record = record
         self.chances = chances
         self.views = views
         self.spread = spread
-        self.modes = [replace(store, source=store.source.with_images(partial(in_mode, mode=mode))) for mode in chances]
 
     def __len__(self) -> int:
         return len(self.store.names)
@@ -105,14 +101,14 @@ class HiddenModeScenes:
             raise DataError("no view shows enough of what the reference image hides", sequence=name)
         targets = sorted({*selected, *evaluation_views(len(sequence.frames), self.spread)[1]})
         scene = with_true_depths(self.store.scene(sequence, 0, targets), sequence, 0, targets)
-        front = scene.reference
-        others = scene.targets
-        assert front.depths is not None
-        assert others.depths is not None
-        unseen, _ = hidden_from(front.cameras, front.depths, others.cameras, others.depths)
+        reference = scene.reference
+        further = scene.targets
+        assert reference.depths is not None
+        assert further.depths is not None
+        unseen, _ = hidden_from(reference.cameras, reference.depths, further.cameras, further.depths)
         views = list(map(targets.index, selected))
         region = regions[selected]
-        # Depth maps leave out edges; but the reference view does not show what differs between the modes.
+        # Depth maps leave out edges, but the reference view does not show what differs between the modes.
         unseen[views] |= region
         true_mode, probabilities = self._modes_of(name)
         return HiddenModes(
@@ -135,10 +131,13 @@ class HiddenModeScenes:
             hidden = field(content, "hidden", str)
             if hidden not in modes:
                 raise BadAnnotation(f"hidden must be one of {', '.join(modes)}")
-            chances = finite_array(content.get("chances", list(self.chances.values())), (len(modes),), "chances")
+            stored = content.get("chances", list(self.chances.values()))
+            chances = finite_array(stored, (len(modes),), "chances")
         return modes.index(hidden), torch.from_numpy(chances).float()
 
     def _truths(self, name: str, views: int) -> Float[Tensor, "mode view 3 size size"]:
-        sequences = [(store, store.source.read(name)) for store in self.modes]
-        images = [torch.stack([store.image(sequence, view) for view in range(views)]) for store, sequence in sequences]
-        return torch.stack(images).float() / 255
+        truths = []
+        for store in self.modes.values():
+            sequence = store.source.read(name)
+            truths.append(torch.stack([store.image(sequence, view) for view in range(views)]))
+        return torch.stack(truths).float() / 255

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,8 +23,8 @@ from completesplat.export.prediction import FileUnits, OutputFiles, Shot, write_
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import Prediction, WeightedSum
+from completesplat.quantities import CameraPath, Format, NonNegative, Positive, Range, Share
 from completesplat.scene import Batch, SceneBatch, Views
-from completesplat.settings.schema import CameraPath, Format, Positive, Range, Share
 from completesplat.tensors import stack
 from completesplat.training.optimization import Schedule, constant
 from completesplat.training.scoring import Renders
@@ -40,7 +40,7 @@ class CaptureSettings:
     """Settings of the Gaussians of a capture.
 
     Attributes:
-        initial, most: numbers of Gaussians at the start (at most as many as there are points) and at most.
+        initial, most: first and largest number of Gaussians; the first is at most that of the points.
         opacity: initial opacity of all Gaussians.
         refine_every: steps between relocations of dead Gaussians, which add the share `growth` of new ones.
         opacity_weight, scale_weight: weights of mean opacity and mean scale in the loss.
@@ -53,15 +53,15 @@ class CaptureSettings:
     opacity: fitting.Translucent = 0.1
     refine_every: Positive = 50
     growth: Share = 0.05
-    opacity_weight: Annotated[float, Range(0)] = 0.01
-    scale_weight: Annotated[float, Range(0)] = 0.01
+    opacity_weight: NonNegative = 0.01
+    scale_weight: NonNegative = 0.01
     position_rate: Annotated[float, Range(1e-3)] = 10.0
-    opacity_rate: Annotated[float, Range(0)] = 1.0
-    other_rates: Annotated[float, Range(0)] = 4.0
+    opacity_rate: NonNegative = 1.0
+    other_rates: NonNegative = 4.0
 
 
 class CaptureFit(Stage):
-    """Gaussians of one capture, fitted to its training frames (Kerbl et al. 2023; Kheradmand et al. 2024).
+    """Gaussians of one capture, fitted to its training frames (Kerbl et al. 2023, Kheradmand et al. 2024).
 
     All parameters have rows for `most` Gaussians, of which the first `count` are used, so that checkpoints and the
     optimizer's state keep their shapes while the number of Gaussians grows. They are in the data module's world.
@@ -89,9 +89,16 @@ class CaptureFit(Stage):
         self.loss = loss
         self.fitting = fitting
         self.scene_folder = None if scene_folder is None else Path(scene_folder)
-        self.wanted = OutputFiles(formats, videos, frames, self.background)
-        shapes = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "logits": (), "harmonics": (3,)}
-        self.raw = nn.ParameterDict({name: torch.zeros(fitting.most, *shape) for name, shape in shapes.items()})
+        self.files = OutputFiles(formats, videos, frames, self.background)
+        self.raw = nn.ParameterDict(
+            {
+                "means": torch.zeros(fitting.most, 3),
+                "log_scales": torch.zeros(fitting.most, 3),
+                "quaternions": torch.zeros(fitting.most, 4),
+                "logits": torch.zeros(fitting.most),
+                "harmonics": torch.zeros(fitting.most, 3),
+            }
+        )
         self.count: Tensor
         self.register_buffer("count", torch.tensor(0))
 
@@ -100,13 +107,18 @@ class CaptureFit(Stage):
         return fitting.RawGaussians(**used).gaussians()[0]
 
     def sequence(self, split: str) -> PosedSequence:
-        """Return the frames of a split of the capture; raise CompleteSplatError unless there is exactly one capture."""
-        names = self.data.store(split).names
-        if len(names) != 1 or not self.data.splits_share_sequences or is_packed(self.data.root):
-            state = "is prepared" if is_packed(self.data.root) else f"has {len(names)} sequences ({first_names(names)})"
+        """Return the frames of a split of the capture.
+
+        Raises:
+            CompleteSplatError: the data are not exactly one capture, as it was taken.
+        """
+        store = self.data.store(split)
+        packed = is_packed(self.data.root)
+        if packed or len(store.names) != 1 or not self.data.splits_share_sequences:
+            state = "is prepared" if packed else f"has {len(store.names)} sequences ({first_names(store.names)})"
             advice = "model=capture fits one capture: give data=capture and its folder, as it was taken"
             raise CompleteSplatError(f"data.root={self.data.root} {state}; {advice}")
-        return self.data.store(split).source.read(names[0])
+        return store.source.read(store.names[0])
 
     def reference_poses(self, scenes: SceneBatch, split: str) -> Float[Tensor, "batch 4 4"]:
         """Return `world_to_camera` of the scenes' references in the capture's world."""
@@ -124,21 +136,23 @@ class CaptureFit(Stage):
     def on_fit_start(self) -> None:
         """Place the first Gaussians, unless a run is continued."""
         self.refuse_average()
-        if changed := [key for key, value in self.data.augment.keywords.items() if value]:
+        changed = self.data.augmentation.active()
+        if changed:
             raise CompleteSplatError(f"data.{changed[0]}: model=capture fits the photos as they are; turn it off")
         sequence = self.sequence("train")
         if self.count:
             return
         generator = torch.Generator().manual_seed(0)
-        settings = self.fitting
+        opacity = self.fitting.opacity
         scene = stack([self.data.store("train").scene(sequence, 0, range(1, len(sequence.frames)))]).to(self.device)
         views = self.in_world(scene, "train")
-        most = min(settings.initial, settings.most)
+        most = min(self.fitting.initial, self.fitting.most)
         if sequence.points is None or len(sequence.points) <= fitting.NEIGHBOURS:
-            points = fitting.initial_gaussians(views, scene.depth_range, most, settings.opacity, generator).means[0]
+            points = fitting.initial_gaussians(views, scene.depth_range, most, opacity, generator).means[0]
         else:
-            points = sequence.points[torch.randperm(len(sequence.points), generator=generator)[:most]].to(self.device)
-        for name, tensor in vars(fitting.gaussians_at_points(points, views[0], settings.opacity)).items():
+            chosen = torch.randperm(len(sequence.points), generator=generator)[:most]
+            points = sequence.points[chosen].to(self.device)
+        for name, tensor in vars(fitting.gaussians_at_points(points, views[0], opacity)).items():
             self.raw[name][: len(points)] = tensor[0]
         self.count.fill_(len(points))
 
@@ -171,41 +185,57 @@ class CaptureFit(Stage):
         total, terms = self.loss(Prediction(images, gaussians[None], None), views, self.global_step)
         total = total + settings.opacity_weight * gaussians.opacities.mean()
         total = total + settings.scale_weight * gaussians.scales.mean()
-        logged = {f"train/{name}": value for name, value in terms.items()}
-        logged |= {"train/loss": total.detach(), "train/gaussians": self.count.float()}
-        self.log_step(logged, batch_size=len(scenes.names))
+        figures = {f"train/{name}": value for name, value in terms.items()}
+        figures["train/loss"] = total.detach()
+        figures["train/gaussians"] = self.count.float()
+        self.log_step(figures, batch_size=len(scenes.names))
         return total
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """Build Adam with 3DGS's rates and epsilon; the rate of the positions decays to a hundredth."""
+        """Build Adam with 3DGS's rates and epsilon, where the rate of the positions decays to a hundredth."""
         depth_ranges = self.sequence("train").depth_ranges
         settings = self.fitting
-        rates = settings.position_rate, settings.opacity_rate, settings.other_rates
-        optimizer = fitting.adam(dict(self.raw.items()), depth_ranges, *rates)
+        optimizer = fitting.adam(
+            dict(self.raw.items()), depth_ranges, settings.position_rate, settings.opacity_rate, settings.other_rates
+        )
         steps = max(1, self.trainer.estimated_stepping_batches)
-        decays = [lambda step: fitting.POSITION_DECAY ** (step / steps), *[lambda step: 1.0] * (len(self.raw) - 1)]
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": Schedule(optimizer, decays), "interval": "step"}}
+
+        def decay(step: int) -> float:
+            return fitting.POSITION_DECAY ** (step / steps)
+
+        def constant_rate(step: int) -> float:
+            return 1.0
+
+        decays: list[Callable[[int], float]] = [constant_rate] * len(self.raw)
+        decays[0] = decay
+        schedule = Schedule(optimizer, decays)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Return the fitted Gaussians in the frame of each scene's reference, a held-out frame."""
-        return stack([self.gaussians().transform(pose) for pose in self.reference_poses(scenes, "test")]).detach()
+        gaussians = self.gaussians()
+        return stack([gaussians.transform(pose) for pose in self.reference_poses(scenes, "test")]).detach()
 
     def on_test_start(self) -> None:
         """Note for tables what the Gaussians were fitted to."""
-        fitted, held_out = (self.sequence(split).photos for split in ("train", "test"))
+        fitted = self.sequence("train").photos
+        held_out = self.sequence("test").photos
         photos = len(fitted) + len(held_out)
         rule = self.data.describe()["split"]
         self.fitted_to = f"{len(fitted)} of {photos} photos; {rule}: {', '.join(held_out)}"
         super().on_test_start()
 
     def test_results(self) -> dict[str, dict[str, Any]]:
-        """Return the scores, with the names of the photos; warn if the photos' mean scores as well."""
+        """Return the scores, with the names of the photos, and warn if the photos' mean scores as well."""
         results = super().test_results()
-        parts = {"fitted": "train", "held_out": "test"}
-        results["model"]["photos"] = {part: list(self.sequence(split).photos) for part, split in parts.items()}
-        fitted, mean = (results[name]["full"]["novel"].get("psnr", math.nan) for name in ("model", "mean_image"))
-        if fitted <= mean:
-            scores = f"{fitted:.2f} dB, the mean image {mean:.2f} dB"
+        results["model"]["photos"] = {
+            "fitted": list(self.sequence("train").photos),
+            "held_out": list(self.sequence("test").photos),
+        }
+        psnr = results["model"]["full"]["novel"].get("psnr", math.nan)
+        psnr_of_mean = results["mean_image"]["full"]["novel"].get("psnr", math.nan)
+        if psnr <= psnr_of_mean:
+            scores = f"{psnr:.2f} dB, the mean image {psnr_of_mean:.2f} dB"
             logger.warning("%s: are these the cameras of these photos, and are the steps enough?", scores)
         return results
 
@@ -215,7 +245,6 @@ class CaptureFit(Stage):
             return
         sequence = self.sequence("test")
         scene = self.gaussians().detach()
-        wanted = self.wanted
         poses = cameras.world_to_camera @ sequence.cameras.world_to_camera[0].to(cameras.world_to_camera)
         placed = replace(cameras, world_to_camera=poses)
         up = normalize(-poses[:, 1, :3].mean(0), dim=-1)
@@ -223,14 +252,22 @@ class CaptureFit(Stage):
         reference, targets = self.data.evaluation_views(sequence, "test")
         photos = tuple(sequence.photos[index] for index in (reference, *targets))
         shot = Shot(scene, placed[0], up, FileUnits(sequence.scale, sequence.origin), photos)
-        files = dict[str, str]()
+        names = dict[str, str]()
         comments = [f"scene {name}"]
         on_file = partial(logger.info, "writing %s")
-        for part in (replace(wanted, formats=()), *(replace(wanted, formats=[x], videos=()) for x in wanted.formats)):
+        # Each format is written on its own, so that one that fails leaves the others.
+        parts = [replace(self.files, formats=())]
+        for scene_format in self.files.formats:
+            parts.append(replace(self.files, formats=[scene_format], videos=()))
+        for part in parts:
             try:
-                files |= write_scene(self.scene_folder, "scene", "", shot, self.rasterizer, part, comments, on_file)[-1]
+                *_, written = write_scene(
+                    self.scene_folder, "scene", "", shot, self.rasterizer, part, comments, on_file
+                )
             except CompleteSplatError as error:
                 logger.warning("left out: %s", error)
+            else:
+                names.update(written)
         title = f"{name}: held-out photos, Gaussians fitted to the {len(self.sequence('train').frames)} others"
         seed = self.evaluation.scene_seed(name)
-        write_fitted_scene(self.scene_folder, name, title, shot, images[0], truth.images, seed, files)
+        write_fitted_scene(self.scene_folder, name, title, shot, images[0], truth.images, seed, names)

@@ -11,18 +11,18 @@ from filelock import FileLock
 from rich.console import Console
 from rich.progress import track
 
-from completesplat.data.co3d import writing
+from completesplat.data.co3d import category_writers
 from completesplat.data.co3d.annotations import viewpoint
-from completesplat.data.hidden_modes import in_mode
 from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_mini, draw_object_scene, render_frame
-from completesplat.data.toy.raytracing import WHITE
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
 from completesplat.data.toy.shapes import Array
+from completesplat.data.toy.surroundings import WHITE
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder
-from completesplat.settings.schema import Entries, Natural, Positive, Range, Side
+from completesplat.quantities import Entries, Natural, Positive, Range, Side
+from completesplat.settings.schema import violations
 
 FORMAT_VERSION = 3
 DESCRIPTION = "toy.json"
@@ -39,7 +39,7 @@ DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
 }
 """Functions that draw a scene, by category: (random generator, number of frames) -> scene."""
 
-KINDS = [*(category.removeprefix("toy_") for category in DRAW), "rooms"]
+KINDS = ["objects", "minis", "marked_minis", "rooms"]
 
 
 class DataSetSize(TypedDict):
@@ -52,7 +52,7 @@ class DataSetSize(TypedDict):
 
 
 Factors = Annotated[Sequence[Annotated[float, Range(0)]], Entries(3, 3)]
-WrittenScene = tuple[str, list[writing.Annotation], writing.Annotation]
+WrittenScene = tuple[str, list[category_writers.Annotation], category_writers.Annotation]
 """Split of a sequence, and annotations of its frames and of itself."""
 
 
@@ -64,12 +64,14 @@ def _write_frame(folder: Path, place: tuple[str, str, int], scene: ToyScene, siz
     translation = scene.unit * world_to_camera[:3, 3] - rotation @ scene.origin
     focal = float(1 / np.tan(np.radians(scene.fov_degrees) / 2))
     seen_from = viewpoint(rotation, translation, [focal, focal], [0.0, 0.0])
-    annotation = writing.write_frame(folder / name, place, *render_frame(scene, frame, size), seen_from, scene.unit)
+    annotation = category_writers.write_frame(
+        folder / name, place, *render_frame(scene, frame, size), seen_from, scene.unit
+    )
     return annotation | {"meta": {"frame_type": f"{split}_known"}}
 
 
 def _splits(scenes: int, rooms: bool) -> list[str]:
-    """Return the split of every scene in order; three or more objects have all splits, rooms have no `val`."""
+    """Return the split of every scene in order. Three or more objects have all splits, and rooms have no `val`."""
     if rooms:
         return ["test" if index % 10 == 0 else "train" for index in range(scenes)]
     test = max(1, round(0.1 * scenes)) if scenes > 1 else 0
@@ -78,7 +80,7 @@ def _splits(scenes: int, rooms: bool) -> list[str]:
 
 
 def draw_category(category: str, seed: int, index: int, frames: int, light: Array) -> ToyScene:
-    """Draw a scene of a category (a key of `DRAW`) from a separate random generator; `light` is `Light.color`."""
+    """Draw a scene of a category (a key of `DRAW`) from a separate random generator, in light of a colour."""
     scene = DRAW[category](np.random.default_rng([seed, index]), frames)
     return scene._replace(light=scene.light._replace(color=light), point_colors=scene.point_colors * light)
 
@@ -86,40 +88,43 @@ def draw_category(category: str, seed: int, index: int, frames: int, light: Arra
 def _write_scene(
     root: Path, place: tuple[int, str], category: str, frames: int, size: int, seed: int, light: Array
 ) -> WrittenScene:
-    """Write one sequence and return its split and annotations; its `toy.json` reveals the colour of the patch.
+    """Write one sequence and return its split and annotations. Its `toy.json` has the colour of the patch.
 
     A test scene has its images with every colour of the patch, too, for `test evaluation=hidden_modes`.
     """
     index, split = place
     scene = draw_category(category, seed, index, frames, light)
     name = f"{index:05d}_{scene.family}"
-    for folder in writing.FOLDERS:
+    for folder in category_writers.FOLDERS:
         (root / name / folder).mkdir(parents=True)
     annotations = [_write_frame(root, (category, name, frame), scene, size, split) for frame in range(frames)]
     points = scene.unit * scene.points + scene.origin
-    writing.write_points(root / name / "pointcloud.ply", points, to_uint8(scene.point_colors))
+    category_writers.write_points(root / name / "pointcloud.ply", points, to_uint8(scene.point_colors))
     if split == "test":
         _write_modes(root / name, scene, size)
     record = {"family": scene.family, "hidden": scene.patch_color, "chances": scene.chances.tolist()}
     (root / name / DESCRIPTION).write_text(json.dumps(record) + "\n")
-    return split, annotations, writing.sequence_annotation(category, name, len(points))
+    return split, annotations, category_writers.sequence_annotation(category, name, len(points))
 
 
 def _write_modes(folder: Path, scene: ToyScene, size: int) -> None:
+    """Write the images of a scene with each colour of the patch."""
     for mode, color in PATCH_COLORS.items():
         (folder / mode).mkdir()
         painted = scene._replace(patch=scene.patch._replace(color=np.array(color)))
         for frame, image in enumerate(sorted((folder / "images").iterdir())):
-            save_jpeg(render_frame(painted, frame, size)[0], in_mode(image, mode))
+            save_jpeg(render_frame(painted, frame, size)[0], category_writers.in_mode(image, mode))
 
 
 def _write_lists(category: Path, written: list[WrittenScene]) -> None:
+    """Write the annotations and the set list of all scenes."""
     lists: dict[str, list[list[str | int]]] = {"train": [], "val": [], "test": []}
     for split, frames, _ in written:
-        lists[split] += [[f["sequence_name"], f["frame_number"], f["image"]["path"]] for f in frames]
+        for frame in frames:
+            lists[split].append([frame["sequence_name"], frame["frame_number"], frame["image"]["path"]])
     annotations = [frame for _, frames, _ in written for frame in frames]
-    writing.write_annotations(category, annotations, [sequence for _, _, sequence in written])
-    writing.write_set_list(category, SUBSET, lists)
+    category_writers.write_annotations(category, annotations, [sequence for _, _, sequence in written])
+    category_writers.write_set_list(category, SUBSET, lists)
 
 
 def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed: int, light: Array) -> None:
@@ -143,8 +148,8 @@ def _write_clip(root: Path, place: tuple[int, str], frames: int, size: int, seed
     lines = [f"https://example.com/toy/{key}"]  # no real video
     for frame, row in enumerate(rows.astype(np.float32)):
         time = round((start + frame) * MICROSECONDS / ROOM_FRAMES_PER_SECOND)
-        # Nine digits identify a float32 exactly.
-        lines.append(" ".join([str(time), *(f"{number:.9g}" for number in row)]))
+        numbers = " ".join(f"{number:.9g}" for number in row)  # nine digits identify a float32 exactly
+        lines.append(f"{time} {numbers}")
         save_jpeg(render_room_frame(scene, frame, size, width)[0], images / f"{time}.jpg")
     images.with_suffix(".txt").write_text("\n".join(lines) + "\n")
 
@@ -172,17 +177,19 @@ def write(
     rooms = kind == "rooms"
     rules = {"scenes": Range(1 + rooms), "frames": Range(2, MOST_FRAMES), "size": Range(8)}
     for name, rule in rules.items():
-        reason = rule.refusal(number := numbers[name])  # type: ignore[literal-required]
-        if reason is not None:
-            raise DataError(f"{folder.name}: {name}={number}: {reason}")
-    parameters = {"format": FORMAT_VERSION, **numbers} | ({} if tuple(light) == WHITE else {"light": list(light)})
-    if writing.is_written(folder / DESCRIPTION, parameters):
+        unfit = violations(Annotated[int, rule], numbers[name])  # type: ignore[literal-required]
+        if unfit:
+            raise DataError(f"{folder.name}: {name}={unfit[0].value}: {unfit[0].reason}")
+    parameters: dict[str, Any] = {"format": FORMAT_VERSION, **numbers}
+    if tuple(light) != WHITE:
+        parameters["light"] = list(light)
+    if category_writers.is_written(folder / DESCRIPTION, parameters):
         if progress:
             Console().print(f"{folder} already holds these scenes")
         return folder
     out.mkdir(parents=True, exist_ok=True)
     with FileLock(out / f".{folder.name}.lock"):
-        if not writing.is_written(folder / DESCRIPTION, parameters):  # by another process
+        if not category_writers.is_written(folder / DESCRIPTION, parameters):  # by another process
             _write_all(folder, parameters, workers, progress)
     return folder
 

@@ -10,6 +10,7 @@ from packed_sequences import SIZE, ListedSource, contents, pack
 
 from completesplat.data.packed.manifest import read_manifest
 from completesplat.data.packed.source import PackedSource
+from completesplat.data.tolerance import ErrorTolerance
 from completesplat.errors import BadImage, CompleteSplatError, DataError, TooFewFrames
 
 SETTINGS = {"image_size": SIZE, "category": "chair", "crop": None}
@@ -108,7 +109,7 @@ def test_bad_frames_and_sequences_are_left_out_and_recorded(tmp_path: Path) -> N
         left_out={"too short": ["a", "b"]},
         refused=[DataError("no annotations", "x.json", "s9")],
     )
-    split = read_manifest(make(source, tmp_path / "store", policy=("skip", 0.5))).splits["train"]
+    split = read_manifest(make(source, tmp_path / "store", tolerance=ErrorTolerance("skip", 0.5))).splits["train"]
     assert split.names == ("s0", "s1", "s2", "s3", "s5", "s7")
     assert split.left_out == {"too short": 2}
     results = [(entry.kind, entry.file, entry.sequence, entry.frame) for entry in split.refused]
@@ -124,9 +125,9 @@ def test_bad_frames_and_sequences_are_left_out_and_recorded(tmp_path: Path) -> N
 
 def test_a_bad_frame_is_raised_with_its_place_if_that_is_asked_for_even_after_it_was_skipped(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="are bad"):
-        make(ListedSource(NAMES[:4], bad_frames={"s1": [2]}), tmp_path / "store", policy=("skip", 0))
+        make(ListedSource(NAMES[:4], bad_frames={"s1": [2]}), tmp_path / "store", tolerance=ErrorTolerance("skip", 0))
     with pytest.raises(BadImage) as caught:
-        make(ListedSource(NAMES[:4], bad_frames={"s1": [2]}), tmp_path / "store", policy=("raise", 0))
+        make(ListedSource(NAMES[:4], bad_frames={"s1": [2]}), tmp_path / "store", tolerance=ErrorTolerance("raise", 0))
     # Worker processes send their refusals as pickles.
     for error in (caught.value, pickle.loads(pickle.dumps(caught.value))):
         assert (error.file, error.sequence, error.frame) == ("s1/2.jpg", "s1", 16)
@@ -139,12 +140,12 @@ def test_a_bad_frame_is_raised_with_its_place_if_that_is_asked_for_even_after_it
 def test_more_than_the_allowed_share_of_bad_input_is_an_error(bad: dict, tmp_path: Path) -> None:
     # 4 of 32 frames, or 1 of 8 sequences.
     with pytest.raises(DataError, match=r"12\.5% of the data are bad"):
-        make(ListedSource(NAMES, **bad), tmp_path / "store", policy=("skip", 0.12))
+        make(ListedSource(NAMES, **bad), tmp_path / "store", tolerance=ErrorTolerance("skip", 0.12))
     assert not (tmp_path / "store" / "manifest.json").exists()
-    make(ListedSource(NAMES, **bad), tmp_path / "store", policy=("skip", 0.13))
+    make(ListedSource(NAMES, **bad), tmp_path / "store", tolerance=ErrorTolerance("skip", 0.13))
     assert (tmp_path / "store" / "manifest.json").exists()
     with pytest.raises(DataError, match="not one sequence"):
-        make(ListedSource(NAMES, failing=failing(*NAMES)), tmp_path / "none", policy=("skip", 1))
+        make(ListedSource(NAMES, failing=failing(*NAMES)), tmp_path / "none", tolerance=ErrorTolerance("skip", 1))
 
 
 @pytest.mark.parametrize(("chunk", "most", "lengths"), [(3, 4, [3, 3, 2]), (8, 3, [3, 2, 3])])
