@@ -63,7 +63,7 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         loss: weighted terms by name.
         checkpoint: checkpoint of an earlier stage, whose weights this one starts from.
         masked: the model sees only the visible part of the reference image (`data.box_masks`) and learns to complete
-            it; renders are compared with whole images. The paper leaves this as future work.
+            it. Renders are compared with whole images. The paper leaves this as future work.
         channels_last, compile: see `prepare_network`.
         **rendering_and_optimization: see `Stage`.
     """

@@ -11,12 +11,12 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from completesplat.data.images.files import label_font
 from completesplat.data.loading.training_statistics import world_up
 from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.errors import DataError
 from completesplat.export.images import INK, MARGIN, PAPER, SheetCell, image_sheet, write_png
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, project, transform_points
+from completesplat.photo.saving import label_font
 
 CELL = 216
 FEWEST_CELLS = 3  # pixels of an image; the title needs the width of three

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps, TiffImagePlugin
 
-from completesplat.data.images.exif import crop_fov
-from completesplat.data.images.photograph import read_photograph
+from completesplat.photo.exif import crop_fov
+from completesplat.photo.reading import Framing, read_square
 
 SIZE = 16
 RATIONAL = TiffImagePlugin.IFDRational
@@ -25,7 +25,7 @@ def test_exif_orientation(tmp_path, orientation, name):
     exif[0x0112] = orientation
     stored.info.clear()
     stored.save(tmp_path / name, exif=exif)
-    got = read_photograph(tmp_path / name, 64).image.permute(1, 2, 0).numpy()
+    got = read_square(tmp_path / name, Framing(64)).image.permute(1, 2, 0).numpy()
     assert np.array_equal(got, np.float32(upright)[:, 16:80] / 255)
 
 
@@ -41,13 +41,13 @@ def exif_of(**tags):
     return exif
 
 
-def fov_of(tmp_path, exif, size=(60, 40), name="a.jpg", **options):
+def fov_of(tmp_path, exif, size=(60, 40), name="a.jpg", default=50.0, given=None):
     # Pillow does not store the inner record of an Exif object in a TIFF, but does so for a plain mapping.
     tags = TiffImagePlugin.ImageFileDirectory_v2()
     tags[0x8769] = dict(exif.get_ifd(0x8769))
     options_for_tiff = {"tiffinfo": tags} if name == "a.tif" else {"exif": exif}
     Image.new("RGB", size).save(tmp_path / name, **options_for_tiff)
-    return read_photograph(tmp_path / name, SIZE, **options)
+    return read_square(tmp_path / name, Framing(SIZE, default), given)
 
 
 def degrees(millimetres, focal):
@@ -60,7 +60,7 @@ def test_full_frame_focal_length_gives_the_field_of_view_of_the_square(tmp_path,
         photograph = fov_of(tmp_path, exif_of(equivalent=focal), size, name)
         assert photograph.fov_source == "exif"
         assert photograph.fov_degrees == pytest.approx(degrees(seen, focal))
-    photograph = fov_of(tmp_path, exif_of(equivalent=50), name=name, fov_degrees=33.0)
+    photograph = fov_of(tmp_path, exif_of(equivalent=50), name=name, given=33.0)
     assert (photograph.fov_degrees, photograph.fov_source) == (33.0, "given")
 
 
@@ -80,7 +80,7 @@ def test_without_a_usable_focal_length_the_default_stands(tmp_path):
     useless += [{"focal": RATIONAL(0, 0), "resolution": RATIONAL(100)}]
     useless += [{"focal": RATIONAL(4), "resolution": RATIONAL(100), "unit": 1}]
     for tags in useless:
-        photograph = fov_of(tmp_path, exif_of(**tags), default_fov_degrees=61.0)
+        photograph = fov_of(tmp_path, exif_of(**tags), default=61.0)
         assert (photograph.fov_degrees, photograph.fov_source) == (61.0, "default"), tags
     infinite = {0x920A: 35.0, 0xA20E: 100.0, 0xA002: math.inf, 0xA003: math.inf}
     assert crop_fov(infinite, (60, 40)) == pytest.approx(degrees(40, 35 * 100 / 25.4))
@@ -93,6 +93,6 @@ def test_a_damaged_inner_record_leaves_the_orientation(tmp_path):
     levels = np.zeros((SIZE, SIZE), np.uint8)
     levels[0] = 255
     Image.fromarray(levels).save(tmp_path / "a.png", exif=b"Exif\0\0MM\0*\0\0\0\x08" + entries + bytes(4))
-    photograph = read_photograph(tmp_path / "a.png", SIZE)
+    photograph = read_square(tmp_path / "a.png", Framing(SIZE))
     assert photograph.image[:, -1].min() == 1
     assert photograph.fov_source == "default"

@@ -3,18 +3,16 @@ import struct
 import warnings
 import zlib
 from collections.abc import Callable
-from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image, ImageCms, ImageFile
 from support import exif_turned
 
-from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.files import decode_image, read_depth
 from completesplat.errors import BadImage, DataError, MissingFile
+from completesplat.photo.crop import Square, cut_square
+from completesplat.photo.files import decode_image
 
 
 def grey_rgb(grey: np.ndarray) -> np.ndarray:
@@ -209,38 +207,6 @@ def test_whatever_a_decoder_raises_is_a_data_error(monkeypatch, error):
     monkeypatch.undo()
     monkeypatch.setattr(ImageFile, "LOAD_TRUNCATED_IMAGES", True)
     refuse(lambda: decode_image(cut(saved(RGB)), "name", "RGB"), "name", "LOAD_TRUNCATED_IMAGES")
-
-
-DEPTH = np.array([[0.0, 0.5, 1.25], [3.0, 65504.0, 2.0**-14]], dtype=np.float16)
-
-
-def depth_png(depth: object) -> bytes:
-    return saved(np.asarray(depth, dtype=np.float16).view(np.uint16))
-
-
-@pytest.mark.parametrize("scale", [1.0, 0.37, 250.0])
-def test_a_depth_map_is_float16_times_the_scale_and_unknown_where_not_finite(tmp_path, scale):
-    holes = np.where([[False, True, False], [True, False, False]], [np.inf, np.nan, 0], DEPTH)
-    for stored, known in ((DEPTH, DEPTH), (holes, np.nan_to_num(holes, posinf=0)), (0 * DEPTH, 0 * DEPTH)):
-        (tmp_path / "d.png").write_bytes(depth_png(stored))
-        expected = torch.from_numpy(known.astype(np.float32))[None] * scale
-        torch.testing.assert_close(read_depth(tmp_path / "d.png", scale), expected, rtol=1e-7, atol=0)
-
-
-@pytest.mark.parametrize(
-    ("content", "scale", "part"),
-    [
-        (saved(GREY), 1.0, "16 bits"),
-        (saved(DEEP, "TIFF"), 1.0, "formats PNG"),
-        (depth_png([[1.0, -0.5]]), 1.0, "negative"),
-        *((depth_png(np.ones((2, 2))), scale, "scale adjustment") for scale in (0.0, float("nan"), float("inf"))),
-    ],
-    ids=["eight_bits", "tiff", "negative", "zero", "nan", "infinite"],
-)
-def test_a_bad_depth_map_is_refused_by_name(tmp_path: Path, content, scale, part):
-    path = tmp_path / "d.png"
-    path.write_bytes(content)
-    refuse(lambda: read_depth(path, scale), str(path), part)
 
 
 def test_a_mask_of_0_and_1_is_refused_because_it_would_be_empty(tmp_path):

@@ -9,9 +9,9 @@ from PIL import Image
 from scipy.stats import norm
 from support import change_json, compose_config, shipped_folders, strict_json
 
-from completesplat.commands.trained import likeliest_weights, open_generator
+from completesplat.commands.trained import open_generator
 from completesplat.errors import WeightsError
-from completesplat.scene_model import match_shipped
+from completesplat.photo.choice import likeliest_weights, match_shipped
 from completesplat.weights import SHIPPED, shipped
 
 COUCH = SHIPPED / "rendered_couches/held_out.jpg"
@@ -21,7 +21,7 @@ COUCH = SHIPPED / "rendered_couches/held_out.jpg"
 def package(tmp_path, monkeypatch):
     """Three folders of weights in place of the package's; their training images had these mean colours and sizes."""
     folders = shipped_folders(tmp_path / "package", blues=(16, (0, 0, 1)), greens=(48, (0, 1, 0)), reds=(24, (1, 0, 0)))
-    for module in ("scene_model", "commands.trained"):
+    for module in ("photo.choice", "commands.trained"):
         monkeypatch.setattr(f"completesplat.{module}.shipped", lambda: folders)
     return folders
 

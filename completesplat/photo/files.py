@@ -1,23 +1,19 @@
 """Strict reader of untrusted image files: the result is complete, upright and has 8 bits, or the file is refused."""
 
 import io
+import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib.metadata import distribution
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
-from jaxtyping import Float, UInt8
-from PIL import Image, ImageFile, ImageFont, UnidentifiedImageError
-from torch import Tensor
+from PIL import Image, ImageFile, UnidentifiedImageError
 
-from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, Tags, read_exif
-from completesplat.data.validation import require_file
-from completesplat.errors import BadImage, ImageError
+from completesplat.errors import BadImage, ImageError, MissingFile
 from completesplat.files import by_numbers
+from completesplat.photo.exif import ORIENTATION, TRANSPOSITIONS, Tags, read_exif
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 HEIC = (".heic", ".heif")
@@ -29,7 +25,6 @@ SIXTEEN_BIT_MODES = ("I;16", "I;16B", "I;16L")
 TIFF_BITS = 258
 TIFF_PHOTOMETRIC = 262
 TRANSPARENT = "has transparent pixels; lay it over a background first"
-LARGEST_SCALE = 2.0**112  # its product with the largest float16 still fits into float32
 
 
 def decode_image(
@@ -57,40 +52,45 @@ def decode_image(
         BadImage: it is too large, damaged, not a JPEG, PNG, WebP, TIFF or BMP, differs from the annotated size, or
             has pixels whose meaning in this mode is unclear.
     """
-    with _loaded(source, file, FORMATS) as (stored, exif):
-        image = turn_upright(stored, exif.get(ORIENTATION) if turn else None)
+    with decoded(source, file, FORMATS) as (stored, exif):
+        image = turn_upright(stored, exif.get(ORIENTATION)) if turn else stored
         if image_size is not None and image.size != image_size[::-1]:
             expected = f"its annotation says {image_size[0]} x {image_size[1]}"
             raise ImageError(f"has {image.height} x {image.width} pixels when upright, {expected}")
         return _eight_bits(image, getattr(stored, "tag_v2", {}), mode)
 
 
-def stored_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
-    """Return (height, width) of an image file or its content, from its header; errors as in `decode_image`."""
-    content = source if isinstance(source, bytes) else require_file(source)
-    with refused_as_bad(file), open_image(content, formats) as image:
-        return image.height, image.width
-
-
-def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height width"]:
-    """Read a depth map of CO3D, a 16-bit grey PNG whose bits are float16, and multiply it by `scale_adjustment`.
-
-    0 means "unknown", and replaces values that are not finite (`pytorch3d/implicitron/dataset/utils.py`, `load_depth`).
+@contextmanager
+def decoded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterator[tuple[Image.Image, Tags]]:
+    """Decode an image completely, as it is stored, and yield it with its EXIF tags.
 
     Raises:
         MissingFile: the file does not exist.
-        BadImage: it is no readable 16-bit PNG, the factor is not positive and finite, or depths are negative.
+        BadImage: an ImageError was raised by decoding, or within the context.
     """
-    if not 0 < scale_adjustment < LARGEST_SCALE:
-        raise BadImage(f"the depth's scale adjustment must be positive and finite, not {scale_adjustment}", str(path))
-    with _loaded(path, str(path), ("PNG",)) as (image, _):
-        if image.mode not in SIXTEEN_BIT_MODES:
-            raise ImageError(f"a depth map is a grey PNG of 16 bits, this has colour mode {image.mode}")
-        depth = np.asarray(image).astype(np.uint16).view(np.float16).astype(np.float32)
-        depth[~np.isfinite(depth)] = 0
-        if depth.min() < 0:
-            raise ImageError("negative depths; its bits are no float16")
-    return torch.from_numpy(depth * np.float32(scale_adjustment))[None]
+    with refused_as_bad(file):
+        if ImageFile.LOAD_TRUNCATED_IMAGES:
+            raise ImageError("Pillow is set to accept truncated files (ImageFile.LOAD_TRUNCATED_IMAGES); unset that")
+        size = len(source) if isinstance(source, bytes) else _require(source).stat().st_size
+        if size == 0:
+            raise ImageError("the file is empty")
+        if size > MOST_BYTES:
+            raise ImageError(f"more than {MOST_BYTES:,} bytes")
+        content = source if isinstance(source, bytes) else source.read_bytes()
+        with open_image(content, formats) as image:
+            frames = getattr(image, "n_frames", 1)
+            if frames > 1 and image.format != "MPO":
+                raise ImageError(f"has {frames} frames; one image is expected")
+            image.load()
+            check_sums(image, io.BytesIO(content))
+            yield image, read_exif(image)
+
+
+def stored_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
+    """Return (height, width) of an image file or its content, from its header; errors as in `decode_image`."""
+    content = source if isinstance(source, bytes) else _require(source)
+    with refused_as_bad(file), open_image(content, formats) as image:
+        return image.height, image.width
 
 
 def photo_formats(formats: tuple[str, ...] = FORMATS) -> tuple[str, ...]:
@@ -190,51 +190,11 @@ def deep_grey(image: Image.Image, tiff_tags: Mapping[int, object]) -> np.ndarray
     return values.astype(np.float32)
 
 
-def label_font(size: int) -> ImageFont.FreeTypeFont:
-    """Return the font of labels, of a size in pixels. It is DejaVu Sans, because Pillow's own font lacks accents."""
-    font = distribution("matplotlib").locate_file("matplotlib/mpl-data/fonts/ttf/DejaVuSans.ttf")  # without its import
-    return ImageFont.truetype(str(font), size)
-
-
-def image_bytes(image: Image.Image, kind: str, **options: int | bytes) -> bytes:
-    """Return the content of an image file in Pillow's format `kind`."""
-    content = io.BytesIO()
-    image.save(content, kind, **options)
-    return content.getvalue()
-
-
-def save_image(image: Image.Image, path: Path, **options: int | bytes) -> None:
-    """Write an image in the format of its path's suffix; a full disk raises, while Pillow would truncate a JPEG."""
-    path.write_bytes(image_bytes(image, Image.registered_extensions()[path.suffix], **options))
-
-
-def to_uint8(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
-    """Convert colours or shares in [0, 1] to bytes."""
-    return np.round(255 * values.clip(0, 1)).astype(np.uint8)
-
-
-def save_jpeg(image: Float[np.ndarray, "height width 3"], path: Path) -> None:
-    """Write colours in [0, 1] as a JPEG of high quality."""
-    save_image(Image.fromarray(to_uint8(image)), path, quality=95, subsampling=0)
-
-
-@contextmanager
-def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterator[tuple[Image.Image, Tags]]:
-    """Decode an image completely and yield it with its EXIF record; convert its errors to BadImage."""
-    with refused_as_bad(file):
-        if ImageFile.LOAD_TRUNCATED_IMAGES:
-            raise ImageError("Pillow is set to accept truncated files (ImageFile.LOAD_TRUNCATED_IMAGES); unset that")
-        size = require_file(source).stat().st_size if isinstance(source, Path) else len(source)
-        if not 0 < size <= MOST_BYTES:
-            raise ImageError(f"more than {MOST_BYTES:,} bytes" if size else "the file is empty")
-        content = source.read_bytes() if isinstance(source, Path) else source
-        with open_image(content, formats) as image:
-            frames = getattr(image, "n_frames", 1)
-            if frames > 1 and image.format != "MPO":
-                raise ImageError(f"has {frames} frames; one image is expected")
-            image.load()
-            check_sums(image, io.BytesIO(content))
-            yield image, read_exif(image)
+def _require(path: Path) -> Path:
+    # `Path.is_file` raises if a name is too long or a folder may not be entered.
+    if not os.path.isfile(path):
+        raise MissingFile("no such file", str(path))
+    return path
 
 
 def _eight_bits(image: Image.Image, tiff_tags: Mapping[int, object], mode: Literal["RGB", "L"]) -> Image.Image:
@@ -251,8 +211,13 @@ def _eight_bits(image: Image.Image, tiff_tags: Mapping[int, object], mode: Liter
     if mode == "L" and image.mode == "L" and image.getextrema()[1] == 1:
         raise ImageError("a mask has values from 0 to 255, not 0 and 1")
     if mode == "L" and image.mode not in ("1", "L"):
-        red, green, blue = image.convert("RGB").split()
-        if red.tobytes() != green.tobytes() or red.tobytes() != blue.tobytes():
-            raise ImageError("has colours; a mask is grey")
-        return red
+        return _grey_channel(image)
     return image.convert(mode)
+
+
+def _grey_channel(image: Image.Image) -> Image.Image:
+    """Return one of the three equal channels of a grey image; raise ImageError if it has colours."""
+    red, green, blue = image.convert("RGB").split()
+    if red.tobytes() != green.tobytes() or red.tobytes() != blue.tobytes():
+        raise ImageError("has colours; a mask is grey")
+    return red

@@ -9,9 +9,9 @@ import pytest
 import torch
 from PIL import Image, ImageCms
 
-from completesplat.data.images import files
-from completesplat.data.images.photograph import read_photograph
 from completesplat.errors import CompleteSplatError, ImageError
+from completesplat.photo import files
+from completesplat.photo.reading import Framing, read_square
 
 SIZE = 16
 
@@ -27,7 +27,7 @@ def read_back(tmp_path, image, name="a.png", size=SIZE, **options):
 
 
 def pixels(path, size=SIZE):
-    image = read_photograph(path, size).image
+    image = read_square(path, Framing(size)).image
     assert image.dtype == torch.float32
     assert 0 <= image.min() <= image.max() <= 1
     return image.permute(1, 2, 0).numpy()
@@ -176,7 +176,7 @@ def refuse(path, match):
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         with pytest.raises(ImageError, match=match) as caught:
-            read_photograph(path, SIDE)
+            read_square(path, Framing(SIDE))
     assert not warned
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -204,12 +204,12 @@ def test_what_is_no_photograph_is_refused(tmp_path, monkeypatch):
 def test_truncated_files_are_refused_or_complete(tmp_path, name):
     options = {"p.jpg": {"progressive": True}, "lzw.tif": {"compression": "tiff_lzw"}}.get(name, {})
     PHOTO.save(tmp_path / name, **options)
-    whole = read_photograph(tmp_path / name, SIDE).image
+    whole = read_square(tmp_path / name, Framing(SIDE)).image
     data = (tmp_path / name).read_bytes()
     for length in [*range(1, len(data) - 24, max(1, len(data) // 40)), *range(len(data) - 24, len(data))]:
         (tmp_path / name).write_bytes(data[:length])
         try:
-            image = read_photograph(tmp_path / name, SIDE).image
+            image = read_square(tmp_path / name, Framing(SIDE)).image
         except ImageError:
             continue
         # Some formats end in a mark after the last pixel; an image without it is whole.
@@ -245,21 +245,21 @@ def test_images_in_memory_are_read_as_files_are(tmp_path):
 )
 def test_images_in_memory_without_one_plain_meaning_are_refused(wrong, reason):
     with pytest.raises(ImageError, match=reason):
-        read_photograph(wrong, SIZE)
+        read_square(wrong, Framing(SIZE))
 
 
 @pytest.mark.parametrize("fov", [1e-300, 0, -5, math.nextafter(180, 0), 200, float("nan")])
 def test_fields_of_view_that_no_lens_has_are_refused(fov):
     """Of 1e-300 degrees the focal length is infinite in float32; of nearly 180 it is negative."""
-    for given in ({"fov_degrees": fov}, {"default_fov_degrees": fov}):
+    for framing, given in ((Framing(SIZE), fov), (Framing(SIZE, fov), None)):
         with pytest.raises(CompleteSplatError, match=r"must lie between 0\.1 and 179 degrees, not "):
-            read_photograph(RGB, SIZE, **given)
+            read_square(RGB, framing, given)
     for edge in (0.1, 179):
-        assert read_photograph(RGB, SIZE, fov_degrees=edge).fov_degrees == edge
+        assert read_square(RGB, Framing(SIZE), edge).fov_degrees == edge
 
 
 @pytest.mark.parametrize("source", [None, 5, [[1, 2], [3, 4]], b"a.png", {"image": "a.png"}])
 def test_what_is_neither_a_file_nor_pixels_is_refused(source, monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # users have no type checker at run time
     with pytest.raises(ImageError, match=f"{type(source).__name__}: give a file name, a PIL image, an array or a"):
-        read_photograph(source, SIZE)
+        read_square(source, Framing(SIZE))

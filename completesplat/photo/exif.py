@@ -54,13 +54,15 @@ def crop_fov(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:
 
 
 def _focal_from_sensor(exif: Mapping[int, object], longer_side: int) -> float | None:
+    """Return the focal length in pixels from the sensor's resolution, or None if it is not recorded."""
     focal = _positive(exif.get(ExifTags.Base.FocalLength))
     resolution = _positive(exif.get(ExifTags.Base.FocalPlaneXResolution))
     unit = exif.get(ExifTags.Base.FocalPlaneResolutionUnit, 2)
     if focal is None or resolution is None or not isinstance(unit, int) or unit not in MILLIMETRES:
         return None
-    recorded = [_positive(exif.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
-    scale = longer_side / max(side or longer_side for side in recorded) if all(recorded) else 1.0
+    width = _positive(exif.get(ExifTags.Base.ExifImageWidth))
+    height = _positive(exif.get(ExifTags.Base.ExifImageHeight))
+    scale = 1.0 if width is None or height is None else longer_side / max(width, height)
     return focal * resolution / MILLIMETRES[unit] * scale
 
 
