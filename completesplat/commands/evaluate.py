@@ -17,7 +17,7 @@ from rich.progress import track
 from completesplat.commands import quieten
 from completesplat.commands.jobs import CONFIG, METRICS
 from completesplat.commands.protocol import Config, protocol, provenance, sampler_settings
-from completesplat.commands.trained import TrainedModel
+from completesplat.commands.trained import trained_model
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
@@ -28,7 +28,7 @@ from completesplat.results.runs import MODEL, read_record
 from completesplat.results.tables import records_table, show
 from completesplat.settings.schema import EvaluationSettings, TestSettings
 from completesplat.training.loggers import wandb_runs
-from completesplat.training.scoring import Scorer
+from completesplat.training.scoring import SceneFiles, Scorer
 from completesplat.training.stopping import stopped_together
 
 METRIC = re.compile(r"\+*evaluation\.metrics\.(\w+)")
@@ -96,7 +96,7 @@ def run(
     Args:
         evaluation, trainer, logger: configs of the protocol, the trainer (without precision), loggers by name.
     """
-    tested = TrainedModel(**trained)
+    tested = trained_model(**trained)
     run_config = tested.configuration()
     quieten()
     seed_everything(tested.seed, verbose=False)
@@ -113,11 +113,17 @@ def run(
         described = protocol(evaluation, module, data, results, out) | tested.facts()
         results = {"protocol": described} | results
         write_json(out / METRICS, results)
-    show(evaluation_table(results, MODEL if tested.scenes is None else module.method), width=160)
+    show(evaluation_table(results, label_of(module)), width=160)
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")
-    if left_out := metrics_left_out(tested.ckpt, evaluation):
+    left_out = metrics_left_out(trained["ckpt"], evaluation)
+    if left_out:
         print(f"metrics of the run are left out; give them again: {shlex.join(left_out)}")
+
+
+def label_of(module: Scorer) -> str:
+    """Return the name of the tested model in tables: that of a method whose scenes are read from files."""
+    return module.method if isinstance(module, SceneFiles) else MODEL
 
 
 def metrics_left_out(ckpt: str | None, evaluation: Config) -> list[str]:
@@ -158,7 +164,7 @@ def run_hidden_modes(
     """
     from completesplat.studies.mode_benchmark import measure, predictors, usable_scenes, write_modes
 
-    tested = TrainedModel(**trained)
+    tested = trained_model(**trained)
     quieten()
     module, data = tested.open()
     data.prepare_data()
@@ -168,8 +174,8 @@ def run_hidden_modes(
     samples = evaluation["samples"]
     candidates = data.hidden_modes(evaluation["views"], evaluation["spread_views"])
     scenes, skipped = usable_scenes(candidates, evaluation["scenes"])
-    if tested.scenes is not None:
-        tested.files.find([scene.scene.names[0] for scene in scenes], samples)
+    if isinstance(module, SceneFiles):
+        module.find([scene.scene.names[0] for scene in scenes], samples)
     progress = partial(track, description="Hidden modes", console=Console(stderr=True))
     methods = predictors(module, samples, evaluation["batch"])
     on_device = [scene.to(device) for scene in scenes]
@@ -191,7 +197,7 @@ def run_hidden_modes(
             each.log_metrics(scores, step=0)
             each.save()
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
-    labels = {} if tested.scenes is None else {MODEL: module.method}
+    labels = {MODEL: label_of(module)}
     records = [{"method": labels.get(name, name), **values} for name, values in results.items()]
     show(records_table(title, records, MODE_COLUMNS), width=140)
     if skipped:

@@ -118,7 +118,7 @@ class ModelSettings(TypedDict):
 
 
 class TestSettings(ModelSettings, total=False):
-    """Settings of `completesplat test`, all of which `TrainedModel` takes."""
+    """Settings of `completesplat test`, all of which `trained_model` takes."""
 
     scenes: str | None
     frame: Literal["opencv", "opengl"]
