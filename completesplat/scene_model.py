@@ -351,11 +351,3 @@ def _shows(background: float | None, square: Float[Tensor, "3 size size"]) -> bo
     """Return whether at least half of an image's border has this grey value, up to 0.1; None: any."""
     border = torch.cat([square[:, [0, -1]].flatten(1), square[:, :, [0, -1]].flatten(1)], 1)
     return background is None or ((border - background).abs().amax(0) < 0.1).float().mean().item() >= 0.5
-
-
-def camera_tensors(camera: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return a training set's typical camera as tensors of a `SceneModel`; raise WeightsError if one is not known."""
-    try:
-        return {name: torch.tensor(camera[name], dtype=torch.float32) for name in ("fov_degrees", "depth_range", "up")}
-    except (KeyError, TypeError, ValueError) as error:
-        raise WeightsError("the training set's typical camera is not known") from error

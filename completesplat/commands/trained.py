@@ -19,13 +19,13 @@ from completesplat.commands.protocol import checkpoint_facts
 from completesplat.errors import CompleteSplatError, ImageError, WeightsError
 from completesplat.files import printable
 from completesplat.generator import CompleteSplat
-from completesplat.run_configs import config_of_run
 from completesplat.scene_model import SceneModel, match_shipped, shipped_configs
 from completesplat.settings.checks import REMOVE
 from completesplat.settings.schema import TestSettings
 from completesplat.tensors import used_device
 from completesplat.weights import AUTO, RUN_CHECKPOINT, sha256_of, shipped
 from completesplat.weights.checkpoint_reading import load_part
+from completesplat.weights.runs import config_of_run
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule

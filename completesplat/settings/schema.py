@@ -206,11 +206,6 @@ def _named_arguments(function: Callable[..., object]) -> tuple[dict[str, object]
     return annotations, any(typing.get_origin(hint) is not typing.Unpack for hint in others)
 
 
-def start_weights(kind: object) -> Mapping[str, str]:
-    """Return the settings of weights that training starts from, with examples, as a part's class declares them."""
-    return getattr(kind, "start_weights", {})
-
-
 def violations(annotation: object, value: object) -> list[Violation]:
     """Return the parts of a value that do not fit an annotation, with the reasons."""
     origin = typing.get_origin(annotation)

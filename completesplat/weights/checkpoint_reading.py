@@ -206,6 +206,12 @@ def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:
     """Load a checkpoint's weights below `prefix` into a module; raise WeightsError unless all are present and fit."""
     weights = read_checkpoint(path)["state_dict"]
     part = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
-    if (difference := mismatch(module.state_dict(), part)) is not None:
+    load_tensors(module, part, path)
+
+
+def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | Path) -> None:
+    """Load the tensors of a file into a module; raise WeightsError, naming the file, unless all are present and fit."""
+    difference = mismatch(module.state_dict(), tensors)
+    if difference is not None:
         raise WeightsError(f"{path}: weights of another architecture: {difference}")
-    module.load_state_dict(part)
+    module.load_state_dict(tensors)

@@ -325,7 +325,7 @@ class SceneDataModule(LightningDataModule):
             return mean_camera(self.store("train"))
 
     def training_facts(self) -> dict[str, float | list[float]]:
-        """Return the facts about training images that weights store (`completesplat.parts.TrainingImages`)."""
+        """Return the facts about training images that weights store (`TrainingImages`)."""
         hidden = 0.0 if self.box_masks is None else self.box_masks.probability
         background = {} if self.background is None else {"background": self.background}
         return {"box_masks": hidden, **background, **feature_moments(self.store("train"))}
