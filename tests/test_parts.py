@@ -25,7 +25,8 @@ from completesplat.weights.allowed import (
     check_names,
     choices,
     class_of,
-    paths_for_weights,
+    listed_parts,
+    names_for_weights,
     settings_of,
 )
 
@@ -120,11 +121,11 @@ def targets(part: dict) -> list[str]:
 
 
 def test_weights_name_classes_by_name_and_their_paths_in_other_versions_count_too(folder):
-    assert set(targets(json.loads((folder / CONFIG_FILE).read_text()))) <= paths_for_weights().keys()
+    assert set(targets(json.loads((folder / CONFIG_FILE).read_text()))) <= set(names_for_weights())
     assert any("completesplat.autoreconstructor." in path for path in targets(SHIPPED_CONFIG))
     origin = Origin(folder, folder, trust=False)
-    for name, path in paths_for_weights().items():
-        assert check_names({"_target_": name}, origin) == {"_target_": path}
+    for name, part in listed_parts().items():
+        assert check_names({"_target_": name}, origin) == {"_target_": part.path}
     before = CompleteSplat.from_pretrained(folder)
     for place in ("denoiser", ENCODER, SCHEDULER):
         part = reduce(dict.__getitem__, place.split("."), before.architecture)
@@ -204,7 +205,7 @@ def test_any_value_in_any_place_is_refused_as_weights_are_or_is_of_the_settings_
 
 
 def test_every_setting_of_every_class_is_checked():
-    for part in paths_for_weights():
+    for part in names_for_weights():
         for name, hint in settings_of(class_of({"_target_": part})).items():
             assert choices(name) or violations(hint, object()), (part, name)
 
@@ -226,7 +227,7 @@ def test_what_the_configuration_tree_offers_may_be_saved_and_loaded(chosen):
 
 def test_each_part_of_a_model_has_the_classes_that_the_configuration_tree_offers_for_it():
     """Whoever adds a denoiser with an option in `conf/` can store it."""
-    assert {name: list(choices(name)) for name in ("autoreconstructor", "network", "denoiser", "encoder")} == {
+    assert {name: choices(name) for name in ("autoreconstructor", "network", "denoiser", "encoder")} == {
         "autoreconstructor": ["VariationalAutoReconstructor"],
         "network": ["SplatterImageUNet", "VariationalAutoReconstructor"],
         "denoiser": ["Denoiser", "TextlessStableDiffusion"],

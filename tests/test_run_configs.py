@@ -169,8 +169,8 @@ def test_parts_that_have_moved_are_found_by_their_names(run, elsewhere):
         with pytest.raises(WeightsError, match=f"names {target}, "):
             configuration(run)
     targets = {path for group in GROUPS for file in (conf_folder() / group).glob("*.yaml") for path in named_in(file)}
-    assert {part.path for part in listed_parts()} == targets
-    assert len({part.name for part in listed_parts()}) == len(targets) > 40
+    assert {part.path for part in listed_parts().values()} == targets
+    assert len(listed_parts()) == len(targets) > 40
 
 
 def named_in(file):

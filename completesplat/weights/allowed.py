@@ -19,7 +19,7 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, NamedTuple, TypedDict, is_typeddict
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict
 
 from huggingface_hub import constants
 from hydra.utils import get_object
@@ -40,15 +40,10 @@ PartConfig = Mapping[str, object]  # config of a part: `_target_`, and arguments
 
 
 class ListedPart(NamedTuple):
-    """A class or function that a file of `conf/` names: the group, the setting (by its last name), and the path."""
+    """A class or function that `conf/` names: its path, and the settings that it may be in weights (none: in runs)."""
 
-    group: str
-    setting: str
     path: str
-
-    @property
-    def name(self) -> str:
-        return self.path.rpartition(".")[2]
+    settings: set[str]
 
 
 class TrainingImages(TypedDict, total=False):
@@ -111,14 +106,17 @@ class SchedulerSettings(TypedDict, total=False):
 
 
 @cache
-def listed_parts() -> tuple[ListedPart, ...]:
-    """Return all that the package's `conf/` names for models and data; the working folder's `conf/` adds nothing."""
-    result = []
+def listed_parts() -> dict[str, ListedPart]:
+    """Return all that the package's `conf/` names for models and data, by name; the working folder's adds nothing."""
+    parts: dict[str, ListedPart] = {}
     for group in (*GROUPS_OF_WEIGHTS, *GROUPS_OF_RUNS):
-        for file in sorted((conf_folder() / group).glob("*.yaml")):
+        for file in (conf_folder() / group).glob("*.yaml"):
             config = LOADER(file.read_text(encoding="utf-8")).get_single_data()
-            result += [ListedPart(group, *named) for named in _named_in(group, config)]
-    return tuple(result)
+            for setting, path in _named_in(group, config):
+                part = parts.setdefault(path.rpartition(".")[2], ListedPart(path, set()))
+                if group in GROUPS_OF_WEIGHTS:
+                    part.settings.add(setting)
+    return parts
 
 
 def _named_in(setting: str, config: object) -> Iterator[tuple[str, str]]:
@@ -135,23 +133,16 @@ def _named_in(setting: str, config: object) -> Iterator[tuple[str, str]]:
 
 
 @cache
-def choices(setting: str) -> dict[str, str]:
-    """Return names and paths of the classes that weights may name for a setting, such as `encoder`, if it is a part."""
-    settings = ("autoreconstructor", "regressor") if setting == "network" else (setting,)
-    parts = [part for part in listed_parts() if part.group in GROUPS_OF_WEIGHTS and part.setting in settings]
-    return {part.name: part.path for part in sorted(parts, key=lambda part: part.name)}
+def choices(setting: str) -> list[str]:
+    """Return the names that weights may have for a setting which is a part, such as `encoder`; none for others."""
+    settings = {"autoreconstructor", "regressor"} if setting == "network" else {setting}
+    return sorted(name for name, part in listed_parts().items() if settings & part.settings)
 
 
 @cache
-def paths_for_weights() -> dict[str, str]:
-    """Return names and paths of all classes that weights may name."""
-    return {part.name: part.path for part in listed_parts() if part.group in GROUPS_OF_WEIGHTS}
-
-
-@cache
-def paths_for_runs() -> dict[str, str]:
-    """Return names and paths of all that runs may name."""
-    return {part.name: part.path for part in listed_parts()}
+def names_for_weights() -> list[str]:
+    """Return the names of all classes that weights may name."""
+    return sorted(name for name, part in listed_parts().items() if part.settings)
 
 
 def name_of(target: object) -> str | None:
@@ -211,9 +202,9 @@ def check_names(config: Any, origin: Origin, setting: object = "") -> Any:
         raise WeightsError(f"{refusal}, which a stored configuration does not")
     if setting != "_target_" or OPTIMIZER.fullmatch(value):
         return config
-    listed = paths_for_runs().get(name_of(value) or "")
-    if listed is not None:
-        return listed
+    name = name_of(value)
+    if name in listed_parts():
+        return listed_parts()[name].path
     refusal = f"{origin.file} names {printable(value, SHORT)}, which is no part of models or data in this package"
     if not origin.may_name_own_modules():
         raise WeightsError(f"{refusal}; if it is a module of your own, and you trust who made the file: trust=true")
@@ -257,7 +248,7 @@ def class_of(part: object) -> Any:
     name = name_of(target)
     if name is None:
         return own_part(target)
-    return get_object(paths_for_weights()[name]) if name in paths_for_weights() else None
+    return get_object(listed_parts()[name].path) if name in names_for_weights() else None
 
 
 def stored_config(part: Any) -> Any:
@@ -268,13 +259,13 @@ def stored_config(part: Any) -> Any:
     if "_target_" in settings:
         settings |= dict.fromkeys(settings.keys() & START_WEIGHTS)
         name = name_of(settings["_target_"])
-        if name in paths_for_weights():
+        if name in names_for_weights():
             settings["_target_"] = name
     return settings
 
 
 def check_architecture(architecture: object, file: Path | None = None) -> None:
-    """Raise WeightsError, naming `file`, for the first part that `choices` or setting that a signature refuses."""
+    """Raise WeightsError, naming `file`, for the first part that `choices` or value that a signature refuses."""
     settings = architecture if isinstance(architecture, Mapping) else {}
     hints = DETERMINISTIC_SETTINGS if "network" in settings else SAMPLING_SETTINGS
     try:
@@ -300,17 +291,15 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
         key = f"{place}.{name}".lstrip(".")
         if name not in hints:
             raise WeightsError(f"{printable(key, SHORT)}: there is no such setting, but {', '.join(hints)}")
-        hint = hints[name]
-        refusals = violations(hint, value)
+        refusals = violations(hints[name], value)
         if choices(name) and (value is not None or refusals):
             _check_part(key, value, choices(name))
-        elif is_typeddict(hint) and isinstance(value, Mapping):
-            _check_settings(key, hints_of(hint), value)
         elif refusals:
-            raise WeightsError(f"{key}={printable(value, SHORT)}: {refusals[0].reason}")
+            inner, refused, reason = refusals[0]
+            raise WeightsError(f"{key}{inner}={printable(refused, SHORT)}: {reason}")
 
 
-def _check_part(place: str, part: object, allowed: Mapping[str, str]) -> None:
+def _check_part(place: str, part: object, allowed: Sequence[str]) -> None:
     target = part.get("_target_") if isinstance(part, Mapping) else part
     name = name_of(target)
     kind = class_of(part)
@@ -331,7 +320,7 @@ def _check_parts_in(place: str, value: object) -> None:
         for index, entry in enumerate(value):
             _check_parts_in(f"{place}.{index}", entry)
     elif isinstance(value, Mapping) and "_target_" in value:
-        _check_part(place, value, paths_for_weights())
+        _check_part(place, value, names_for_weights())
     elif isinstance(value, Mapping):
         for name, part in value.items():
             if name in HYDRA_KEYS:

@@ -1,8 +1,8 @@
 """Reading of checkpoints and other `torch.save` files: plain tensors, in no more memory than the file has bytes.
 
-`torch.load(weights_only=True)` runs no code of a file, but the calls that it allows can turn a few bytes into much
-memory, and its tensors may repeat numbers. Therefore a dry run first adds up what the calls would make.
-None of this needs Lightning.
+`torch.load(weights_only=True)` runs no code of a file, but even with `mmap=True` it takes 2 GB for a file of 500 bytes
+that calls `bytearray(2**31)`. Therefore a dry run first adds up what the calls of a file would make, and what its
+tensors would repeat. None of this needs Lightning.
 """
 
 import io
