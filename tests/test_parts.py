@@ -20,7 +20,7 @@ from completesplat.splatter_image import Parameterization
 from completesplat.weights import CONFIG_FILE, LARGEST_TEXT, SHIPPED, SUMS_FILE
 from completesplat.weights.allowed import (
     SAMPLING_PARTS,
-    Origin,
+    ConfigOrigin,
     check_architecture,
     check_names,
     choices,
@@ -123,7 +123,7 @@ def targets(part: dict) -> list[str]:
 def test_weights_name_classes_by_name_and_their_paths_in_other_versions_count_too(folder):
     assert set(targets(json.loads((folder / CONFIG_FILE).read_text()))) <= set(names_for_weights())
     assert any("completesplat.autoreconstructor." in path for path in targets(SHIPPED_CONFIG))
-    origin = Origin(folder, folder, trust=False)
+    origin = ConfigOrigin(folder, folder, trust=False)
     for name, part in listed_parts().items():
         assert check_names({"_target_": name}, origin) == {"_target_": part.path}
     before = CompleteSplat.from_pretrained(folder)

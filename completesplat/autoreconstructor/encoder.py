@@ -17,13 +17,13 @@ Features = list[Float[Tensor, "batch _ _ _"]]
 
 
 def recompute(block: nn.Module, *inputs: Tensor | None) -> Tensor:
-    """Apply a block; in training, do not store its activations but recompute them in the backward pass."""
+    """Apply a block. In training its activations are not stored, but recomputed in the backward pass."""
     recomputed = block.training and torch.is_grad_enabled()
     return checkpoint(block, *inputs, use_reentrant=False) if recomputed else block(*inputs)
 
 
 def vae_encoder(inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, groups: int) -> vae.Encoder:
-    """Build the network of Stable Diffusion's VAE encoder; the resolution halves between levels."""
+    """Build the network of Stable Diffusion's VAE encoder, whose resolution halves between levels."""
     return vae.Encoder(
         in_channels=inputs,
         out_channels=outputs,
@@ -76,7 +76,7 @@ class Encoder(nn.Module):
         return self.encode(images * 2 - 1)
 
     def encode(self, values: Float[Tensor, "batch channel height width"]) -> tuple[Posterior, Features]:
-        """Encode values around zero without rescaling them; `forward` describes the result."""
+        """Encode values around zero without rescaling them (see `forward`)."""
         network = self.network
         run = recompute if self.gradient_checkpointing else nn.Module.__call__
         features = self.features(values, len(network.down_blocks))

@@ -20,7 +20,7 @@ DepthRange = Float[Tensor, "batch 2"]
 
 @dataclass(frozen=True)
 class Reconstruction(TensorDataclass):
-    """Prediction of a reconstruction model from one image; regression baselines have no posterior."""
+    """Prediction of a reconstruction model from one image. Regression baselines have no posterior."""
 
     splatter_image: SplatterImage
     posterior: Posterior | None

@@ -48,7 +48,10 @@ class PlaneSweep(nn.Module):
         zeroed(self.network.conv_out)
 
     def forward(self, views: Views, depth_range: DepthRange) -> Float[Tensor, "batch moment _ _"]:
-        """Return what to add to the moments; the reference is the first view, and its frame is the world."""
+        """Return what to add to the moments.
+
+        The reference is the first view, and its frame is the world.
+        """
         with torch.autocast(views.images.device.type, enabled=False):
             swept = sweep(views, depth_range, self.planes)
         reference = nn.functional.avg_pool2d(views.images[:, 0], 2)

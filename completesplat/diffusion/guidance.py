@@ -19,18 +19,19 @@ Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def allowed_skip_weight(given: float | None, visible: Tensor | None = None) -> float:
-    """Return the given weight; by default 1, or 0 if part of an image is hidden (`visible` below 1).
+    """Return the given weight, or by default 1, or 0 if part of an image is hidden (`visible` below 1).
 
     Raises:
         CompleteSplatError: the weight lies outside of [0, 1], or is above 0 although something is hidden.
     """
-    if given is not None:
-        check_weight("skip_weight", given)
     hidden = visible is not None and bool((visible < 1).any())
-    if hidden and given:
+    if given is None:
+        return 0.0 if hidden else 1.0
+    check_weight("skip_weight", given)
+    if hidden and given > 0:
         reason = "skips carry its pixels into the scene"
         raise CompleteSplatError(f"skip_weight={given:g}: must be 0 where the image is hidden, as {reason}")
-    return (0.0 if hidden else 1.0) if given is None else given
+    return given
 
 
 def check_weight(name: str, weight: float) -> None:
@@ -45,7 +46,7 @@ def guided_noise(
     """Return eps = (1 - w) * eps_conditional + w * eps_unconditional, with w in [0, 1].
 
     The customary guidance scale is s = 1 - w. The unconditional prediction has its conditioning zeroed, as in
-    training with probability 0.2. w = 0 and w = 1 cost one denoiser call; other weights cost one of twice the batch.
+    training with probability 0.2. w = 0 and w = 1 cost one denoiser call. Other weights cost one of twice the batch.
 
     Raises:
         CompleteSplatError: w lies outside of [0, 1].

@@ -12,7 +12,8 @@ from completesplat.errors import CompleteSplatError
 from completesplat.quantities import CameraPath, Entries, Format, NonNegative, Positive, Range, Seed, Share
 
 MOST_SHOWN = 1e6  # help texts leave out larger bounds
-NUMBERS: Mapping[type, type] = {int: Integral, float: Real}  # NumPy's are such, too
+NOT_A_LIST = "must be a list"
+NUMBERS: Mapping[type, type] = {int: Integral, float: Real}  # which include NumPy's numbers
 KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "null"}
 
 
@@ -157,22 +158,30 @@ def check_settings(function: object, settings: Mapping[str, object]) -> None:
         CompleteSplatError: a setting does not fit. The message names the first one, and the values that it may have.
     """
     hints = hints_of(function)
-    for name in [name for name in settings if name in hints]:
-        check_value(name, hints[name], settings[name])
+    for name in settings:
+        if name in hints:  # others may be missing in a config
+            check_value(name, hints[name], settings[name])
 
 
 def check_value(key: str, annotation: object, value: object) -> None:
     """Raise CompleteSplatError, with the values that are allowed, if a setting does not fit an annotation."""
-    for place, part, reason in violations(annotation, value):
-        example = f", such as {key}{place}=[{part}]" if reason == "must be a list" and part is not None else ""
-        raise CompleteSplatError(f"{key}{place}={'null' if part is None else part}: {reason}{example}")
+    unfit = violations(annotation, value)
+    if not unfit:
+        return
+    place, part, reason = unfit[0]
+    written = "null" if part is None else part
+    if reason == NOT_A_LIST and part is not None:
+        reason = f"{reason}, such as {key}{place}=[{part}]"
+    raise CompleteSplatError(f"{key}{place}={written}: {reason}")
 
 
 def hints_of(function: object) -> dict[str, object]:
-    """Return annotations by name, of a function's arguments or a `TypedDict`; expand `**name: Unpack[...]`."""
+    """Return annotations by name, of a function's arguments or a `TypedDict`, with those in `**name: Unpack[...]`."""
     hints = typing.get_type_hints(function, include_extras=True)
-    for shared in [typing.get_args(hint)[0] for hint in hints.values() if typing.get_origin(hint) is typing.Unpack]:
-        hints |= typing.get_type_hints(shared, include_extras=True)
+    for hint in list(hints.values()):
+        if typing.get_origin(hint) is typing.Unpack:
+            shared = typing.get_args(hint)[0]
+            hints.update(typing.get_type_hints(shared, include_extras=True))
     return hints
 
 
@@ -181,13 +190,14 @@ def arguments_of(target: Callable[..., object] | type) -> tuple[dict[str, object
 
     If a class passes further settings on to its base class, the arguments of the base class are included.
     """
-    kinds = target.__mro__ if isinstance(target, type) else ()
-    functions = [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [target]
+    functions: list[Callable[..., object]] = [target]
+    if isinstance(target, type):
+        functions = [vars(kind)["__init__"] for kind in target.__mro__ if "__init__" in vars(kind)]
     annotations: dict[str, object] = {}
     for function in functions:
         try:
             further, passes_on = _named_arguments(function)
-        except (NameError, TypeError, ValueError):  # other packages: names only under TYPE_CHECKING
+        except (NameError, TypeError, ValueError):  # annotations of other packages may name what only checkers import
             return annotations, False
         annotations = further | annotations
         if not passes_on:
@@ -198,12 +208,18 @@ def arguments_of(target: Callable[..., object] | type) -> tuple[dict[str, object
 def _named_arguments(function: Callable[..., object]) -> tuple[dict[str, object], bool]:
     """Return annotations of a function's arguments by name, and whether it has a `**` that takes any others."""
     hints = hints_of(function)
-    parameters = inspect.signature(function).parameters.values()
-    named = {param.name for param in parameters if param.kind in (param.POSITIONAL_OR_KEYWORD, param.KEYWORD_ONLY)}
-    unpacked = hints.keys() - {param.name for param in parameters} - {"return"}
-    others = [hints.get(param.name) for param in parameters if param.kind is param.VAR_KEYWORD]
-    annotations = {name: hints.get(name, object) for name in (named | unpacked) - {"self"}}
-    return annotations, any(typing.get_origin(hint) is not typing.Unpack for hint in others)
+    annotations: dict[str, object] = {}
+    takes_any = False
+    for name, parameter in inspect.signature(function).parameters.items():
+        hint = hints.pop(name, object)
+        if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
+            annotations[name] = hint
+        elif parameter.kind is parameter.VAR_KEYWORD and typing.get_origin(hint) is not typing.Unpack:
+            takes_any = True
+    annotations.update(hints)  # the names in `**name: Unpack[...]`
+    annotations.pop("self", None)
+    annotations.pop("return", None)
+    return annotations, takes_any
 
 
 def violations(annotation: object, value: object) -> list[Violation]:
@@ -266,28 +282,38 @@ def _entries_reason(allowed: Entries, count: int) -> str | None:
 
 
 def _in_choice(choices: Sequence[object], value: object) -> list[Violation]:
+    if value in choices:
+        return []
     written = ", ".join("null" if choice is None else str(choice) for choice in choices)
-    return [] if value in choices else [Violation("", value, f"choose one of {written}")]
+    return [Violation("", value, f"choose one of {written}")]
 
 
 def _in_union(members: Sequence[object], value: object) -> list[Violation]:
     if all(typing.get_origin(member) is Literal or member is NoneType for member in members):
-        return _in_choice([choice for member in members for choice in typing.get_args(member) or (None,)], value)
+        choices: list[object] = []
+        for member in members:
+            choices.extend([None] if member is NoneType else typing.get_args(member))
+        return _in_choice(choices, value)
     # Of `float | Tensor` only float counts, because no setting is a tensor. Classes without numbers accept everything.
     if {int, float} & set(members) and isinstance(value, str | int | float | Sequence):
         members = [member for member in members if not isinstance(member, type) or member in KINDS]
-    if isinstance(value, Sequence) and not isinstance(value, str):  # for the reason that its entries do not fit
-        members = [*(member for member in members if typing.get_origin(member) is Sequence), *members]
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        # Lists first, because the message gives the first reason.
+        lists = [member for member in members if typing.get_origin(member) is Sequence]
+        members = lists + [member for member in members if member not in lists]
     attempts = [violations(member, value) for member in members]
     if [] in attempts:
         return []
-    others = [described(x) or "null" for x in members if x is NoneType or typing.get_origin(x) is Literal]
-    return [unfit._replace(reason=", or ".join([unfit.reason, *others])) for unfit in attempts[0]]
+    alternatives: list[str] = []
+    for member in members:
+        if member is NoneType or typing.get_origin(member) is Literal:
+            alternatives.append(described(member) or "null")
+    return [unfit._replace(reason=", or ".join([unfit.reason, *alternatives])) for unfit in attempts[0]]
 
 
 def _in_list(kind: object, value: object) -> list[Violation]:
     if isinstance(value, str) or not isinstance(value, Sequence):
-        return [Violation("", value, "must be a list")]
+        return [Violation("", value, NOT_A_LIST)]
     # If an entry does not fit, the whole list is reported.
     return [Violation("", value, unfit.reason) for entry in value for unfit in violations(kind, entry)]
 
@@ -295,16 +321,21 @@ def _in_list(kind: object, value: object) -> list[Violation]:
 def _in_mapping(annotation: object, value: object) -> list[Violation]:
     if not isinstance(value, Mapping):
         return [Violation("", value, "must be a mapping")]
-    hints = typing.get_type_hints(annotation, include_extras=True) if typing.is_typeddict(annotation) else None
+    hints: Mapping[str, object] = {}
+    default: object = object
+    if typing.is_typeddict(annotation):
+        hints = typing.get_type_hints(annotation, include_extras=True)
+    else:
+        default = typing.get_args(annotation)[1]
     result = []
     for key, part in value.items():
-        kind = typing.get_args(annotation)[1] if hints is None else hints.get(key, object)
-        result += [unfit._replace(place=f".{key}{unfit.place}") for unfit in violations(kind, part)]
+        for unfit in violations(hints.get(key, default), part):
+            result.append(unfit._replace(place=f".{key}{unfit.place}"))
     return result
 
 
 def described(annotation: object) -> str:
-    """Describe the values that an annotation allows in a few words; return an empty text if unknown."""
+    """Describe the values that an annotation allows in a few words, or by an empty text if they are unknown."""
     origin = typing.get_origin(annotation)
     arguments = typing.get_args(annotation)
     if origin is Annotated:
@@ -329,6 +360,6 @@ def _range_words(allowed: Range) -> str:
 
 
 def _is_a(kind: type, value: object) -> bool:
-    if kind is bool or isinstance(value, bool):
-        return kind is bool and isinstance(value, bool)
+    if isinstance(value, bool):
+        return kind is bool
     return isinstance(value, NUMBERS.get(kind, kind))

@@ -19,7 +19,7 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, NamedTuple, TypedDict
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict, is_typeddict
 
 from huggingface_hub import constants
 from hydra.utils import get_object
@@ -53,7 +53,7 @@ class TrainingImages(TypedDict, total=False):
     shows this, before it is seen (0: even); low for renders, which are rare, and high for fruit on white. `box_masks`:
     how often parts of an image were hidden. `background`: grey value behind the objects, if images show nothing else.
     `depth_before`: depth range before the centre of an object of the common size. The others: mean
-    and standard deviation of the training images' features, see `completesplat.data.images.photograph.image_features`.
+    and standard deviation of the training images' features, see `completesplat.photo.features.image_features`.
     """
 
     content: str
@@ -152,7 +152,7 @@ def name_of(target: object) -> str | None:
 
 
 @dataclass(frozen=True)
-class Origin:
+class ConfigOrigin:
     """The file that a config comes from.
 
     Args:
@@ -177,7 +177,7 @@ class Origin:
         return self.trust or (below and not downloaded and owners == {os.getuid()})
 
 
-def check_names(config: Any, origin: Origin, setting: object = "") -> Any:
+def check_names(config: Any, origin: ConfigOrigin, setting: object = "") -> Any:
     """Return a plain config with the present paths of parts that it names by name or old path.
 
     A config may name what is listed, and optimizers of torch. What the user's modules define may be named if the origin
@@ -291,12 +291,14 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
         key = f"{place}.{name}".lstrip(".")
         if name not in hints:
             raise WeightsError(f"{printable(key, SHORT)}: there is no such setting, but {', '.join(hints)}")
-        refusals = violations(hints[name], value)
+        hint = hints[name]
+        refusals = violations(hint, value)
         if choices(name) and (value is not None or refusals):
             _check_part(key, value, choices(name))
+        elif is_typeddict(hint) and isinstance(value, Mapping):
+            _check_settings(key, hints_of(hint), value)
         elif refusals:
-            inner, refused, reason = refusals[0]
-            raise WeightsError(f"{key}{inner}={printable(refused, SHORT)}: {reason}")
+            raise WeightsError(f"{key}={printable(value, SHORT)}: {refusals[0].reason}")
 
 
 def _check_part(place: str, part: object, allowed: Sequence[str]) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from completesplat.errors import WeightsError
 from completesplat.files import SHORT, printable
 from completesplat.weights import CAMERA, CONFIG_FILE, RUN_WEIGHTS, SCENES, WEIGHTS_FILE, locate, read_small
-from completesplat.weights.allowed import Origin, check_architecture, check_names, stored_config
+from completesplat.weights.allowed import ConfigOrigin, check_architecture, check_names, stored_config
 from completesplat.weights.checkpoint_reading import read_checkpoint
 from completesplat.weights.runs import read_run_config
 
@@ -48,7 +48,7 @@ def _read_weights(file: Path, trust: bool) -> StoredModel:
         raise WeightsError(f"{path}: not readable as JSON ({error})") from error
     folder = path.resolve().parent
     run = folder.parent if folder.name == RUN_WEIGHTS else folder
-    return StoredModel(_allowed(config, Origin(path, run, trust)), load_file(file), path, file)
+    return StoredModel(_allowed(config, ConfigOrigin(path, run, trust)), load_file(file), path, file)
 
 
 def _read_run(checkpoint: Path, trust: bool) -> StoredModel:
@@ -61,7 +61,7 @@ def _read_run(checkpoint: Path, trust: bool) -> StoredModel:
         advice = f"; those that it fitted are in {fitted}" if fitted.is_dir() else ""
         raise WeightsError(f"{path} names {target}: a run of {stage} makes no scene of a photograph{advice}")
     part = config["model"].get(STAGES[stage])
-    origin = Origin(path, path.resolve().parent, trust)
+    origin = ConfigOrigin(path, path.resolve().parent, trust)
     prefix = f"{STAGES[stage]}."
     if stage == "ReconstructionModule":
         settings = {"network": part, "image_size": config["data"].get("image_size")}
@@ -76,7 +76,7 @@ def _read_run(checkpoint: Path, trust: bool) -> StoredModel:
     return StoredModel(architecture, tensors, path, checkpoint)
 
 
-def _allowed(config: Any, origin: Origin) -> dict[str, Any]:
+def _allowed(config: Any, origin: ConfigOrigin) -> dict[str, Any]:
     """Return a model's config as weights store it; raise WeightsError for what the list does not allow."""
     named = check_names(config, origin)
     check_architecture(named, origin.file)

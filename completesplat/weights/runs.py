@@ -12,7 +12,7 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.settings import checks
 from completesplat.settings.schema import check_value
 from completesplat.weights import RUN_CONFIG_FILE, first_line, read_small
-from completesplat.weights.allowed import Origin, check_names
+from completesplat.weights.allowed import ConfigOrigin, check_names
 
 SECTIONS = ["model", "data"]  # sections of a run's config that are read
 CONFIG = "hyper_parameters"  # Lightning's name for the config in a checkpoint
@@ -32,7 +32,7 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
     if not checkpoint.is_file():
         raise WeightsError(f"{checkpoint}: no such checkpoint")
     path, config = read_run_config(checkpoint)
-    allowed = OmegaConf.create(check_names(config, Origin(path, path.resolve().parent, trust)))
+    allowed = OmegaConf.create(check_names(config, ConfigOrigin(path, path.resolve().parent, trust)))
     return without_training(_changed(allowed, overrides))
 
 
@@ -45,7 +45,7 @@ def config_of_checkpoint(checkpoint: Path, contents: Mapping[str, Any], trust: b
     if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
         reason = "has no config; train with `fit`, or with what completesplat.instantiate gives"
         raise WeightsError(f"{checkpoint}: {reason}")
-    allowed: dict[str, Any] = check_names(config, Origin(checkpoint, checkpoint.resolve().parent.parent, trust))
+    allowed: dict[str, Any] = check_names(config, ConfigOrigin(checkpoint, checkpoint.resolve().parent.parent, trust))
     return allowed
 
 
