@@ -261,7 +261,7 @@ class SceneModel(nn.Module):
 
     @property
     def framing(self) -> Framing:
-        """How photos are framed for this model, which is how its training images were.
+        """Return how photos are framed for this model, which is how its training images were.
 
         The central square is enlarged where a cut-out or transparent object reaches beyond it. A model of objects on a
         background gets such an object on it, as large as in training. It takes every image as of its training's field

@@ -228,7 +228,7 @@ def _given_data(data: Mapping[str, object], seed: int) -> Any:
 
 
 def _rendering(rasterizer: Mapping[str, object], background: object) -> dict[str, Any]:
-    """Return the settings of a scorer's renders; without a background, it has its own default."""
+    """Return the settings of a scorer's renders, without a background if that is not known."""
     settings = {"rasterizer": instantiate(rasterizer, _convert_="all")}
     if background is not None:
         settings["background"] = background

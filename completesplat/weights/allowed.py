@@ -47,13 +47,19 @@ class ListedPart(NamedTuple):
 
 
 class TrainingImages(TypedDict, total=False):
-    """Facts about the training images that are stored with weights; older weights have none.
+    """Facts about the training images that are stored with weights.
 
-    `content`: what they show, in words, for weights in the package. `log_odds`: logarithm of the odds that a photo
-    shows this, before it is seen (0: even); low for renders, which are rare, and high for fruit on white. `box_masks`:
-    how often parts of an image were hidden. `background`: grey value behind the objects, if images show nothing else.
-    `depth_before`: depth range before the centre of an object of the common size. The others: mean
-    and standard deviation of the training images' features, see `completesplat.photo.features.image_features`.
+    Weights of earlier versions have none.
+
+    Attributes:
+        content: what they show, in words, for weights in the package.
+        log_odds: logarithm of the odds that a photo shows this, before it is seen (0: even). It is low for renders,
+            which are rare, and high for fruit on white.
+        box_masks: how often parts of an image were hidden.
+        background: grey value behind the objects, if images show nothing else.
+        depth_before: depth range before the centre of an object of the common size.
+        picture_mean, picture_std: mean and standard deviation of the training images' features, see
+            `completesplat.photo.features.image_features`.
     """
 
     content: str
@@ -73,7 +79,7 @@ DETERMINISTIC_SETTINGS = {"network": PartConfig} | COMMON_SETTINGS
 
 
 class SchedulerSettings(TypedDict, total=False):
-    """Settings of diffusers' schedulers, which check none themselves; each scheduler has some of them."""
+    """Settings of diffusers' schedulers, which do not check them. Each scheduler has some of them."""
 
     num_train_timesteps: Annotated[int, Range(1, 10_000)]
     beta_start: Share
@@ -107,7 +113,10 @@ class SchedulerSettings(TypedDict, total=False):
 
 @cache
 def listed_parts() -> dict[str, ListedPart]:
-    """Return all that the package's `conf/` names for models and data, by name; the working folder's adds nothing."""
+    """Return all that the package's `conf/` names for models and data, by name.
+
+    The `conf/` of the working folder adds nothing.
+    """
     parts: dict[str, ListedPart] = {}
     for group in (*GROUPS_OF_WEIGHTS, *GROUPS_OF_RUNS):
         for file in (conf_folder() / group).glob("*.yaml"):
@@ -134,7 +143,7 @@ def _named_in(setting: str, config: object) -> Iterator[tuple[str, str]]:
 
 @cache
 def choices(setting: str) -> list[str]:
-    """Return the names that weights may have for a setting which is a part, such as `encoder`; none for others."""
+    """Return the names that weights may give for a setting, such as `encoder`; none if the setting is no part."""
     settings = {"autoreconstructor", "regressor"} if setting == "network" else {setting}
     return sorted(name for name, part in listed_parts().items() if settings & part.settings)
 
@@ -237,11 +246,13 @@ def own_part(target: str) -> Any:
 
 def _is_installed(path: Path) -> bool:
     libraries = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")}
-    return not {"site-packages", "dist-packages"}.isdisjoint(path.parts) or not libraries.isdisjoint(path.parents)
+    if "site-packages" in path.parts or "dist-packages" in path.parts:
+        return True
+    return any(library in path.parents for library in libraries)
 
 
 def class_of(part: object) -> Any:
-    """Return the class that a part's config names, by its name or a path of any version, or a user's own; else None."""
+    """Return the class that a part's config names, which is listed or the user's own; None if it may not be named."""
     target = part.get("_target_") if isinstance(part, Mapping) else None
     if not isinstance(target, str):
         return None

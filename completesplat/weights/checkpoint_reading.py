@@ -62,7 +62,11 @@ def _refusing_damage() -> Iterator[None]:
 
 
 def _checked_pickle(path: Path, sums: bool) -> bytes:
-    """Return the pickle in an archive whose records are whole; `sums`: compare their CRC-32, which torch does not."""
+    """Return the pickle in an archive whose records are whole.
+
+    Args:
+        sums: compare the records' checksums (CRC-32), which torch does not.
+    """
     with path.open("rb") as file, zipfile.ZipFile(file) as records:
         # If a file starts with other bytes, torch reads an older format, even if an archive follows.
         file.seek(0)
@@ -91,9 +95,10 @@ class _Made:
 
 
 class _DryRun(pickle._Unpickler):
-    """Reading of a pickle without making tensors; TensorFileError if that would take more than `most` bytes.
+    """Reading of a pickle that makes no tensors but counts their bytes.
 
-    The unpickler in C is not used, because it reserves memory for any index that a file names.
+    It raises TensorFileError if there are more than `most`. The unpickler in C is not used, because it reserves memory
+    for any index that a file names.
     """
 
     # Later operations reserve memory for any length, and torch.save does not write them.

@@ -1,4 +1,4 @@
-"""Configs of runs of `fit`, from their folders and checkpoints; `check_names` holds them to the list before use."""
+"""Configs of runs of `fit`, from their folders and checkpoints, after `check_names` has held them to the list."""
 
 from collections.abc import Mapping
 from pathlib import Path

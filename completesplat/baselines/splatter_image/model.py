@@ -224,7 +224,7 @@ class PublishedModel(SceneModel):
 
     @property
     def framing(self) -> Framing:
-        """How photos are framed: on the background that the weights know.
+        """Return how photos are framed: on the background that the weights know.
 
         If the weights know only one field of view, the image is taken to have it, and a cut-out object is placed in the
         middle of the image, as large as in training.
