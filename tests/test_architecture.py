@@ -24,7 +24,7 @@ LAYERS = """
     imports version errors quantities signals files settings ply_files weights tensors
     geometry gaussians splatter_image scene rasterizers
     photo data autoreconstructor diffusion losses metrics scene_model baselines parts run_configs generator export
-    training viewer results studies commands cli
+    evaluation training viewer commands cli
     benchmarks
 """
 FLOORS = LAYERS.split()

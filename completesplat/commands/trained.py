@@ -11,8 +11,8 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from completesplat.commands.inputs import check_one_model
-from completesplat.commands.protocol import checkpoint_facts
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.provenance import checkpoint_facts
 from completesplat.generator import CompleteSplat
 from completesplat.photo.choice import likeliest_weights
 from completesplat.run_configs import config_of_run
@@ -24,7 +24,8 @@ from completesplat.weights.checkpoint_reading import load_part
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
-    from completesplat.training.scoring import SceneFiles, Scorer
+    from completesplat.evaluation.scene_files import SceneFiles
+    from completesplat.evaluation.scorer import Scorer
 
 logger = logging.getLogger(__name__)
 WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no effect"
@@ -61,7 +62,7 @@ class TrainedModel:
 
     @cached_property
     def files(self) -> "SceneFiles":
-        from completesplat.training.scoring import SceneFiles
+        from completesplat.evaluation.scene_files import SceneFiles
 
         rendering = self._rendering((self.data or {}).get("background"))
         return SceneFiles(str(self.scenes), self.frame, self.align, self.method, **rendering)

@@ -19,6 +19,7 @@ from completesplat.baselines import fitting
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.sequences import PosedSequence, first_names
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.scorer import Renders
 from completesplat.export.fitted_scene import FittedViews, write_fitted_scene
 from completesplat.export.placed_scene import FileCoordinates, PlacedScene
 from completesplat.export.scene_files import OutputFiles, write_scene
@@ -29,7 +30,6 @@ from completesplat.quantities import CameraPath, Format, NonNegative, Positive, 
 from completesplat.scene import Batch, SceneBatch, Views
 from completesplat.tensors import stack
 from completesplat.training.optimization import Schedule, constant
-from completesplat.training.scoring import Renders
 from completesplat.training.stage import Stage
 
 REFINED_SHARE = 0.8  # of the run, in which Gaussians move and are added (25,000 of 30,000 steps in 3DGS-MCMC)
@@ -42,12 +42,12 @@ class CaptureSettings:
     """Settings of the Gaussians of a capture.
 
     Attributes:
-        initial, most: first and largest number of Gaussians; the first is at most that of the points.
+        initial, most: first and largest number of Gaussians. The first is at most that of the points.
         opacity: initial opacity of all Gaussians.
         refine_every: steps between relocations of dead Gaussians, which add the share `growth` of new ones.
         opacity_weight, scale_weight: weights of mean opacity and mean scale in the loss.
         position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
-        opacity_rate: factor on the opacities' learning rate; with 4, captures of flat floors and walls collapse.
+        opacity_rate: factor on the opacities' learning rate. With 4, captures of flat floors and walls collapse.
     """
 
     initial: fitting.Count = 20_000
@@ -75,7 +75,7 @@ class CaptureFit(Stage):
     """
 
     first_novel = 0  # all held-out photos count as one
-    without_effect = ("optimizer", "schedule")
+    unused_settings = ("optimizer", "schedule")
 
     def __init__(
         self,
