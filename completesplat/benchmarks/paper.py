@@ -22,8 +22,8 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.trajectories import orbit
+from completesplat.quantities import Natural, Positive
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Natural, Positive
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stage import Stage

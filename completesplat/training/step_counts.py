@@ -24,7 +24,7 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.losses.ssim import blur_matrix
 from completesplat.rasterizers import Rendering, with_view_colors
 from completesplat.scene import Batch, CachedScene, SceneBatch
-from completesplat.training.capture import CaptureFit
+from completesplat.training.capture_fit import CaptureFit
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stage import Stage

@@ -8,6 +8,7 @@ from typing import Any
 import bmesh
 import bpy
 import numpy as np
+from _placement import stray_faces
 from mathutils import Matrix
 
 IMPORTERS = {
@@ -17,12 +18,21 @@ IMPORTERS = {
     "ply": "wm.ply_import",
     "stl": "wm.stl_import",
     "fbx": "import_scene.fbx",
-    **dict.fromkeys(USD := ("usd", "usda", "usdc", "usdz"), "wm.usd_import"),
+    "usd": "wm.usd_import",
+    "usda": "wm.usd_import",
+    "usdc": "wm.usd_import",
+    "usdz": "wm.usd_import",
 }
 # With these, an importer keeps vertices that are not finite, which it would otherwise move to the origin.
-AS_STORED = {"stl": {"use_mesh_validate": False}, **{kind: {"validate_meshes": False} for kind in ("obj", *USD)}}
-MOST = 0.99
-FAR = 4.0  # share of the surface, and its reach times which faces count as stray
+UNCHECKED = {"validate_meshes": False}
+AS_STORED = {
+    "stl": {"use_mesh_validate": False},
+    "obj": UNCHECKED,
+    "usd": UNCHECKED,
+    "usda": UNCHECKED,
+    "usdc": UNCHECKED,
+    "usdz": UNCHECKED,
+}
 
 
 class RefusedMesh(Exception):
@@ -30,7 +40,7 @@ class RefusedMesh(Exception):
 
 
 def import_mesh(path: Path, root: Path) -> None:
-    """Import a file into the empty scene; refuse one that Blender cannot read, or whose textures it cannot use."""
+    """Import a file into the empty scene, or refuse one that Blender cannot read, or whose textures it cannot use."""
     kind = path.suffix[1:].lower()
     module, name = IMPORTERS[kind].split(".")
     try:
@@ -58,7 +68,7 @@ def check_texture(image: Any, root: Path) -> None:
 
 
 def find_factory(name: str) -> Any:
-    """Return Infinigen's class of procedural objects; import only the package that names it, which saves seconds."""
+    """Return Infinigen's class of procedural objects, and import only the package that names it to save seconds."""
     try:
         import infinigen.assets.objects as kinds
     except ImportError as error:
@@ -161,25 +171,6 @@ def values_of(items: Any, name: str, kind: Any = np.int32, width: int = 1) -> An
     values = np.empty(len(items) * width, kind)
     items.foreach_get(name, values)
     return values
-
-
-def stray_faces(corners: Any, sizes: Any, areas: Any) -> Any:
-    """Return a mask of the faces that reach farther than `FAR` times the ball that holds `MOST` of the surface.
-
-    The ball's centre is the median of the faces, weighted by area, which stray faces do not move.
-    """
-    firsts = np.cumsum(sizes) - sizes
-    weights = areas + 1e-300  # equal if no face has an area
-    middle = [quantile(places, weights, 0.5) for places in corners[firsts].T]
-    reaches = np.maximum.reduceat(np.linalg.norm(corners - middle, axis=1), firsts)
-    return reaches > FAR * quantile(reaches, weights, MOST)
-
-
-def quantile(values: Any, weights: Any, share: float) -> Any:
-    """Return the smallest value such that values up to it have this share of the weight."""
-    order = values.argsort()
-    total = weights[order].cumsum()
-    return values[order][np.searchsorted(total, share * total[-1])]
 
 
 def remove_faces(mesh: Any, mask: Any) -> None:

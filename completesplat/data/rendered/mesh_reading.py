@@ -1,6 +1,5 @@
 """Textured triangles of mesh files, read by trimesh: upright, centred, the farthest corner at distance 1."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from jaxtyping import Float, Int, UInt8, UInt16
 from PIL import Image, UnidentifiedImageError
 
 from completesplat.data.rendered._placement import stray_faces
+from completesplat.data.rendered.assets import BrokenMesh, gltf_description
 
 READABLE = (".glb", ".gltf", ".obj", ".ply")
 """Suffixes that trimesh reads with their textures; Blender reads the others."""
@@ -22,10 +22,6 @@ GREY = 0.8  # linear, of faces without colour: Blender's own default
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 TURNS = {".ply": np.eye(3), ".obj": Y_UP, ".glb": Y_UP, ".gltf": Y_UP}
 """Rotations that make z point up, by the rules of the formats (of PLY, which has none: as stored)."""
-
-
-class UnreadableMesh(Exception):
-    """Mesh that cannot be drawn; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +85,8 @@ class TextureFiles:
         """Return a file's content.
 
         Raises:
-            FileNotFoundError: it is missing, outside of the root, or an image that cannot be decoded; `refused` says so.
+            FileNotFoundError: it is missing, outside of the root, or an image that cannot be decoded.
+                `refused` says which.
         """
         path = self._find(name.strip().replace("\\", "/"))
         if path is None:
@@ -137,7 +134,7 @@ def read_mesh(path: Path, root: Path) -> TexturedMesh:
         root: folder that all its textures must lie in, with links resolved.
 
     Raises:
-        UnreadableMesh: trimesh cannot read it, a texture is missing or cannot be read, or its faces cannot be drawn.
+        BrokenMesh: trimesh cannot read it, a texture is missing or cannot be read, or its faces cannot be drawn.
     """
     import trimesh
 
@@ -150,34 +147,19 @@ def read_mesh(path: Path, root: Path) -> TexturedMesh:
             ]
         except Exception as error:  # trimesh raises many kinds for a damaged file
             reason = files.refused[0] if files.refused else f"trimesh cannot read it: {type(error).__name__}"
-            raise UnreadableMesh(reason) from error
-    description = read_description(path)
+            raise BrokenMesh(reason) from error
     if files.refused:
-        raise UnreadableMesh(files.refused[0])
+        raise BrokenMesh(files.refused[0])
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
+    description = gltf_description(path) if is_gltf else {}
     parts = []
     for geometry, matrix in geometries:
         if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
             _require_texture(geometry, description)
             parts.append(_part(geometry, matrix, is_gltf))
     if not parts:
-        raise UnreadableMesh("it has no faces")
+        raise BrokenMesh("it has no faces")
     return _joined(parts, TURNS[path.suffix.lower()], _beyond(description))
-
-
-def read_description(path: Path) -> dict[str, Any]:
-    """Return the JSON of a glTF file, {} for another format or one that cannot be read."""
-    if path.suffix.lower() not in (".glb", ".gltf"):
-        return {}
-    with path.open("rb") as file:
-        start = file.read(20)
-        binary = start.startswith(b"glTF")
-        content = file.read(int.from_bytes(start[12:16], "little") if binary else -1)
-    try:
-        description = json.loads(content if binary else start + content)
-    except (ValueError, RecursionError):
-        return {}
-    return description if isinstance(description, dict) else {}
 
 
 def _require_texture(geometry: Any, description: dict[str, Any]) -> None:
@@ -186,7 +168,7 @@ def _require_texture(geometry: Any, description: dict[str, Any]) -> None:
     named = [x for x in description.get("materials", ()) if x.get("name") == getattr(material, "name", None)]
     wanted = bool(named) and all("baseColorTexture" in x.get("pbrMetallicRoughness", {}) for x in named)
     if wanted and getattr(material, "baseColorTexture", None) is None:
-        raise UnreadableMesh("it has a texture that cannot be read: damaged, or of a format such as KTX2")
+        raise BrokenMesh("it has a texture that cannot be read: damaged, or of a format such as KTX2")
 
 
 def _beyond(description: dict[str, Any]) -> str:
@@ -259,7 +241,7 @@ def _joined(parts: list[_Part], turn: Float[np.ndarray, "3 3"], beyond: str) -> 
     """Join parts to one mesh that stands upright, without stray faces, in the unit ball."""
     corners = np.concatenate([part.corners for part in parts]) @ turn.T
     if not np.isfinite(corners).all():
-        raise UnreadableMesh("it has vertices that are not finite")
+        raise BrokenMesh("it has vertices that are not finite")
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(crosses, axis=1) / 2
     stray = stray_faces(corners.reshape(-1, 3), np.full(len(corners), 3), areas)
@@ -269,7 +251,7 @@ def _joined(parts: list[_Part], turn: Float[np.ndarray, "3 3"], beyond: str) -> 
     center = (low + high) / 2
     radius = float(np.linalg.norm(corners - center, axis=-1).max())
     if not radius > 1e-12:
-        raise UnreadableMesh("all its vertices are in one place")
+        raise BrokenMesh("all its vertices are in one place")
     corners = (corners - center) / radius
     images = [part.image for part in parts]
     return TexturedMesh(

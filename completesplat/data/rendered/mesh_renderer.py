@@ -1,18 +1,21 @@
 """Images of textured meshes without Blender: z-buffer, sun with soft shadows, sky, ground and walls.
 
-It draws the jobs of `drawing.draw_rendered_scene`, as `_scene_script.py` does in Blender, and writes the same files. What
-it leaves out: light from surface to surface other than from the ground, highlights, metal and glass.
+It draws the jobs of `draw_rendered_scene`, as `_scene_script.py` does in Blender, and writes the same files. It leaves
+out highlights, metal, glass, and light from surface to surface other than from the ground.
 """
 
 import math
+import time
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from PIL import Image
 
+from completesplat.data.rendered.assets import BrokenMesh
 from completesplat.data.rendered.mesh_reading import TexturedMesh, Textures, packed_textures, read_mesh, to_srgb
 from completesplat.data.rendered.z_buffer import NOTHING, draw_rectangles, draw_triangles, light_share, look_up
 
@@ -74,16 +77,21 @@ class Plane:
         return np.stack([self.corner, *self.sides, self.normal])
 
 
-def draw_job(job: dict[str, Any]) -> dict[str, Any]:
+def draw_job(job: dict[str, Any], stopped: Event, minutes: float = math.inf) -> dict[str, Any]:
     """Draw all views of a job's mesh into the job's folder; return the object's place and scale.
 
-    For each view the files are `NNNN.png`, the colours, and `NNNN.npy`, float32 [height width 3]: depth along the optical
-    axis, 1 where the pixel's centre shows the object, and the object's coverage of the pixel. With paints for the back,
-    `K_NNNN.png` has the colours with paint K, and `NNNN.png` those with paint 0.
+    For each view the files are `NNNN.png`, the colours, and `NNNN.npy`, float32 [height width 3]: depth along the
+    optical axis, 1 where the pixel's centre shows the object, and the object's coverage of the pixel. With paints for
+    the back, `K_NNNN.png` has the colours with paint K, and `NNNN.png` those with paint 0.
+
+    Args:
+        stopped: an event after which no further view is drawn.
+        minutes: time after which no further view is drawn.
 
     Raises:
-        UnreadableMesh: the mesh cannot be drawn.
+        BrokenMesh: the mesh cannot be drawn, or not in this time.
     """
+    end = time.monotonic() + 60 * minutes
     mesh = read_mesh(Path(job["mesh"]), Path(job["root"]))
     planes = surroundings(job, float(mesh.corners[..., 2].min()))
     lighting = light_of(job["light"], mesh, planes)
@@ -93,6 +101,8 @@ def draw_job(job: dict[str, Any]) -> dict[str, Any]:
     samples = max(1, round(math.sqrt(job["samples"])))
     back = painted_triangles(mesh, hidden) if hidden else np.zeros(len(mesh.corners), bool)
     for number, view in enumerate(job["views"]):
+        if stopped.is_set() or time.monotonic() > end:
+            raise BrokenMesh(f"took longer than max_minutes={minutes:g}")
         scene = _Scene(mesh, lighting, planes, back)
         depth, seen = scene.geometry(view)
         for index, paint in enumerate(paints):

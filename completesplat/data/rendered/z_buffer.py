@@ -43,7 +43,7 @@ def bilinear(texels, start, width, height, u, v, channel):
 
 
 @compiled
-def draw_triangles(points, uv, texture, texels, levels, cut, triangles, weights, depth):
+def draw_triangles(points, uv, texture, texels, levels, cut, triangles, weights, depth):  # noqa: PLR0913
     """Find the nearest triangle at each pixel's centre.
 
     Args:

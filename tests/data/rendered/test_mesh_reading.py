@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from completesplat.data.rendered.mesh_reading import UnreadableMesh, read_mesh
+from completesplat.data.rendered.assets import BrokenMesh
+from completesplat.data.rendered.mesh_reading import read_mesh
 
 CASES = Path(__file__).parents[2] / "cases"
 trimesh = pytest.importorskip("trimesh")
@@ -57,21 +58,21 @@ def test_textures_are_found(cube, tmp_path, place, name):
 
 def test_a_texture_that_is_missing_outside_or_damaged_is_refused(cube, tmp_path):
     path = moved(cube, "../../../outside.png")
-    with pytest.raises(UnreadableMesh, match=r"its texture model.png is missing"):
+    with pytest.raises(BrokenMesh, match=r"its texture model.png is missing"):
         read_mesh(cube, tmp_path / "root")
     cube.with_suffix(".mtl").write_text("newmtl checker\nmap_Kd ../../../outside.png\n")
-    with pytest.raises(UnreadableMesh, match=r"its texture outside.png lies outside of the folder of meshes"):
+    with pytest.raises(BrokenMesh, match=r"its texture outside.png lies outside of the folder of meshes"):
         read_mesh(cube, (tmp_path / "root").resolve())
     content = path.read_bytes()
     (cube.parent / "outside.png").write_bytes(content[: len(content) // 2])
     cube.with_suffix(".mtl").write_text("newmtl checker\nmap_Kd outside.png\n")
-    with pytest.raises(UnreadableMesh, match=r"its texture outside.png cannot be read"):
+    with pytest.raises(BrokenMesh, match=r"its texture outside.png cannot be read"):
         read_mesh(cube, (tmp_path / "root").resolve())
 
 
 @pytest.mark.parametrize("name", ["badtex.glb", "cuttex.glb", "lfstex.glb", "ktx2only.glb"])
 def test_textures_of_glb_files_that_cannot_be_read_are_refused(name):
-    with pytest.raises(UnreadableMesh, match=r"texture"):
+    with pytest.raises(BrokenMesh, match=r"texture"):
         read_mesh(CASES / "meshes" / name, CASES.resolve())
 
 
@@ -83,10 +84,10 @@ def test_faces_that_are_stray_empty_or_not_finite(cube, tmp_path):
     assert np.linalg.norm(mesh.corners, axis=-1).max() == pytest.approx(1)
     for content, reason in (("v 0 0 0\n", "no faces"), ("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not finite")):
         cube.write_text(content)
-        with pytest.raises(UnreadableMesh, match=reason):
+        with pytest.raises(BrokenMesh, match=reason):
             read_mesh(cube, tmp_path.resolve())
     cube.write_text("v 1 1 1\n" * 3 + "f 1 2 3\n")
-    with pytest.raises(UnreadableMesh, match="in one place"):
+    with pytest.raises(BrokenMesh, match="in one place"):
         read_mesh(cube, tmp_path.resolve())
 
 

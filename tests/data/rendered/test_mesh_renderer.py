@@ -1,6 +1,7 @@
 """Images of meshes without Blender, against closed forms: depth, coverage, light, shadows, textures."""
 
 import math
+from threading import Event
 
 import meshes
 import numpy as np
@@ -8,9 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
-from completesplat.data.rendered.drawing import view_of
 from completesplat.data.rendered.mesh_reading import packed_textures, read_mesh, to_linear, to_srgb
 from completesplat.data.rendered.mesh_renderer import ambient_light, draw_job
+from completesplat.data.rendered.random_scenes import view_of
 from completesplat.data.rendered.z_buffer import look_up
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 
@@ -35,7 +36,7 @@ def drawn(mesh, folder, cameras, **changes):
     job = {"mesh": str(mesh), "root": str(mesh.parent.resolve()), "folder": str(folder), "samples": 16}
     job |= {"views": [view_of(one) for one in cameras], "room": 3.0, "floor": None, "wall": None}
     job |= {"light": UNIFORM, "hidden": None, **changes}
-    record = draw_job(job)
+    record = draw_job(job, Event())
     images = [np.asarray(Image.open(folder / f"{k:04d}.png")) / 255 for k in range(len(cameras))]
     geometry = [np.load(folder / f"{k:04d}.npy") for k in range(len(cameras))]
     return images, geometry, record
