@@ -20,6 +20,7 @@ SQUARES = 4
 SETTINGS = {"cameras": "turn", "fov": [36, 55], "light": "random", "floor": "random", "wall": "none", "seed": 0}
 SETTINGS |= {"front": None, "hidden": "none", "factory": None, "count": 1, "max_megabytes": 500, "max_minutes": 5}
 SETTINGS |= {"workers": 1, "shard": 0, "shards": 1}
+SETTINGS |= {"renderer": "blender"}
 """Settings of renders, without views, size and samples."""
 
 CORNERS = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import Image, UnidentifiedImageError
 
 from completesplat.data.rendered._placement import stray_faces
 from completesplat.data.rendered.assets import BrokenMesh, gltf_description
+from completesplat.errors import CompleteSplatError
 
 READABLE = (".glb", ".gltf", ".obj", ".ply")
 """Suffixes that trimesh reads with their textures; Blender reads the others."""
@@ -126,6 +128,16 @@ def _is_sound(path: Path) -> bool:
     return True
 
 
+def import_trimesh() -> ModuleType:
+    """Return trimesh; raise CompleteSplatError if it is not installed."""
+    try:
+        import trimesh
+    except ImportError as error:
+        advice = 'pip install "completesplat[render]", or renderer=blender'
+        raise CompleteSplatError(f"data render needs trimesh to read meshes: {advice}") from error
+    return trimesh
+
+
 def read_mesh(path: Path, root: Path) -> TexturedMesh:
     """Read a mesh file with its textures.
 
@@ -136,9 +148,8 @@ def read_mesh(path: Path, root: Path) -> TexturedMesh:
     Raises:
         BrokenMesh: trimesh cannot read it, a texture is missing or cannot be read, or its faces cannot be drawn.
     """
-    import trimesh
-
-    files = TextureFiles(path, root)
+    trimesh = import_trimesh()
+    files: Any = TextureFiles(path, root)
     with path.open("rb") as file:
         try:
             scene = trimesh.load_scene(file, file_type=path.suffix[1:].lower(), resolver=files, process=False)

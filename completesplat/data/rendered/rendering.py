@@ -23,7 +23,7 @@ from completesplat.data.co3d.annotations import viewpoint
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.rendered.assets import Asset, BrokenMesh, check_named_files, find_meshes, procedural_objects
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
-from completesplat.data.rendered.mesh_reading import READABLE
+from completesplat.data.rendered.mesh_reading import READABLE, import_trimesh
 from completesplat.data.rendered.mesh_renderer import draw_job
 from completesplat.data.rendered.random_scenes import PAINTS, RenderSettings, check_surroundings, draw_rendered_scene
 from completesplat.data.validation import read_points
@@ -106,6 +106,8 @@ def render(
     by_blender = renderer == "blender" or factory is not None or settings["light"] != "random"
     needed = by_blender or any(not _is_readable(asset) for asset in objects)
     program = find_blender(blender) if needed else None
+    if not by_blender:
+        import_trimesh()
     category = out / CATEGORY
     if factory is not None and program is not None:
         objects = procedural_objects(program, factory, count)
