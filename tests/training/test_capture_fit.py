@@ -10,7 +10,7 @@ from completesplat.data.captures.captured_frames import CapturedFrame
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_transforms
 from completesplat.errors import CompleteSplatError
-from completesplat.export import prediction
+from completesplat.export import fitted_scene
 from completesplat.export.ply import read_ply
 from completesplat.export.reading import read_gaussians
 from completesplat.training.capture_fit import CaptureFit
@@ -37,8 +37,8 @@ def no_converter() -> None:
 def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, capture, tmp_path, monkeypatch):
     monkeypatch.setattr("completesplat.export.formats.find_splat_transform", no_converter)
     read, original = [], CapturedFrame.read
-    columns, sheet = [], prediction.image_sheet
-    monkeypatch.setattr(prediction, "image_sheet", lambda names, *rest: columns.append(names) or sheet(names, *rest))
+    columns, sheet = [], fitted_scene.image_sheet
+    monkeypatch.setattr(fitted_scene, "image_sheet", lambda names, *rest: columns.append(names) or sheet(names, *rest))
     monkeypatch.setattr(CapturedFrame, "read", lambda self: read.append(self.number) or original(self))
 
     with interrupted_at(6, CaptureFit):
