@@ -13,10 +13,10 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.evaluation.mode_predictors import OTHER_SCENE, Predictor, Renders, predictors
+from completesplat.evaluation.ply_samples import PlySamples
 from completesplat.evaluation.protocol import sampler_settings
 from completesplat.evaluation.provenance import provenance
 from completesplat.evaluation.records import MODEL
-from completesplat.evaluation.scene_files import SceneFiles
 from completesplat.evaluation.scorer import Scorer
 from completesplat.evaluation.studies.samples import mean_over_scenes
 from completesplat.export.images import Sheet, SheetCell, image_sheet, write_png
@@ -187,7 +187,7 @@ def score_hidden_modes(
     samples = evaluation["samples"]
     candidates = data.hidden_modes(evaluation["views"], evaluation["spread_views"])
     scenes, skipped = usable_scenes(candidates, evaluation["scenes"])
-    if isinstance(module, SceneFiles):
+    if isinstance(module, PlySamples):
         module.find_files([scene.scene.names[0] for scene in scenes], samples)
     measured = measure(
         predictors(module, samples, evaluation["batch"]),

@@ -12,7 +12,8 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.provenance import provenance
-from completesplat.evaluation.scene_scores import BEST_RULES, MODEL
+from completesplat.evaluation.records import MODEL
+from completesplat.evaluation.scene_scores import BEST_RULES
 from completesplat.evaluation.scorer import Scorer
 from completesplat.metrics import MetricFormat
 

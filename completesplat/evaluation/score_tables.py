@@ -6,6 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar, cast
 
 from completesplat.evaluation.records import (
+    BEST_BY_METRIC,
+    BEST_OF_K,
+    MEAN_OF_K,
     MODEL,
     PROTOCOL,
     UPPER_BOUND,
@@ -34,9 +37,6 @@ from completesplat.evaluation.tables import (
 from completesplat.files import counted
 from completesplat.metrics import METRIC_FORMATS, MetricFormat
 
-BEST_OF_K = "best_of_k"
-BEST_BY_METRIC = "best_of_k_by_metric"
-MEAN_OF_K = "mean_of_k"
 OURS = "completesplat: "  # not "ours", because the paper gives its rows that name
 COST = ("inference", "rendering")
 LEADING = {

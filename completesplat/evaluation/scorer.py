@@ -17,8 +17,9 @@ from torch import Tensor
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import gather_values
 from completesplat.data.loading.loader import SceneLoader
+from completesplat.evaluation.records import MODEL
 from completesplat.evaluation.regions import REGIONS
-from completesplat.evaluation.scene_scores import MODEL, SceneScores
+from completesplat.evaluation.scene_scores import SceneScores
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.quantities import Share

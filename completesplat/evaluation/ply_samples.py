@@ -24,7 +24,7 @@ LEAST_IN_FRONT = 0.1  # of a scene's Gaussians: with less, the axes are wrong
 FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 
 
-class SceneFiles(Scorer):
+class PlySamples(Scorer):
     """Scorer whose samples are the files `sample_*.ply` of each test scene.
 
     Args:
