@@ -54,7 +54,7 @@ def score_columns(table: PublishedTable) -> list[tuple[int, Any, str]]:
 
 
 def parse_cell(cell: str) -> tables.Cell:
-    """Convert `17.93 best` to the text `17.93` with the mark `best`; dagger and star become signs behind the text."""
+    """Convert `17.93 best` to the text `17.93` with the mark `best`. Dagger and star become signs behind the text."""
     words = cell.split()
     text = " ".join(word for word in words if word not in (tables.BEST, tables.SECOND, *SIGNS)) or tables.BLANK
     signs = [SIGNS[word] for word in words if word in SIGNS]

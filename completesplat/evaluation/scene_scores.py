@@ -36,7 +36,7 @@ BEST_RULES = {
     BEST_OF_K: "of each region one sample for all metrics: that with the best `criterion` there, in novel views",
     BEST_BY_METRIC: "of each region and metric another sample: the best by it, in novel views; no metrics of sets",
 }
-"""Rules by which rows choose the best sample; the paper states none."""
+"""Rules by which rows choose the best sample. The paper states none."""
 
 RESERVED_NAMES = ("sharpness", "energy", "crps", "fid", "kid")
 """Names of scores that are no image metrics, which metrics of the user's own cannot have."""
@@ -122,7 +122,7 @@ class SceneScores:
 
     @torch.no_grad()
     def update(self, predictor: str, images: Float[Tensor, "batch view 3 height width"], scenes: SceneBatch) -> None:
-        """Score images predicted for the reference (first view) and all targets; they are clipped to [0, 1]."""
+        """Score images predicted for the reference (first view) and all targets. They are clipped to [0, 1]."""
         truth = scenes.all_views()
         for b, name in enumerate(scenes.names):
             clipped = images[b].clamp(0, 1)
@@ -225,7 +225,7 @@ class SceneScores:
                     self.sets.add(owner, region, name, in_region(views.float(), truth, region)[self.first_novel :])
 
     def gather(self) -> None:
-        """Merge the scores of all processes; each of them must call this."""
+        """Merge the scores of all processes. Each of them must call this."""
         of_this_process = self.scores, self.views, self.of_samples, self.sets.described, self.skipped
         self.reset()
         for scores, views, of_samples, descriptors, skipped in gather_values(of_this_process):
