@@ -100,20 +100,7 @@ class FitSettings(TypedDict):
 class PlanSettings(FitSettings):
     """Settings of `completesplat plan`."""
 
-    gpu: str
-    devices: Positive
-    share: Annotated[float, Range(0.01, 1)]
-    price: Annotated[float, Range(0)]
-    sequences: Positive
-    frames: Positive
-    pixel_bytes: Annotated[float, Range(0)]
-    loading_rate: Annotated[float, Range(1e-3)]
-    bandwidth_share: Annotated[float, Range(0.01, 1)]
-    checkpoint_rate: Annotated[float, Range(1e-3)]
-    gaussian_ns: Annotated[float, Range(0)]
-    operation_us: Annotated[float, Range(0)]
-    usable: Annotated[float, Range(0.01, 1)]
-    gpus: Mapping[str, Mapping[str, Annotated[float, Range(1e-3)]]]
+    timed_steps: Positive
 
 
 class SceneSettings(TypedDict):
