@@ -88,7 +88,7 @@ def test_the_settings_of_a_stage_are_shown_without_the_parts_of_others(command):
 def test_bench_alone_lists_what_it_can_time_and_times_nothing(command, tmp_path):
     listed = command.succeeds("bench").out
     assert list(tmp_path.iterdir()) == []
-    assert all(f"\n  {task} " in listed for task in ("paper", "rasterizers"))
+    assert "\n  rasterizers " in listed
 
 
 @pytest.mark.processes
