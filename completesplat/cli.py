@@ -60,12 +60,11 @@ def _run() -> None:
 
 def _help() -> None:
     """Print the verbs with their descriptions in `conf/`."""
-    from completesplat.settings.options import read_conf_file
+    from completesplat.settings.help import describe
 
     print("usage: completesplat VERB [key=value ...]      completesplat VERB --help\n")
     for verb in VERBS:
-        descriptions = {setting.key: setting.value for setting in read_conf_file(verb).settings}
-        print(f"  {verb:9} {descriptions['description']}")
+        print(f"  {verb:9} {describe(verb)}")
 
 
 def _refuse(message: str, status: int = 2) -> int:

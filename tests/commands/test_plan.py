@@ -8,7 +8,7 @@ from completesplat.commands import plan
 from completesplat.commands.plan import measured_plan
 from completesplat.errors import CompleteSplatError
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.settings.options import choices_of_verb
+from completesplat.settings.help import defaults
 from completesplat.training.optimization import constant
 from completesplat.training.stage import Stage
 from completesplat.training.steps import Training, synthetic_batch
@@ -91,4 +91,4 @@ def test_halves_of_a_batch_give_the_gradient_of_the_whole():
 
 
 def test_it_takes_what_fit_takes():
-    assert choices_of_verb("plan") == choices_of_verb("fit")
+    assert defaults("plan")[1] == defaults("fit")[1]

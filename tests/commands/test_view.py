@@ -188,7 +188,7 @@ def test_an_offline_page_is_written_from_a_scene_and_of_what_is_drawn(command, p
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
     out = f"out={tmp_path / 'out'}"
     write_ply(tmp_path / "my scene.ply", balls(points=5))
-    command.succeeds("view", "my scene.ply", "--export", "page.html", out)
+    command.succeeds("view", "my scene.ply", "export=page.html", out)
     text = (tmp_path / "page.html").read_text()
     assert text.startswith("<!doctype html>")
     assert "__VISER_EMBED_DATA__" in text
