@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
@@ -24,7 +23,6 @@ from completesplat.commands.inputs import check_inputs
 from completesplat.commands.protocol import git_commit
 from completesplat.errors import CompleteSplatError
 from completesplat.files import UNFINISHED, atomic_path, write_bytes, write_json, writing
-from completesplat.imports import importing, postponing
 from completesplat.results.runs import read_mapping
 from completesplat.settings.checks import check_parts_of_verb, check_values
 from completesplat.settings.composition import shard_folder, use_working_folder
@@ -185,15 +183,12 @@ def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) 
 
 def start(verb: str, config: DictConfig, out: Path) -> object:
     """Check the settings and call the config's task or else the verb's `run`; return its result (a text is printed)."""
-    with importing(), postponing() if verb == "predict" else nullcontext():
-        check_values(verb, config)
-        check_inputs(verb, config)
-        check_parts_of_verb(verb, config)
-        if config.get("task") is None:
-            run = partial(import_module(f"completesplat.commands.{verb}").run, config, out)
-        else:
-            run = partial(instantiate, config.task, out=out, _convert_="all")
-    return run()
+    check_values(verb, config)
+    check_inputs(verb, config)
+    check_parts_of_verb(verb, config)
+    if config.get("task") is not None:
+        return instantiate(config.task, out=out, _convert_="all")
+    return import_module(f"completesplat.commands.{verb}").run(config, out)
 
 
 def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str] = ()) -> bool:

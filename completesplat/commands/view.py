@@ -12,7 +12,6 @@ from omegaconf import DictConfig
 from completesplat.commands.jobs import is_running
 from completesplat.errors import CompleteSplatError, needing
 from completesplat.files import SPLATS, printable
-from completesplat.imports import importing, postponing
 from completesplat.settings.checks import REMOVE, check_parts
 from completesplat.signals import Interrupted
 from completesplat.weights import AUTO, CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, shipped
@@ -100,18 +99,17 @@ def scenes_in(path: Path) -> dict[str, Path]:
 
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     """Create a server's page and fill it with the scenes or the model that the settings name."""
-    with importing(), postponing():
-        from hydra.utils import instantiate
+    from hydra.utils import instantiate
 
-        from completesplat.commands.trained import open_generator, shown_background
-        from completesplat.viewer.access import show_background
-        from completesplat.viewer.completion import Completion
-        from completesplat.viewer.page import Page, Saver
-        from completesplat.viewer.panel import SLIDERS
-        from completesplat.viewer.sample import read_scene
-        from completesplat.viewer.splat_view import SplatView
+    from completesplat.commands.trained import open_generator, shown_background
+    from completesplat.viewer.access import show_background
+    from completesplat.viewer.completion import Completion
+    from completesplat.viewer.page import Page, Saver
+    from completesplat.viewer.panel import SLIDERS
+    from completesplat.viewer.sample import read_scene
+    from completesplat.viewer.splat_view import SplatView
 
-        check_parts(config)
+    check_parts(config)
     model = None
     scenes = {}
     status = ""

@@ -30,6 +30,7 @@ from completesplat.metrics.scoring import MODEL, REGIONS, Evaluation
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
 from completesplat.settings.schema import Share
+from completesplat.signals import restore_handlers
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 
@@ -125,6 +126,7 @@ class Scorer(LightningModule):
             return self.rasterizer(gaussians, cameras).over(self.background)
 
     def on_test_start(self) -> None:
+        restore_handlers()  # Lightning's would end a test with exit status 0
         self.evaluation.reset()
         self.evaluation.first_novel = self.first_novel
         self.seconds = defaultdict(list)

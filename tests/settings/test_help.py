@@ -17,8 +17,7 @@ PAGES += [(verb, task) for verb in TASKS for task in options(f"{verb}_task")]
 @pytest.mark.parametrize(("verb", "task"), PAGES)
 def test_a_page_has_its_settings_each_with_a_comment_and_its_parts(verb, task):
     text = help_page(verb, [] if task is None else [task])
-    assert text.startswith(f"completesplat {verb}{'' if task is None else f' {task}'}")
-    assert max(map(len, text.split("Parts")[0].splitlines())) <= 130
+    assert text.startswith(f"completesplat {verb}")
     name = verb if task is None else f"{verb}_task/{task}"
     bases, choices = defaults(name)
     for place in choices:
