@@ -50,7 +50,9 @@ class GuardedServer(viser.ViserServer):
     def __init__(self, port: int) -> None:
         self.token = secrets.token_urlsafe(32)
         self._guarded = False
-        # viser's constructor starts the websocket server in a thread and waits for it, and has no options for it.
+        # viser's constructor starts the websocket server in a thread, waits for it, and has no options for it. A proxy
+        # in front would leave viser's own port open to every page of this machine's browsers. This can go when viser
+        # takes a `process_request`, or asks for a token itself.
         serve = websockets_server.serve
         websockets_server.serve = partial(self._serve, serve)  # type: ignore[assignment, misc]
         try:
