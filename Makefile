@@ -95,7 +95,7 @@ lock: $(READY) ## Write requirements.lock: the newest versions that pyproject.to
 	$(BIN)/python -m uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --upgrade --generate-hashes \
 	  --no-annotate --no-emit-package torch --custom-compile-command "make lock" --quiet --output-file requirements.lock
 
-size: ## Print the lines of code of package and tests
+size: ## Print the lines of code of package and tests, and how dense they are
 	@$(PYTHON) tests/lines_of_code.py completesplat tests
 
 bench: $(READY) ## Time the rasterizer backends, side by side

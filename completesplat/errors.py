@@ -1,4 +1,7 @@
-"""Errors that the user sees as one line, `error: ...`; the exit status is 2 for refused input, 1 for failed work."""
+"""Errors that the user sees as one line, `error: ...`.
+
+The exit status is 2 for refused input, and 1 for work that failed.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,7 +15,9 @@ class CompleteSplatError(Exception):
 
 
 class DataError(CompleteSplatError):
-    """A missing or broken part of a data set, or one with another layout; each subclass is one kind of it.
+    """A missing or broken part of a data set, or one with another layout.
+
+    Each subclass is one kind of such an error.
 
     Args:
         reason: description of the problem, without the place.
@@ -92,7 +97,10 @@ class PlyError(CompleteSplatError):
 
 
 class TensorFileError(CompleteSplatError):
-    """A `torch.save` file that is damaged or would take more memory than it has bytes; the message omits the path."""
+    """A `torch.save` file that is damaged, or that would take more memory than it has bytes.
+
+    The message omits the path.
+    """
 
 
 class WeightsError(CompleteSplatError):
@@ -113,7 +121,7 @@ class DiskError(CompleteSplatError):
 
 @contextmanager
 def needing(extra: str, what: str) -> Iterator[None]:
-    """Say in a CompleteSplatError which extra of this package to install if an import within the context fails."""
+    """Raise a CompleteSplatError that names the extra of this package to install if an import in the context fails."""
     try:
         yield
     except ImportError as error:
@@ -126,8 +134,10 @@ def errors_at(file: Path | str | None = None, sequence: str | None = None, frame
     try:
         yield
     except DataError as error:
-        place = error.file or (None if file is None else str(file)), error.sequence or sequence
-        raise type(error)(error.reason, *place, frame if error.frame is None else error.frame) from error.__cause__
+        file = error.file or (None if file is None else str(file))
+        sequence = error.sequence or sequence
+        frame = frame if error.frame is None else error.frame
+        raise type(error)(error.reason, file, sequence, frame) from error.__cause__
 
 
 @contextmanager

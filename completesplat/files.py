@@ -18,9 +18,9 @@ NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 UNUSABLE = {errno.EIO, errno.EROFS, errno.EACCES, errno.ESTALE, errno.ENODEV}
 BAD_NAME = {errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM}
 PROBE_BYTES = 2**16
-LONGEST = 100  # bytes of UTF-8
-MOST_SHOWN = 500
-SHORT = 120  # characters of a message, and of a value in it
+LONGEST = 100  # bytes of a file name, in UTF-8
+MOST_SHOWN = 500  # characters of a message
+SHORT = 120  # characters of a value in a message
 SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")  # files of Gaussians that are read
 # Control characters, line breaks, changes of direction, and the surrogates that stand for bytes that are not UTF-8.
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -87,8 +87,9 @@ def writing(path: Path, temporary: Path | None = None) -> Iterator[None]:
     except CompleteSplatError:
         raise
     except Exception as error:
-        cause = error if isinstance(error, OSError) and error.errno is not None else _asked(temporary)
-        if cause is None or (refusal := _disk_error(cause, path)) is None:
+        cause = error if isinstance(error, OSError) and error.errno is not None else _test_write_error(temporary)
+        refusal = None if cause is None else _disk_error(cause, path)
+        if refusal is None:
             raise
         raise refusal from error
 
@@ -111,7 +112,8 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
     """
     not_finite: list[str] = []
     finite = {key: _finite(value, key, not_finite) for key, value in content.items()}
-    finite |= {"not_finite": not_finite} if not_finite else {}
+    if not_finite:
+        finite["not_finite"] = not_finite
     write_text(path, json.dumps(finite, indent=2, allow_nan=False) + "\n")
 
 
@@ -127,7 +129,12 @@ def _finite(value: object, place: str, not_finite: list[str]) -> object:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a missing folder in an existing one; raise CompleteSplatError for a link, DiskError if it cannot be made."""
+    """Make a missing folder in an existing one.
+
+    Raises:
+        CompleteSplatError: there is a link at its path.
+        DiskError: it cannot be made.
+    """
     if folder.is_symlink():
         raise CompleteSplatError(f"{folder}: is a link, and results are not written through links; remove it")
     with writing(folder):
@@ -135,17 +142,22 @@ def make_folder(folder: Path) -> None:
 
 
 def file_refusal(error: BaseException) -> CompleteSplatError | None:
-    """Return the error to show for an OSError about a named file: no space, or an unusable name; None for others."""
-    if not isinstance(error, OSError) or not isinstance(name := error.filename2 or error.filename, str):
+    """Return the error to show for an OSError about a named file, or None if it is about something else.
+
+    It says that a disk has no space, or that a name cannot be used.
+    """
+    if not isinstance(error, OSError):
+        return None
+    name = error.filename2 or error.filename
+    if not isinstance(name, str):
         return None
     if error.errno in BAD_NAME:
-        return CompleteSplatError(
-            f"{printable(name)}: cannot be used: {error.strerror}; choose another name or out=DIR"
-        )
+        reason = f"cannot be used: {error.strerror}; choose another name or out=DIR"
+        return CompleteSplatError(f"{printable(name)}: {reason}")
     return _disk_error(error, Path(name)) if error.errno in {*NO_SPACE, errno.EROFS} else None
 
 
-def _asked(path: Path | None) -> OSError | None:
+def _test_write_error(path: Path | None) -> OSError | None:
     """Write more to a file or folder, which is no longer needed, and return the operating system's error, if any."""
     if path is None:
         return None
@@ -160,10 +172,12 @@ def _asked(path: Path | None) -> OSError | None:
 
 
 def _disk_error(error: OSError, path: Path) -> DiskError | None:
-    """Return the error to show, in the operating system's words; None if it is not the disk's."""
+    """Return the error to show, in the operating system's words, or None if it is not the disk's."""
     if not path.parent.is_dir():
         return DiskError(f"{path}: cannot be written, {path.parent} is not there")
-    return DiskError(f"{path}: cannot be written: {error.strerror}") if error.errno in NO_SPACE | UNUSABLE else None
+    if error.errno in NO_SPACE | UNUSABLE:
+        return DiskError(f"{path}: cannot be written: {error.strerror}")
+    return None
 
 
 def printable(value: object, most: int = MOST_SHOWN) -> str:
@@ -193,8 +207,10 @@ def safe_name(text: str, ending: str = "") -> str:
 
 def by_numbers(path: Path) -> list[tuple[int, str]]:
     """Return a key that sorts paths with numbers by them, `r_2` before `r_10`."""
-    parts = re.split(r"([0-9]+)", str(path))
-    return [(len(part), part) if part.isdecimal() else (-1, part) for part in parts]
+    key: list[tuple[int, str]] = []
+    for part in re.split(r"([0-9]+)", str(path)):
+        key.append((len(part) if part.isdecimal() else -1, part))
+    return key
 
 
 def folder_names(stems: Iterable[str]) -> list[str]:
@@ -207,9 +223,13 @@ def folder_names(stems: Iterable[str]) -> list[str]:
     for stem in stems:
         name = safe_name(stem)
         number = 2
-        while (key := unicodedata.normalize("NFC", name).casefold()) in taken:
+        while _folded(name) in taken:
             name = safe_name(stem, f"_{number}")
-            number = number + 1
-        taken.add(key)
+            number += 1
+        taken.add(_folded(name))
         names.append(name)
     return names
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()

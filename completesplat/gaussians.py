@@ -18,8 +18,8 @@ class Gaussians(TensorDataclass):
     """3D Gaussians with final values: scales in world units, opacities in [0, 1], sRGB colours from 0 to 1.
 
     Quaternions are (w, x, y, z), of any length but zero for a defined rotation. Colours are stored as they are seen,
-    not as harmonics, because there is one colour for all directions (the DC term only, as in the paper);
-    `DirectionalGaussians` add the others.
+    not as harmonics, because there is one colour for all directions (the DC term only, as in the paper).
+    `DirectionalGaussians` add the other harmonics.
     """
 
     means: Float[Tensor, "*batch gaussian 3"]
@@ -50,9 +50,9 @@ class Gaussians(TensorDataclass):
 
     def finite(self) -> Bool[Tensor, "*batch gaussian"]:
         """Return a mask of the Gaussians whose values are all finite."""
-        marks = [self.opacities.isfinite()]
-        marks += [x.isfinite().all(-1) for x in (self.means, self.quaternions, self.scales, self.colors)]
-        return torch.stack(marks).all(0)
+        vectors = (self.means, self.quaternions, self.scales, self.colors)
+        masks = [self.opacities.isfinite(), *(vector.isfinite().all(-1) for vector in vectors)]
+        return torch.stack(masks).all(0)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,8 @@ class DirectionalGaussians(Gaussians):
         Colours of Gaussians that are not finite are NaN, without a gradient.
         """
         finite = self.finite()[..., None]
-        means, plain = (torch.where(finite, values, 0.0) for values in (self.means, self.colors))
+        means = torch.where(finite, self.means, 0.0)
+        plain = torch.where(finite, self.colors, 0.0)
         directions = torch.nn.functional.normalize(means - centers[..., None, :], dim=-1)
         terms = torch.where(finite[..., None], self.harmonics, 0.0)
         change = (harmonics(directions, self.degree)[..., None, :] @ terms).squeeze(-2)
@@ -84,8 +85,9 @@ class DirectionalGaussians(Gaussians):
 
     def transform(self, matrix: Float[Tensor, "*#batch 4 4"]) -> "DirectionalGaussians":
         """Move the Gaussians as `Gaussians.transform` does, and turn their harmonics with them."""
-        moved = super().transform(matrix)
-        return DirectionalGaussians(**{**vars(moved), "harmonics": rotated(self.harmonics, matrix[..., :3, :3])})
+        values = dict(vars(super().transform(matrix)))
+        values["harmonics"] = rotated(self.harmonics, matrix[..., :3, :3])
+        return DirectionalGaussians(**values)
 
     def finite(self) -> Bool[Tensor, "*batch gaussian"]:
         return super().finite() & self.harmonics.isfinite().flatten(-2).all(-1)

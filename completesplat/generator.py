@@ -4,32 +4,42 @@ model = CompleteSplat.from_pretrained("toy_objects")
 scenes = model("photo.jpg", samples=4, seed=0)
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from completesplat.autoreconstructor.encoder import Images
+from completesplat.autoreconstructor.encoder import Features, Images
 from completesplat.autoreconstructor.model import DepthRange, VariationalAutoReconstructor
 from completesplat.baselines.splatter_image.model import PublishedModel, is_published
-from completesplat.diffusion import sampling
-from completesplat.diffusion.guidance import Latents, allowed_skip_weight, in_bfloat16
+from completesplat.diffusion.guidance import Denoise, Latents, allowed_skip_weight
+from completesplat.diffusion.sampling import (
+    PART,
+    Sampler,
+    draw_noise,
+    in_bfloat16,
+    in_parts,
+    one_thread_each,
+    part_of,
+    with_forward_process,
+)
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.parts import PartConfig, build, check_architecture, stored_config
-from completesplat.run_configs import read_run, read_weights
 from completesplat.scene import Views
-from completesplat.scene_model import SceneModel, Visible
-from completesplat.settings.schema import Natural, Positive, Seed
+from completesplat.scene_model import DEFAULT_SAMPLING, OnScenes, Sampling, SceneModel, Visible
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import concatenate, in_float32
-from completesplat.weights import WEIGHTS_FILE, first_line, locate
+from completesplat.weights import first_line
+from completesplat.weights.allowed import PartConfig, check_architecture, class_of, stored_config
 from completesplat.weights.checkpoint_reading import mismatch, not_finite
+from completesplat.weights.opening import StoredModel, read_model
+
+NETWORKS = ("autoreconstructor", "conditioning", "denoiser", "network")  # parts of models that have weights
 
 
 class CompleteSplat(SceneModel):
@@ -41,10 +51,10 @@ class CompleteSplat(SceneModel):
     Args:
         autoreconstructor, conditioning, denoiser, sampler: configs of the parts.
         image_size: side of the square images, in pixels.
-        training: facts about the training images (`completesplat.parts.TrainingImages`).
+        training: facts about the training images (`completesplat.weights.allowed.TrainingImages`).
 
     Raises:
-        WeightsError: a config has a part or an option that weights may not name (`completesplat.parts`).
+        WeightsError: a config has a part or an option that weights may not name (`completesplat.weights.allowed`).
     """
 
     latent_mean: Tensor
@@ -68,7 +78,7 @@ class CompleteSplat(SceneModel):
         self.autoreconstructor = frozen.requires_grad_(False)
         self.conditioning = build(conditioning)
         self.denoiser = build(denoiser)
-        self.sampler: sampling.Sampler = build(sampler)
+        self.sampler: Sampler = build(sampler)
         # The training stage measures these on the training set.
         channels = self.denoiser.latent_channels
         self.register_buffer("latent_mean", torch.zeros(channels, 1, 1))
@@ -104,70 +114,31 @@ class CompleteSplat(SceneModel):
         return (latent - self.latent_mean) / self.latent_std
 
     @torch.no_grad()
-    def generate(  # type: ignore[override]
+    def generate(
         self,
         images: Images,
         cameras: Cameras,
         depth_range: DepthRange,
-        samples: Positive = 1,
-        skip_weight: float | None = None,
-        guidance_weight: float = 0.0,
-        steps: int | None = None,
-        seed: Seed | Sequence[Seed] = 0,
+        sampling: Sampling = DEFAULT_SAMPLING,
         visible: Visible | None = None,
-        color_fits: Natural = 0,
-        batch: Positive | None = None,
-        bfloat16: bool = False,
-        on_step: Callable[[int, int, Gaussians], None] | None = None,
+        on_step: OnScenes | None = None,
     ) -> Gaussians:
         """Draw Gaussians [batch * samples]: the scenes of one image next to each other, in the frame of its camera.
 
         Args:
-            skip_weight: default 1, the most faithful (supplement, "Diverse Sampling"), or 0 if something is hidden.
-            guidance_weight: share of the unconditional prediction; more gives more diverse samples.
-            steps: denoising steps; by default the sampler's number.
-            seed: seed of all noise, or one for each image, whose samples then do not depend on the other images.
             visible: 0 where an image is hidden; hidden pixels have no influence.
-            color_fits: rounds of fitting to the image (`fit_front`); 0 in the paper.
-            batch: the largest number of latents at a time; it changes only rounding. By default all, or fewer if a
-                GPU's memory does not suffice; a small denoiser on a CPU draws `part_of` them unless `on_step` is given.
-            bfloat16: compute the denoiser in bfloat16; a call with a photo does, where the device computes in it.
-                Renders then change about as little as by rounding to 8 bits.
             on_step: called after each denoiser call of each part with its number, the timestep, the estimated scenes.
 
         Raises:
             CompleteSplatError: a weight lies outside of [0, 1], skips meet hidden pixels, or the steps are impossible.
         """
-        weight = allowed_skip_weight(skip_weight, visible)
-        images = images if visible is None else images * visible
-        with sampling.one_thread_each(self.denoiser, images.device) as threads:
-            conditioning = self.conditioning(images)
-            stage1 = self.autoreconstructor
-            features = stage1.encoder.features(images * 2 - 1, stage1.reconstructor.feature_levels) if weight else []
-            shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
-            noise = sampling.draw_noise(len(images), samples, shape, seed).to(images.device)
-            image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
-            denoise = partial(in_bfloat16, self.denoiser) if bfloat16 else self.denoiser
-
-            def decode(latent: Tensor, part: slice) -> Gaussians:
-                """Decode the latents of a part of all samples; `image_of` has the index of each one's image."""
-                indices = image_of[part]
-                skips = [feature[indices] for feature in features], weight
-                unscaled = latent * self.latent_std + self.latent_mean
-                splatter_image: SplatterImage = stage1.reconstructor(unscaled, *skips)
-                return splatter_image.gaussians(cameras[indices], depth_range[indices])
-
-            def draw(part: slice) -> Tensor:
-                watch = None if on_step is None else lambda step, t, latent: on_step(step, t, decode(latent, part))
-                inputs = noise[part], conditioning[image_of[part]]
-                return self.sampler(denoise, *inputs, guidance_weight, steps, watch)
-
-            # Sample first, then decode: if a GPU's memory does not suffice to decode a part, its latents are not lost.
-            drawn, decoded = (sampling.part_of(len(noise)), sampling.PART) if threads else (None, None)
-            parts = partial(sampling.in_parts, count=len(noise), threads=1 if on_step else threads)
-            latents = torch.cat(parts(draw, most=batch or (None if on_step else drawn)))
-            scenes = concatenate(parts(lambda part: decode(latents[part], part), most=batch or decoded))
-        return self.fitted(scenes, images, cameras, visible, color_fits)
+        skip_weight = allowed_skip_weight(sampling.skip_weight, visible)
+        if visible is not None:
+            images = images * visible
+        with one_thread_each(self.denoiser, images.device) as threads:
+            drawing = _Drawing(self, images, cameras, depth_range, sampling, skip_weight, on_step)
+            scenes = drawing.scenes(threads)
+        return self.fitted(scenes, images, cameras, visible, sampling.color_fits)
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Use another sampler from now on, with the noise schedule and prediction type of training.
@@ -176,7 +147,7 @@ class CompleteSplat(SceneModel):
             CompleteSplatError: one of the two is for diffusion, the other for flow matching.
             WeightsError: weights may not name one of its parts.
         """
-        config = stored_config(sampling.with_forward_process(sampler, self.architecture["sampler"]))
+        config = stored_config(with_forward_process(sampler, self.architecture["sampler"]))
         check_architecture({**self.architecture, "sampler": config})
         self.sampler = build(config)
         self.architecture["sampler"] = config
@@ -193,7 +164,7 @@ class CompleteSplat(SceneModel):
 
         Raises:
             WeightsError: files are missing, unreadable, changed, not finite, do not belong together, or name parts that
-                `completesplat.run_configs.check_names` does not allow; or the run's model makes no scene from a photo.
+                `completesplat.weights.allowed` does not list; or the run's model makes no scene from a photo.
         """
         try:
             model = _opened(path, trust)
@@ -205,6 +176,85 @@ class CompleteSplat(SceneModel):
         if name is not None:
             raise WeightsError(f"{path}: {name} is not finite")
         return model.eval()
+
+
+class _Drawing:
+    """All samples of some images, which are drawn and decoded in parts.
+
+    Samples are numbered from 0 to `count - 1`, those of one image next to each other.
+
+    Args:
+        model, images, cameras, depth_range, sampling, on_step: as of `CompleteSplat.generate`; hidden pixels are 0.
+        skip_weight: weight of the skips from the images.
+    """
+
+    def __init__(
+        self,
+        model: CompleteSplat,
+        images: Images,
+        cameras: Cameras,
+        depth_range: DepthRange,
+        sampling: Sampling,
+        skip_weight: float,
+        on_step: OnScenes | None,
+    ) -> None:
+        self.model = model
+        self.cameras = cameras
+        self.depth_range = depth_range
+        self.sampling = sampling
+        self.skip_weight = skip_weight
+        self.on_step = on_step
+        self.conditioning: Tensor = model.conditioning(images)
+        self.features: Features = []
+        stage1 = model.autoreconstructor
+        if skip_weight:
+            self.features = stage1.encoder.features(images * 2 - 1, stage1.reconstructor.feature_levels)
+        shape = (model.denoiser.latent_channels, *self.conditioning.shape[-2:])
+        self.noise = draw_noise(len(images), sampling.samples, shape, sampling.seed).to(images.device)
+        self.count = len(self.noise)
+        self.image_of = torch.arange(len(images), device=images.device).repeat_interleave(sampling.samples)
+        self.denoise: Denoise = partial(in_bfloat16, model.denoiser) if sampling.bfloat16 else model.denoiser
+
+    def scenes(self, threads: int) -> Gaussians:
+        """Draw all samples with this number of threads, each of which draws parts (0: torch's own threads).
+
+        Latents are drawn first and decoded then: if a GPU's memory does not suffice to decode a part, its latents are
+        not lost.
+        """
+        draw_most = self.sampling.batch
+        decode_most = self.sampling.batch
+        if threads and self.on_step is None:
+            draw_most = draw_most or part_of(self.count)
+        if threads:
+            decode_most = decode_most or PART
+        if self.on_step is not None:
+            threads = 1
+        latents = torch.cat(in_parts(self.draw, self.count, draw_most, threads))
+        return concatenate(in_parts(partial(self.decode_part, latents), self.count, decode_most, threads))
+
+    def draw(self, part: slice) -> Latents:
+        """Draw the latents of some samples."""
+        conditioning = self.conditioning[self.image_of[part]]
+        watch = None if self.on_step is None else partial(self.show_step, part)
+        weight = self.sampling.guidance_weight
+        return self.model.sampler(self.denoise, self.noise[part], conditioning, weight, self.sampling.steps, watch)
+
+    def decode_part(self, latents: Latents, part: slice) -> Gaussians:
+        """Decode some of the latents of all samples."""
+        return self.decode(latents[part], part)
+
+    def decode(self, latents: Latents, part: slice) -> Gaussians:
+        """Decode the latents of some samples."""
+        indices = self.image_of[part]
+        skips = [feature[indices] for feature in self.features]
+        unscaled = latents * self.model.latent_std + self.model.latent_mean
+        splatter_image: SplatterImage = self.model.autoreconstructor.reconstructor(unscaled, skips, self.skip_weight)
+        return splatter_image.gaussians(self.cameras[indices], self.depth_range[indices])
+
+    def show_step(self, part: slice, step: int, timestep: int, latents: Latents) -> None:
+        """Call `on_step` with the scenes that a step estimates for some samples."""
+        assert self.on_step is not None
+        self.on_step(step, timestep, self.decode(latents, part))
 
 
 class DeterministicModel(SceneModel):
@@ -225,20 +275,46 @@ def _architecture(
     parts: Mapping[str, PartConfig], image_size: int, training: Mapping[str, object] | None
 ) -> dict[str, Any]:
     """Return a model's config as weights store it; raise WeightsError for parts that weights may not name."""
-    config: dict[str, Any] = {name: stored_config(part) for name, part in parts.items()} | {"image_size": image_size}
-    config |= {} if training is None else {"training": dict(training)}
+    config: dict[str, Any] = {name: stored_config(part) for name, part in parts.items()}
+    config["image_size"] = image_size
+    if training is not None:
+        config["training"] = dict(training)
     check_architecture(config)
     return config
 
 
-def _opened(path: Path | str, trust: bool) -> SceneModel:
-    if is_published(path):
-        return PublishedModel(str(path))
-    file = locate(path)
-    architecture, tensors = (read_weights if file.name == WEIGHTS_FILE else read_run)(file, trust)
-    model: SceneModel = (DeterministicModel if "network" in architecture else CompleteSplat)(**architecture)
-    if (difference := mismatch(model.state_dict(), tensors)) is not None:
+def build(part: Any) -> Any:
+    """Build a part, and the parts in it, from a config that `check_architecture` has accepted."""
+    if isinstance(part, list):
+        return [build(value) for value in part]
+    if not isinstance(part, Mapping):
+        return part
+    settings = {name: build(value) for name, value in part.items() if name != "_target_"}
+    return class_of(part)(**settings) if "_target_" in part else settings
+
+
+def _opened(weights: Path | str, trust: bool) -> SceneModel:
+    if is_published(weights):
+        return PublishedModel(str(weights))
+    stored = read_model(weights, trust)
+    _check_sizes(stored)
+    kind = DeterministicModel if "network" in stored.architecture else CompleteSplat
+    model: SceneModel = kind(**stored.architecture)
+    difference = mismatch(model.state_dict(), stored.tensors)
+    if difference is not None:
         raise ValueError(difference)
-    model.load_state_dict(tensors)
-    model.file = file
+    model.load_state_dict(stored.tensors)
+    model.file = stored.tensor_file
     return model
+
+
+def _check_sizes(stored: StoredModel) -> None:
+    """Raise WeightsError, before the networks take memory, if a tensor of theirs is missing or has another size."""
+    with torch.device("meta"):  # tensors with sizes but without memory
+        parts = {name: build(stored.architecture[name]) for name in NETWORKS if name in stored.architecture}
+        networks = nn.ModuleDict(parts)
+    for name, value in networks.state_dict().items():
+        actual = list(stored.tensors[name].shape) if name in stored.tensors else "missing"
+        if actual != list(value.shape):
+            places = f"in {stored.tensor_file.name} and {list(value.shape)} by {stored.config_file.name}"
+            raise WeightsError(f"{name} is {actual} {places}")

@@ -1,6 +1,6 @@
 """Vertices of PLY files: the header, and one array with a field for each property.
 
-Format: Greg Turk, "The PLY Polygon File Format" (1994); both the old and the new names of types are read.
+Format: Greg Turk, "The PLY Polygon File Format" (1994). Both the old and the new names of types are read.
 """
 
 import os
@@ -14,8 +14,8 @@ import numpy as np
 from completesplat.errors import PlyError
 
 PACKED = "packed_position"  # a property of the vertices in compressed files
-LONGEST_HEADER = 1 << 16
-LONGEST_COUNT = 15  # bytes, digits
+LONGEST_HEADER = 1 << 16  # bytes
+LONGEST_COUNT = 15  # digits
 HEADER = re.compile(rb"ply\s*\n(.*?)(?<=\n)end_header[ \t\r]*\n", re.DOTALL)
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 TYPES = {
@@ -26,7 +26,10 @@ TYPES = {
 
 
 class Element(NamedTuple):
-    """An element that a header declares, with its properties and their types; a list has the type of its length."""
+    """An element that a header declares, with its properties and their types.
+
+    The type of a list is that of its length.
+    """
 
     name: str
     records: int
@@ -43,12 +46,14 @@ def vertex_header(count: int, properties: Sequence[tuple[str, str]], comments: S
 
     Args:
         properties: names and types (`TYPES`), in the order of a record.
-        comments: one line each; characters outside ASCII are escaped.
+        comments: one line each. Characters outside ASCII are escaped.
     """
     lines = ["ply", "format binary_little_endian 1.0"]
     # A line break inside a comment would start another header line.
     lines += [f"comment {' '.join(comment.split())}" for comment in comments]
-    lines += [f"element vertex {count}", *(f"property {kind} {name}" for name, kind in properties), "end_header", ""]
+    lines.append(f"element vertex {count}")
+    lines += [f"property {kind} {name}" for name, kind in properties]
+    lines += ["end_header", ""]
     return "\n".join(lines).encode("ascii", "backslashreplace")
 
 
@@ -87,7 +92,8 @@ def _vertices(file: BinaryIO, needed: Sequence[str]) -> np.ndarray:
         raise PlyError("a list in the vertices, or before them")
     if PACKED in elements[index].fields:
         raise PlyError("SuperSplat's compressed PLY; `splat-transform FILE x.ply` unpacks it")
-    if missing := [name for name in needed if name not in elements[index].fields]:
+    missing = [name for name in needed if name not in elements[index].fields]
+    if missing:
         raise PlyError(f"no property {', '.join(missing)}")
     file.seek(header_match.end())
     match form.split():

@@ -29,8 +29,8 @@ class SceneBatch(TensorDataclass):
     World coordinates are the reference camera's frame, after scaling; `depth_range` is (near, far) along its
     optical axis in those units. Without a batch axis this is one scene and `names` is a single string.
     `visible` is 1 where the conditioning may see the reference image, 0 within the boxes of masked diffusion.
-    `names` are the sequences' names, and `reference_frame` is the reference's index in its sequence. `seen` holds the
-    same scenes with the smaller images that the model takes, if its renders are compared with larger ones; else None.
+    `names` are the sequences' names, and `reference_frame` is the reference's index in its sequence. `low_resolution`
+    holds the same scenes with the smaller images that the model takes, if its renders are compared with larger ones.
     """
 
     reference: Views
@@ -39,7 +39,7 @@ class SceneBatch(TensorDataclass):
     visible: Float[Tensor, "*batch 1 height width"]
     reference_frame: Int64[Tensor, "*batch"]
     names: str | tuple[str, ...]
-    seen: "SceneBatch | None" = None
+    low_resolution: "SceneBatch | None" = None
 
     def all_views(self) -> Views:
         """Join reference and targets along one view axis, the reference first: [batch 1+view ...]."""

@@ -19,7 +19,7 @@ from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_rays
 from completesplat.geometry.harmonics import LARGEST_DEGREE, SH_C0, coefficients
 from completesplat.geometry.rotations import normalize_quaternion
-from completesplat.settings.schema import Few, Range
+from completesplat.quantities import Few, Range
 from completesplat.tensors import TensorDataclass
 
 
@@ -54,7 +54,7 @@ def independent_depths(raw: LayerMaps, near: Tensor, far: Tensor) -> LayerMaps:
 
 
 def incremental_depths(raw: LayerMaps, near: Tensor, far: Tensor) -> LayerMaps:
-    """Return the first layer as `independent_depths` does; each further one lies exp(raw) behind the last (Flash3D).
+    """Return the first layer as `independent_depths` does, and each further one exp(raw) behind the last (Flash3D).
 
     `initialize_head` makes that distance `Parameterization.layer_step` at first.
     """
@@ -102,8 +102,9 @@ class Parameterization:
     @property
     def groups(self) -> dict[str, Group]:
         """Return the groups of a layer's raw values, in order."""
-        further = {"harmonics": Group(3 * coefficients(self.harmonics), HARMONICS_GAIN, 0.0)} if self.harmonics else {}
-        return GROUPS | further
+        if self.harmonics == 0:
+            return GROUPS
+        return GROUPS | {"harmonics": Group(3 * coefficients(self.harmonics), HARMONICS_GAIN, 0.0)}
 
     @property
     def layer_channels(self) -> int:

@@ -25,12 +25,13 @@ def in_float32() -> Iterator[None]:
 
 def used_device() -> str:
     """Return where networks compute: "cuda", or else "mps", if torch has one, else "cpu"."""
-    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    return next(name for name, here in available.items() if here)
+    if torch.cuda.is_available():
+        return "cuda"
+    return "mps" if torch.backends.mps.is_available() else "cpu"
 
 
 def as_float64(tensor: Tensor) -> Tensor:
-    """Return a tensor in float64; on the CPU if it was on Apple's MPS, which has no float64."""
+    """Return a tensor in float64, on the CPU if it was on Apple's MPS, which has no float64."""
     return (tensor.cpu() if tensor.device.type == "mps" else tensor).double()
 
 
@@ -53,9 +54,10 @@ class TensorDataclass:
         return replace(self, **{field.name: apply(getattr(self, field.name)) for field in fields(self)})
 
     def to(self: T, *args: Any, **kwargs: Any) -> T:
-        """Move every tensor to a device or dtype (`non_blocking`); integer and boolean tensors keep their dtype.
+        """Move every tensor to a device or dtype, with the arguments of `torch.Tensor.to`.
 
-        Copies to a GPU do not block: Lightning asks for that only if a batch is a plain tensor.
+        Integer and boolean tensors keep their dtype. Copies to a GPU do not block. (Lightning asks for that only if a
+        batch is a plain tensor.)
         """
         device, dtype, non_blocking, _ = torch._C._nn._parse_to(*args, **kwargs)
         non_blocking = non_blocking or (device is not None and device.type == "cuda")
@@ -86,26 +88,30 @@ class TensorDataclass:
 def stack(items: Sequence[T]) -> T:
     """Stack equal-shaped dataclasses along a new leading axis (the collate function of the data loaders).
 
-    Strings are collected into a tuple; other static values must be the same in all items.
+    Strings are collected into a tuple. Other static values must be the same in all items.
 
     Raises:
         ValueError: there are no items, or a static value differs between them.
     """
     if not items:
         raise ValueError("cannot stack an empty sequence")
-    merged = {field.name: _merge([getattr(item, field.name) for item in items]) for field in fields(items[0])}
+    merged = {}
+    for field in fields(items[0]):
+        merged[field.name] = _merge([getattr(item, field.name) for item in items])
     return replace(items[0], **merged)
 
 
 def concatenate(items: Sequence[T], axis: int = 0) -> T:
-    """Concatenate the items' tensors along an existing axis; static values are those of the first item."""
+    """Concatenate the items' tensors along an existing axis, and take static values from the first item."""
 
     def join(values: list[Any]) -> object:
         if isinstance(values[0], Tensor):
             return torch.cat(values, dim=axis)
         return concatenate(values, axis) if isinstance(values[0], TensorDataclass) else values[0]
 
-    joined = {field.name: join([getattr(item, field.name) for item in items]) for field in fields(items[0])}
+    joined = {}
+    for field in fields(items[0]):
+        joined[field.name] = join([getattr(item, field.name) for item in items])
     return replace(items[0], **joined)
 
 

@@ -12,7 +12,7 @@ import torch
 import completesplat
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.selection import auto
-from completesplat.scene_model import match_shipped
+from completesplat.scene_model import Sampling, match_shipped
 
 ROUNDS, rasterizer = (0, 2, 5, 10, 20, 40), auto()
 models, results = {}, {rounds: [] for rounds in ROUNDS}
@@ -28,7 +28,7 @@ def model_of(name):
 def score(images, cameras, depth_range, targets, model, background):
     """Note the PSNR of the reference view, and of the novel views if there are any, after each number of rounds."""
     for rounds in ROUNDS:
-        scene = model.generate(images, cameras, depth_range, seed=0, color_fits=rounds)
+        scene = model.generate(images, cameras, depth_range, Sampling(color_fits=rounds))
         views = [(cameras[:, None], images[:, None]), *([(targets.cameras, targets.images)] if targets else [])]
         with torch.no_grad():
             rendered = [rasterizer(scene, view).over(background)[0] for view, _ in views]

@@ -23,6 +23,7 @@ from completesplat.export.images import to_pixels
 from completesplat.geometry.cameras import crop_resize, invert_rigid, nearest_to_axes, transform_points
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.selection import auto
+from completesplat.scene_model import Sampling
 
 LEAST, MOST, VIEWS, ROUNDS = 1.0, 30.0, 8, (0, 40)  # degrees from the reference, views of an object, `color_fits`
 rasterizer = auto()
@@ -89,7 +90,7 @@ for name in source.names:
         for rounds in ROUNDS:
             with torch.no_grad():
                 seen, views = resized(images, model.image_size), crop_resize(cameras, 0, 0, size, model.image_size)
-                scene = model.generate(seen[:1], views[:1], depth_range, seed=0, color_fits=rounds)
+                scene = model.generate(seen[:1], views[:1], depth_range, Sampling(color_fits=rounds))
                 background = 0.5 if model.background is None else model.background
                 drawn[f"{weights}, {rounds} rounds"] = rasterizer(scene, views[None]).over(background)[0]
     images = resized(images, least)

@@ -12,9 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from completesplat.commands.protocol import git_commit
+from completesplat.evaluation.provenance import git_commit, machine
 from completesplat.files import write_json
-from completesplat.results.machine import machine
 
 RASTERIZERS = ["sizes=[16]", "views=[1]", "repeats=1"]
 PLAN = ["data.image_size=32", "data.batch_size=2", "data.targets=1", "timed_steps=1"]

@@ -10,6 +10,7 @@ from support import compose_config
 
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.realestate10k.module import RE10KDataModule
+from completesplat.data.tolerance import ErrorTolerance
 
 FRAMES = 5
 
@@ -39,7 +40,7 @@ def broken_rooms(root: Path) -> Path:
 
 def pack(raw: Path, **settings: object) -> Path:
     """The packed store of these clips, beside them."""
-    return prepared(rooms(raw, **settings), raw.with_name("packed"), policy=("skip", 1.0))
+    return prepared(rooms(raw, **settings), raw.with_name("packed"), tolerance=ErrorTolerance("skip", 1.0))
 
 
 def rooms(root: Path, **settings: object) -> RE10KDataModule:

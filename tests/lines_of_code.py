@@ -1,13 +1,25 @@
-"""Lines of code, without docstrings, comments and blank lines: `make size` prints those of package and tests."""
+"""Lines of code and how dense they are: `make size` prints those of package and tests.
+
+Dense code is counted per 1,000 lines of code, which are lines without docstrings, comments and blank lines. The counts
+are a report and no test fails by them.
+"""
 
 import ast
 import io
 import sys
 import tokenize
+from collections import Counter
 from pathlib import Path
 
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+LITERAL = ast.Tuple | ast.List | ast.Set | ast.Dict | ast.DictComp | ast.IfExp
+
+PACKED = "`a, b = x, y`"
+WALRUS = "walrus"
+HANDLERS = "`except`"
+UNPACKED = "unpacked literals"
+DENSE = [PACKED, WALRUS, HANDLERS, UNPACKED]
 
 
 def lines_of_code(text: str) -> int:
@@ -20,13 +32,40 @@ def lines_of_code(text: str) -> int:
     return len(lines)
 
 
-def size(folder: Path) -> tuple[int, int]:
-    """Return the lines of code, and all lines, of the modules in a folder."""
+def kinds(node: ast.AST) -> list[str]:
+    """Return which kinds of dense code a node of the syntax tree is; a dict counts once for each literal in it."""
+    match node:
+        case ast.Assign(targets=[ast.Tuple()], value=ast.Tuple()):
+            return [PACKED]
+        case ast.NamedExpr():
+            return [WALRUS]
+        case ast.ExceptHandler():
+            return [HANDLERS]
+        case ast.Starred(value=value) if isinstance(value, LITERAL):
+            return [UNPACKED]
+        case ast.AugAssign(op=ast.BitOr(), value=value) if isinstance(value, ast.Dict | ast.DictComp):
+            return [UNPACKED]
+        case ast.Dict(keys=keys, values=values):
+            unpacked = [value for key, value in zip(keys, values, strict=True) if key is None]
+            return [UNPACKED for value in unpacked if isinstance(value, LITERAL)]
+    return []
+
+
+def density(text: str) -> Counter[str]:
+    """Count each kind of dense code in the text of a module."""
+    return Counter(kind for node in ast.walk(ast.parse(text)) for kind in kinds(node))
+
+
+def report(folder: Path) -> str:
+    """Describe the modules in a folder: lines of code, all lines, and dense code per 1,000 lines of code."""
     texts = [path.read_text() for path in folder.rglob("*.py")]
-    return sum(map(lines_of_code, texts)), sum(len(text.splitlines()) for text in texts)
+    code = sum(map(lines_of_code, texts))
+    total = sum(map(density, texts), Counter())
+    lines = sum(len(text.splitlines()) for text in texts)
+    per_thousand = [f"{kind} {1000 * total[kind] / max(code, 1):.1f}" for kind in DENSE]
+    return f"{folder}: {code:,} lines of code, {lines:,} lines; per 1,000 lines of code: {', '.join(per_thousand)}"
 
 
 if __name__ == "__main__":
     for name in sys.argv[1:]:
-        code, lines = size(Path(name))
-        print(f"{name}: {code:,} lines of code, {lines:,} lines")
+        print(report(Path(name)))

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.data.packed.writing import prepare
+from completesplat.data.packed.preparation import prepare
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.errors import BadImage, DataError
 from completesplat.geometry.cameras import Cameras, look_at

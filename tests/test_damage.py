@@ -401,13 +401,8 @@ VAES = [
 ]  # fmt: skip
 Y, P = "config_hydrants.yaml", "model_hydrants.pth"
 PUBLISHED = [
-    (published(data={"input_images": 2}), WeightsError, Y, "data.input_images is 2"),
-    (published(cam_embd={"embedding": "pose"}), WeightsError, Y, "cam_embd.embedding is pose"),
-    (published(model={"name": "TwoUNets"}), WeightsError, Y, "model.name is TwoUNets"),
-    (published(model={"max_sh_degree": 0}), WeightsError, Y, "model.max_sh_degree is 0"),
     (published(model={"base_dim": 10**6}), WeightsError, Y, "model.base_dim is 1000000"),
     (published(data={"training_resolution": None}), WeightsError, Y, "data.training_resolution is None"),
-    (published(data={"znear": 5.0}), WeightsError, Y, "data.znear must be below data.zfar"),
     (content(Y, b"model: !!python/object/apply:pathlib.Path.touch [called]"), WeightsError, Y, "not readable as YAML"),
     (content(Y, b"a: &a [1, 2]\nb: [*a, *a]"), WeightsError, Y, "has aliases"),
     (content(Y, b"just text"), WeightsError, Y, "data.training_resolution is None"),

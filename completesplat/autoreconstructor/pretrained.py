@@ -20,7 +20,7 @@ ENDINGS = (".safetensors", ".bin", ".fp16.safetensors", ".fp16.bin")
 WEIGHTS_FILES = tuple(f"diffusion_pytorch_model{ending}" for ending in ENDINGS)
 SUFFIXES = (".safetensors", ".bin", ".ckpt", ".pt", ".pth")
 LDM = re.compile(r"(?:first_stage_model\.|vae\.)?encoder\.down\.(\d+)\.")  # names in Stable Diffusion's own files
-PLACES = ("", "vae/")  # a VAE by itself, or within a whole pipeline
+SUBFOLDERS = ("", "vae/")  # of a VAE by itself, or within a whole pipeline
 MODEL_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[\w.-]+)?")
 ENCODER = ("encoder.", "quant_conv.")
 HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
@@ -44,7 +44,7 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
         source: a folder with `config.json` and `diffusion_pytorch_model.safetensors` (or `.bin`, `.fp16.safetensors`),
             a folder with these in a subfolder `vae`, a hub id of either, or a file of the VAE or of a whole model, with
             diffusers' names or Stable Diffusion's own (`first_stage_model`).
-        reconstructor: None loads the encoder of a conditioning; the checkpoint may then lack a decoder.
+        reconstructor: None loads the encoder of a conditioning. The checkpoint may then lack a decoder.
 
     Raises:
         WeightsError: the checkpoint is missing, damaged or not finite, or its VAE has another kind or size.
@@ -59,13 +59,13 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
     except Exception as error:  # torch and safetensors raise many kinds for a damaged file
         cause = first_line(error).partition(". ")[0]  # torch adds advice to trust the file
         raise WeightsError(f"{place}: damaged, or not a VAE ({cause}); fetch it again") from error
-    decoder: dict[str, nn.Module] = {}
+    # Under these names the state dict's keys are those of diffusers' AutoencoderKL.
+    vae = nn.ModuleDict({"encoder": encoder.network, "quant_conv": encoder.quant_conv})
     if reconstructor is None:
         weights = {name: value for name, value in weights.items() if name.startswith(ENCODER)}
     else:
-        decoder = {"post_quant_conv": reconstructor.post_quant_conv, "decoder": reconstructor.network}
-    # Under these names the state dict's keys are those of diffusers' AutoencoderKL.
-    vae = nn.ModuleDict({"encoder": encoder.network, "quant_conv": encoder.quant_conv, **decoder})
+        vae["post_quant_conv"] = reconstructor.post_quant_conv
+        vae["decoder"] = reconstructor.network
     loaded = _without_head(weights)
     reason = mismatch(_without_head(vae.state_dict()), loaded) or _other_kind(config, encoder)
     if reason is not None:
@@ -81,7 +81,7 @@ def _without_head(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _other_kind(config: Mapping[str, object], encoder: Encoder) -> str | None:
-    """Return how a VAE differs from ours in what no tensor's shape shows, if it does."""
+    """Return a difference between a VAE and ours that no tensor's shape shows, if there is one."""
     groups = config.get("norm_num_groups", 32)
     activation = config.get("act_fn", "silu")
     assert isinstance(encoder.network.conv_norm_out, nn.GroupNorm)
@@ -92,16 +92,21 @@ def _other_kind(config: Mapping[str, object], encoder: Encoder) -> str | None:
 
 def _needed_settings(config: Mapping[str, object], part: str) -> str:
     """Name the options of the autoreconstructor's encoder, or of a conditioning, that fit a VAE's config."""
-    conditioning = part == "conditioning"
-    names = SETTINGS | ({"latent_channels": "out_channels"} if conditioning else {})
-    place = part if conditioning else f"{part}.encoder"
-    values = {names[key]: json.dumps(config[key], separators=(",", ":")) for key in names if key in config}
-    overrides = [f"{place}.{name}={value}" for name, value in values.items()]
+    names = dict(SETTINGS)
+    network = f"{part}.encoder"
+    if part == "conditioning":
+        names["latent_channels"] = "out_channels"
+        network = part
+    overrides: list[str] = []
+    for key, name in names.items():
+        if key in config:
+            value = json.dumps(config[key], separators=(",", ":"))
+            overrides.append(f"{network}.{name}={value}")
     return f"its config.json asks for {' '.join(overrides)}" if overrides else "no config.json gives its sizes"
 
 
 def _vae_file(source: str, part: str) -> Path:
-    """Return the file of the VAE's tensors; download it from the hub if `source` is not a file or folder."""
+    """Return the file of the VAE's tensors, downloaded from the hub if `source` is not a file or folder."""
     local = Path(source).expanduser()
     is_id = MODEL_ID.fullmatch(source) is not None
     hub_id = source if is_id and not local.exists() else "CompVis/stable-diffusion-v1-4"
@@ -116,33 +121,39 @@ def _vae_file(source: str, part: str) -> Path:
     if not local.exists() and not is_id:
         raise WeightsError(f"{source}: no such folder; {advice}")
     for file in WEIGHTS_FILES:
-        names = [f"{place}{name}" for place in PLACES for name in (CONFIG_FILE, file)]
+        names = [f"{subfolder}{name}" for subfolder in SUBFOLDERS for name in (CONFIG_FILE, file)]
         folder = local if local.exists() else from_hub(source, names, advice)
-        for place in PLACES:
-            if (folder / place / CONFIG_FILE).is_file() and (folder / place / file).is_file():
-                return folder / place / file
+        for subfolder in SUBFOLDERS:
+            path = folder / subfolder / file
+            if path.is_file() and path.with_name(CONFIG_FILE).is_file():
+                return path
     reason = f"no {CONFIG_FILE} and {WEIGHTS_FILES[0]} (or .bin) there, nor in a subfolder vae"
-    others = sorted(str(path) for path in local.glob("*") if path.suffix in SUFFIXES)
-    if others:
-        advice = f"if one of its files is the VAE, give {part}.pretrained={others[0]}"
+    other_files = sorted(str(path) for path in local.glob("*") if path.suffix in SUFFIXES)
+    if other_files:
+        advice = f"if one of its files is the VAE, give {part}.pretrained={other_files[0]}"
     raise WeightsError(f"{source}: {reason}; {advice}")
 
 
 def _read_weights(file: Path) -> dict[str, Tensor]:
     """Return tensors by the names of diffusers' AutoencoderKL."""
-    safe = file.suffix == ".safetensors"
-    contents: dict[str, Any] = load_file(file) if safe else torch.load(file, map_location="cpu", weights_only=True)
-    weights = contents.get("state_dict", contents)
+    contents: dict[str, Any]
+    if file.suffix == ".safetensors":
+        contents = load_file(file)
+    else:
+        contents = torch.load(file, map_location="cpu", weights_only=True)
+    weights: Any = contents.get("state_dict", contents)
     levels = {match[1] for match in map(LDM.match, weights) if match}
     if levels:
         from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint
 
         convert: Callable[..., dict[str, Tensor]] = convert_ldm_vae_checkpoint
-        weights = convert(weights, dict.fromkeys(("down_block_types", "up_block_types"), levels))
+        weights = convert(weights, {"down_block_types": levels, "up_block_types": levels})
     return {_current_name(name): value for name, value in weights.items() if isinstance(value, Tensor)}
 
 
 def _current_name(name: str) -> str:
-    path, _, rest = name.partition(".attentions.0.")
-    layer, _, kind = rest.partition(".")
-    return f"{path}.attentions.0.{OLD_ATTENTION[layer]}.{kind}" if layer in OLD_ATTENTION else name
+    block, _, parameter = name.partition(".attentions.0.")
+    layer, _, kind = parameter.partition(".")
+    if layer not in OLD_ATTENTION:
+        return name
+    return f"{block}.attentions.0.{OLD_ATTENTION[layer]}.{kind}"

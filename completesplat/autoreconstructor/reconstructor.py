@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import recompute
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.schema import Few, Levels, Width, Widths
+from completesplat.quantities import Few, Levels, Width, Widths
 from completesplat.splatter_image import Parameterization, SplatterImage, from_channels, initialize_head, zeroed
 
 
@@ -18,7 +18,7 @@ class Reconstructor(nn.Module):
 
     A skip passes the encoder's features of one level, before its downsampling, through a zero-initialised 1x1
     convolution and adds them to the input of the up block of the same resolution. The paper does not state the merge
-    operator; zero initialisation leaves pretrained weights intact at step 0.
+    operator. Zero initialisation leaves pretrained weights intact at step 0.
 
     Args:
         parameterization: layers and activations of the Splatter Image.

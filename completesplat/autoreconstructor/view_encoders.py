@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.encoder import vae_encoder
 from completesplat.autoreconstructor.model import DepthRange
 from completesplat.geometry.cameras import pixel_centers, project, rays_through
+from completesplat.quantities import Few, Range, Width, Widths
 from completesplat.scene import Views
-from completesplat.settings.schema import Few, Range, Width, Widths
 from completesplat.splatter_image import zeroed
 
 
@@ -48,7 +48,10 @@ class PlaneSweep(nn.Module):
         zeroed(self.network.conv_out)
 
     def forward(self, views: Views, depth_range: DepthRange) -> Float[Tensor, "batch moment _ _"]:
-        """Return what to add to the moments; the reference is the first view, and its frame is the world."""
+        """Return what to add to the moments.
+
+        The reference is the first view, and its frame is the world.
+        """
         with torch.autocast(views.images.device.type, enabled=False):
             swept = sweep(views, depth_range, self.planes)
         reference = nn.functional.avg_pool2d(views.images[:, 0], 2)

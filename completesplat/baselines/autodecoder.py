@@ -23,7 +23,7 @@ class AutoDecoder(nn.Module):
     should be off. The table has `rows * latent_channels * (image_size / 8)^2` numbers, thrice that with Adam's moments.
 
     Args:
-        rows: images that the table has room for; loading weights resizes the table to theirs.
+        rows: images that the table has room for. Loading weights resizes the table to theirs.
 
     Raises:
         CompleteSplatError: the reconstructor has skips, or its levels do not divide the image size.
@@ -57,7 +57,11 @@ class AutoDecoder(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *others)
 
     def codes_of(self, names: Sequence[str], frames: Int64[Tensor, " batch"]) -> Codes:
-        """Return the codes of images, given by sequence and place; raise CompleteSplatError if the table is full."""
+        """Return the codes of images, given by sequence and place.
+
+        Raises:
+            CompleteSplatError: the table is full.
+        """
         return self.codes[[self._row(*key) for key in zip(names, frames.tolist(), strict=True)]]
 
     def new_codes(self, count: int, seed: int) -> Codes:

@@ -17,9 +17,9 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import pixel_centers, project, unproject
 from completesplat.geometry.harmonics import SH_C0
 from completesplat.losses import Prediction, WeightedSum
+from completesplat.quantities import Positive, Range
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
-from completesplat.settings.schema import Positive, Range
 from completesplat.tensors import as_float64
 
 POSITION_RATE = 1.6e-4
@@ -68,7 +68,7 @@ class RawGaussians:
     harmonics: Float[Tensor, "batch gaussian 3"]
 
     def gaussians(self) -> Gaussians:
-        """Apply 3DGS's activations; the quaternions may have any length."""
+        """Apply 3DGS's activations to raw values, whose quaternions may have any length."""
         colors = (0.5 + SH_C0 * self.harmonics).clamp(min=0)
         return Gaussians(self.means, self.quaternions, self.log_scales.exp(), self.logits.sigmoid(), colors)
 
@@ -165,15 +165,17 @@ def fit_gaussians(
 def adam(
     raw: Mapping[str, Tensor], depth_ranges: Float[Tensor, "_ 2"], positions: float, opacities: float, others: float
 ) -> torch.optim.Adam:
-    """Return Adam for tensors of `RawGaussians` by name, with factors on 3DGS's rates; the positions come first.
+    """Return Adam for tensors of `RawGaussians` by name, the positions first, with factors on 3DGS's rates.
 
     Its epsilon is 3DGS's (`gaussian_model.py`), which is small compared with a Gaussian's gradients.
     """
     # Half of the mean depth range: the spread of the initial Gaussians (3DGS uses the spread of the cameras).
     extent = (0.5 * (depth_ranges[:, 1] - depth_ranges[:, 0])).mean().item()
-    rates = {"means": positions * POSITION_RATE * extent}
-    rates |= {name: (opacities if name == "logits" else others) * rate for name, rate in RATES.items()}
-    return torch.optim.Adam([{"params": [raw[name]], "lr": rate} for name, rate in rates.items()], eps=1e-15)
+    groups = [{"params": [raw["means"]], "lr": positions * POSITION_RATE * extent}]
+    for name, rate in RATES.items():
+        factor = opacities if name == "logits" else others
+        groups.append({"params": [raw[name]], "lr": factor * rate})
+    return torch.optim.Adam(groups, eps=1e-15)
 
 
 def opacity_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:

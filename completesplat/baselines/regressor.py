@@ -8,7 +8,7 @@ from torch import Tensor
 
 from completesplat.autoreconstructor.encoder import recompute
 from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
-from completesplat.settings.schema import Few, Levels, Share, Width, Widths
+from completesplat.quantities import Few, Levels, Share, Width, Widths
 from completesplat.splatter_image import Parameterization, from_channels, initialize_head
 
 
@@ -23,17 +23,15 @@ class SplatterImageUNet(ReconstructionModel):
     - Residual sums are not scaled by sqrt(1/2), and weights start from PyTorch's default initialisation.
     - Resampling blocks have no 1x1 convolution in their shortcut.
     - On the way up, attention follows every block of a level instead of only the last one.
-    - The last 3x3 convolution is the head; upstream has a 1x1 convolution after it.
+    - The last 3x3 convolution is the head. Upstream has a 1x1 convolution after it.
 
     Args:
-        channels: width of each level, from full resolution down; the image's sides are multiples of 2^(levels - 1).
+        channels: width of each level, from full resolution down. The image's sides are multiples of 2^(levels - 1).
         attention_levels: levels with self-attention (upstream: at 16 pixels, level 3 of images of 128).
         layers_per_block: residual blocks per level on the way down (the way up has one more).
         dropout: dropout probability before the second convolution of each residual block.
         gradient_checkpointing: recompute the residual blocks' activations in the backward pass.
     """
-
-    halves_images = True
 
     def __init__(
         self,
@@ -68,6 +66,6 @@ class SplatterImageUNet(ReconstructionModel):
         self.network = network
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Reconstruction:
-        """Reconstruct from sRGB images in [0, 1]; there is no posterior."""
+        """Reconstruct from sRGB images in [0, 1], without a posterior."""
         output = self.network(images * 2 - 1, timestep=0).sample
         return Reconstruction(from_channels(output.float(), self.parameterization), posterior=None)

@@ -14,16 +14,16 @@ from rich.console import Console
 
 from completesplat.commands import quieten
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.provenance import machine
+from completesplat.evaluation.scorer import synchronized_time
+from completesplat.evaluation.tables import records_table, show
 from completesplat.files import write_json
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unproject
+from completesplat.quantities import Entries, Positive
 from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.selection import FASTER, failure
-from completesplat.results.machine import machine
-from completesplat.results.tables import records_table, show
-from completesplat.settings.schema import Entries, Positive
-from completesplat.training.scoring import synchronized_time
 from completesplat.training.steps import DISTANCE, FOV_DEGREES, cameras_on_orbit, peak_megabytes
 
 Row = dict[str, object]  # of the table; its values can be written as JSON

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import write_json
-from completesplat.settings.schema import Entries, Positive, Range
+from completesplat.quantities import Entries, Positive, Range
 from completesplat.weights import RUN_CHECKPOINT
 
 logger = logging.getLogger(__name__)
@@ -22,7 +22,7 @@ def check(data: Any, splits: SplitNames, workers: Positive | None, out: Path) ->
     from completesplat.data.validation import audit
 
     try:
-        sources = {split: data.evaluated(split, source) for split, source in _sources(data, splits).items()}
+        sources = {split: data.select_sequences(split, source) for split, source in _sources(data, splits).items()}
         findings = audit.check(sources, workers, splits_share_sequences=data.splits_share_sequences)
     except DataError as error:  # concerns the data set as a whole
         findings = audit.AuditReport(0, 0, [error], {}, {})
@@ -37,7 +37,7 @@ def stats(data: Any, splits: SplitNames, out: Path) -> None:
     """Write `stats.json` and `stats.png`, and print the numbers."""
     from rich.progress import track
 
-    from completesplat.studies.statistics import plot_statistics, show_statistics, statistics
+    from completesplat.evaluation.studies.statistics import plot_statistics, show_statistics, statistics
 
     sources = _sources(data, splits)
     tracked_names = {split: track(source.names, f"reading cameras of {split}") for split, source in sources.items()}
@@ -49,7 +49,7 @@ def stats(data: Any, splits: SplitNames, out: Path) -> None:
 
 def show(data: Any, split: SplitName, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path) -> None:
     """Write `show.png`: images of some sequences, evenly spread over a split."""
-    from completesplat.studies.contact_sheet import write_contact_sheet
+    from completesplat.evaluation.studies.contact_sheet import write_contact_sheet
 
     source = _sources(data, [split])[split]
     names = source.names
@@ -71,17 +71,18 @@ def prepare(
     on_bad: Literal["raise", "skip"],
     max_bad_fraction: float,
 ) -> None:
-    """Write packed data into `out`; see `completesplat.data.packed.writing.prepare`."""
-    from completesplat.data.packed import manifest, writing
+    """Write packed data into `out`; see `completesplat.data.packed.preparation.prepare`."""
+    from completesplat.data.packed import manifest, preparation
+    from completesplat.data.tolerance import ErrorTolerance
 
     if manifest.is_packed(data.root):
         raise CompleteSplatError(f"{data.root} is prepared already")
     if Path(data.root).resolve().is_relative_to(out.resolve()):
         raise CompleteSplatError(f"out={out}: the data to be prepared lie there; choose another out=DIR")
-    policy = on_bad, max_bad_fraction
-    sources = _sources(data, splits, policy)
+    tolerance = ErrorTolerance(on_bad, max_bad_fraction)
+    sources = _sources(data, splits, tolerance)
     settings = data.packed_settings()
-    writing.prepare(sources, settings, out, codec, sequences_per_shard, workers, policy)
+    preparation.prepare(sources, settings, out, codec, sequences_per_shard, workers, tolerance)
 
 
 def latents(
@@ -102,10 +103,10 @@ def latents(
     from lightning import Fabric
 
     from completesplat.autoreconstructor.model import VariationalAutoReconstructor
-    from completesplat.run_configs import config_of_run
     from completesplat.training.encoding import FrameEncoder, encode_training_set
     from completesplat.training.stopping import stopped_together
     from completesplat.weights.checkpoint_reading import load_part
+    from completesplat.weights.runs import config_of_run
 
     ckpt = Path(ckpt, RUN_CHECKPOINT) if Path(ckpt).is_dir() else Path(ckpt)
     run_config = config_of_run(ckpt, list(overrides), trust)
@@ -123,9 +124,11 @@ def latents(
     logger.info("standard deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 
-def _sources(data: Any, splits: Sequence[str], policy: tuple[str, float] = ("skip", 1.0)) -> dict[str, Any]:
+def _sources(data: Any, splits: Sequence[str], tolerance: Any = None) -> dict[str, Any]:
     """Return the sources of the splits that exist; by default each collects the errors in its files."""
-    data.policy = policy
+    from completesplat.data.tolerance import SKIP_ALL
+
+    data.tolerance = tolerance or SKIP_ALL
     data.prepare_data()
     sources = {}
     missing = []

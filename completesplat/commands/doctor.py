@@ -62,7 +62,7 @@ def devices() -> Iterator[tuple[str, str]]:
     """Yield CPU and GPUs, and where networks compute."""
     import torch
 
-    from completesplat.results.machine import machine
+    from completesplat.evaluation.provenance import machine
     from completesplat.tensors import used_device
 
     threads = f"{os.cpu_count()} cores, {torch.get_num_threads()} threads of torch"

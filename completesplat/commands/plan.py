@@ -20,15 +20,15 @@ from completesplat.commands import quieten
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.provenance import machine
+from completesplat.evaluation.scorer import synchronized_time
+from completesplat.evaluation.tables import records_table, show
 from completesplat.files import write_json
-from completesplat.results.machine import machine
-from completesplat.results.tables import records_table, show
 from completesplat.scene import Batch
 from completesplat.settings.checks import check_image_size, check_optimizer, remove_start_weights
 from completesplat.tensors import used_device
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule, ReconstructorOnly
-from completesplat.training.scoring import synchronized_time
 from completesplat.training.stage import Stage
 from completesplat.training.steps import Training, synthetic_batch
 

@@ -1,35 +1,36 @@
 """`completesplat report`: studies of a trained model's samples.
 
-Each study raises the errors of `TrainedModel.open`, `diffusion_of`, `first_scenes` and the functions of its module in
-`completesplat.studies`.
+Each study raises the errors of `trained_model`, `TrainedModel.open`, `diffusion_of`, `first_scenes` and the functions
+of its module in `completesplat.evaluation.studies`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, NotRequired, Unpack
+from typing import Annotated, Any, NotRequired, Unpack
 
 import torch
 from rich.console import Console
 
 from completesplat.commands import quieten
-from completesplat.commands.trained import TrainedModel, diffusion_of
+from completesplat.commands.trained import diffusion_of, trained_model
+from completesplat.evaluation.studies.calibration import calibration_rows, plot_calibration
+from completesplat.evaluation.studies.controls import OnProgress, controls_rows, controls_strips, grid, plot_controls
+from completesplat.evaluation.studies.depth import depth_rows, depth_strips
+from completesplat.evaluation.studies.ladder import ladder_rows
+from completesplat.evaluation.studies.samples import SampleRenderer, first_scenes
+from completesplat.evaluation.tables import records_table, show
 from completesplat.export.images import image_sheet, write_png
 from completesplat.files import counted, write_json
-from completesplat.results.tables import records_table, show
+from completesplat.quantities import Entries, Positive, Range, Share
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Entries, ModelSettings, Positive, Range, Share
-from completesplat.studies.calibration import calibration_rows, plot_calibration
-from completesplat.studies.controls import OnProgress, controls_rows, controls_strips, grid, plot_controls
-from completesplat.studies.depth import depth_rows, depth_strips
-from completesplat.studies.ladder import ladder_rows
-from completesplat.studies.samples import SampleRenderer, first_scenes
+from completesplat.settings.schema import ModelSettings
 
 Weights = Annotated[Sequence[Share], Entries(1)]
 
 
 class Run(ModelSettings):
-    """Arguments of `TrainedModel`, number of test scenes (the first ones), and number of samples of each scene."""
+    """Arguments of `trained_model`, number of test scenes (the first ones), and number of samples of each scene."""
 
     data: NotRequired[Mapping[str, object]]
     rasterizer: Mapping[str, object]
@@ -107,8 +108,8 @@ def _report(path: Path, title: str, rows: Sequence[Mapping[str, object]], run: R
 def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], OnProgress]]:
     """Yield renderer and first test scenes (on a GPU if there is one), and a status."""
     quieten()
-    model = run["ckpt"], run["overrides"], run["trust"], run["weights"]
-    stage, data = TrainedModel(*model, data=run.get("data"), rasterizer=run["rasterizer"], seed=run["seed"]).open()
+    settings: Any = {name: value for name, value in run.items() if name not in ("scenes", "samples")}
+    stage, data = trained_model(**settings).open()
     stage = stage.to("cuda" if torch.cuda.is_available() else "cpu").eval()
     scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
     renderer = SampleRenderer(diffusion_of(stage), stage.rasterizer, stage.background, run["samples"], run["seed"])

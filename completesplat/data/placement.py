@@ -9,10 +9,10 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from completesplat.data.images.crop import Square, cut_square, principal_square
 from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.errors import BadCamera, BadPlacement
 from completesplat.geometry.cameras import Cameras, crop_resize, nearest_to_axes, transform_points
+from completesplat.photo.crop import Square, cut_square, principal_square
 from completesplat.tensors import stack
 
 UP = 1
@@ -26,7 +26,7 @@ Axes = Float[np.ndarray, "3 3"]
 
 
 class ObjectFraming(NamedTuple):
-    """Image size, and depth range in front of and behind the object's centre; the object's half size is 0.57."""
+    """Image size, and depth range in front of and behind the centre of an object whose half size is 0.57."""
 
     image_size: int
     depth_before: float
@@ -39,14 +39,14 @@ class ObjectFraming(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """Centre and half size of the object; the latter is the largest distance from the centre along an upright axis."""
+    """Centre and half size of the object, which is the largest distance from the centre along an upright axis."""
 
     center: Float[Tensor, "3"]
     half_size: float
 
 
 def upright_axes(cameras: Sequence[Cameras]) -> Axes:
-    """Return the axes of an upright frame in the sequence's world, as columns; the second points up or down.
+    """Return the axes of an upright frame in the sequence's world, as columns. The second points up or down.
 
     People hold a camera level, so its x axis varies least along the vertical. It varies most along the first of these
     axes (Splatter Image, `co3d_normalisation.py`).
@@ -80,7 +80,7 @@ def from_points(points: Float[np.ndarray, "n 3"], axes: Axes, what: str, quantil
 
 
 def from_cameras(cameras: Sequence[Cameras]) -> Placement:
-    """Place the object at the point nearest to all optical axes; assume that it fills the images' largest square.
+    """Place the object at the point nearest to all optical axes, as if it filled the images' largest square.
 
     Raises:
         BadPlacement: the optical axes are parallel or meet behind the cameras.
@@ -91,7 +91,10 @@ def from_cameras(cameras: Sequence[Cameras]) -> Placement:
         raise BadPlacement("no point cloud, no depth maps, and optical axes that do not meet")
     depths = transform_points(world_to_camera, center[None])[:, 0, 2]
     # Half the side of each camera's square, at depth 1.
-    extents = [0.5 * square_of(camera).side / camera.intrinsics.diagonal()[:2].max().item() for camera in cameras]
+    extents = []
+    for camera in cameras:
+        focal = camera.intrinsics.diagonal()[:2].max().item()
+        extents.append(0.5 * square_of(camera).side / focal)
     half_size = (depths * torch.tensor(extents, dtype=depths.dtype)).median().item()
     if not (half_size > 0 and np.isfinite(half_size)):
         advice = "if matrices in transforms.json have OpenCV's axes, negate their second and third columns"

@@ -1,10 +1,8 @@
 """Posed image sequences: the common form of all data sets, independent of their files and conventions."""
 
-import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import NamedTuple
 
 from jaxtyping import Float, UInt8
@@ -12,8 +10,6 @@ from torch import Tensor
 
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras
-
-SPLITS = ("train", "val", "test")
 
 
 class MaskedImage(NamedTuple):
@@ -70,34 +66,19 @@ class SequenceSource(ABC):
 
     @abstractmethod
     def read(self, name: str) -> PosedSequence:
-        """Read a sequence's cameras, or raise a DataError; `PosedSequence.read` reads its images later."""
+        """Read a sequence's cameras, or raise a DataError. `PosedSequence.read` reads its images later."""
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """Return groups of indices into `names` that are best read one after the other; by default one group."""
+        """Return groups of indices into `names` that are best read one after the other, by default one group."""
         return [list(range(len(names)))]
 
     def verify(self) -> Sequence[DataError]:
-        """Return the files that differ from their checksums; by default there are no checksums."""
+        """Return the files that differ from their checksums. By default there are no checksums."""
         return []
 
     @abstractmethod
     def fingerprint(self) -> str:
         """Return a SHA-256 (hexadecimal) of the sequences' sources, which changes with the data."""
-
-
-def shared_names(splits: Mapping[str, Collection[str]]) -> dict[str, list[str]]:
-    """Return the names that two splits share, by pair ("train and val"), without pairs that share nothing."""
-    shared = {}
-    for first, second in combinations(splits, 2):
-        names = set(splits[first]) & set(splits[second])
-        if names:
-            shared[f"{first} and {second}"] = sorted(names)
-    return shared
-
-
-def overlaps(shared: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return a sentence for each pair of `shared_names`."""
-    return [f"{len(names)} sequences are in both {pair}: {first_names(names)}" for pair, names in shared.items()]
 
 
 def first_names(names: Sequence[str], most: int = 5) -> str:
@@ -107,19 +88,7 @@ def first_names(names: Sequence[str], most: int = 5) -> str:
 
 
 def spread_places(count: int, most: int | None) -> list[int]:
-    """Return at most `most` of `count` indices, the middles of equal parts; None: all."""
+    """Return at most `most` of `count` indices, the middles of equal parts, or all if `most` is None."""
     if most is None or most >= count:
         return list(range(count))
     return [(2 * part + 1) * count // (2 * most) for part in range(most)]
-
-
-def split_by_hash(names: Sequence[str], fraction: float, seed: int, kept: int = 0) -> tuple[list[str], list[str]]:
-    """Return training and held-out sequences in the order of `names`.
-
-    A sequence's side depends only on its name and the seed, so it does not change when sequences are added. If no
-    sequence would be held out, the one with the smallest hash is; `kept` ones with the largest hashes never are.
-    """
-    position = {name: int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8]) / 2**64 for name in names}
-    count = max(1, sum(position[name] < fraction for name in names))
-    held_out = set(sorted(names, key=position.__getitem__)[: min(count, max(0, len(names) - kept))])
-    return [name for name in names if name not in held_out], [name for name in names if name in held_out]

@@ -3,15 +3,13 @@
 `frozen` says whether an encoder is constant in training, so that its features can be computed once and stored.
 """
 
-from typing import ClassVar
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import Encoder, vae_encoder
 from completesplat.autoreconstructor.pretrained import load_pretrained
-from completesplat.settings.schema import Few, Width, Widths
+from completesplat.quantities import Few, Width, Widths
 
 STABLE_DIFFUSION_SCALE = 0.18215
 """Scale of Stable Diffusion's latents (CompVis `configs/stable-diffusion/v1-inference.yaml`, scale_factor)."""
@@ -20,7 +18,7 @@ STABLE_DIFFUSION_SCALE = 0.18215
 class LearnedConditioning(nn.Module):
     """Small convolutional encoder that is trained together with the denoiser.
 
-    It is for setups without Stable Diffusion's weights; the paper uses the frozen encoder of Stable Diffusion's VAE.
+    It is for setups without Stable Diffusion's weights. The paper uses the frozen encoder of Stable Diffusion's VAE.
 
     Args:
         out_channels: channels of phi_ref.
@@ -60,7 +58,6 @@ class StableDiffusionConditioning(nn.Module):
     """
 
     frozen = True
-    start_weights: ClassVar = {"pretrained": "CompVis/stable-diffusion-v1-4, or null for random weights"}
 
     def __init__(
         self,

@@ -10,11 +10,11 @@ from jaxtyping import Int
 from torch import Tensor, nn
 
 from completesplat.diffusion.guidance import Conditioning, Latents
-from completesplat.settings.schema import Few, Levels, Width, Widths
+from completesplat.quantities import Few, Levels, Width, Widths
 
 
 class Sizes(TypedDict, total=False):
-    """Sizes of both denoisers, and whether to save memory; `TextlessStableDiffusion` explains each."""
+    """Sizes of both denoisers, and whether to save memory (see `TextlessStableDiffusion`)."""
 
     latent_channels: Width
     conditioning_channels: Width
@@ -32,8 +32,6 @@ class ConditionalUNet(nn.Module):
         kind, attention: diffusers' network, and the name prefix of its blocks with attention.
         attention_settings: further arguments of the network.
     """
-
-    halves_images = True
 
     def __init__(
         self,
@@ -75,15 +73,16 @@ class ConditionalUNet(nn.Module):
 
 
 class ZeroTokenAttention(AttnProcessor2_0):
-    """Cross-attention to one token of zeros; without gradients, it computes the same values without queries and keys.
+    """Cross-attention to one token of zeros.
 
-    In training, queries and keys are computed because DDP waits for every weight's gradient, even if it is zero.
+    Without gradients, it computes the same values without queries and keys. In training, queries and keys are computed
+    because DDP waits for every weight's gradient, even if it is zero.
     """
 
     def __call__(
         self, attn: Attention, hidden_states: Tensor, *inputs: Tensor | None, **settings: Tensor | None
     ) -> Tensor:
-        """Attend like diffusers' `AttnProcessor2_0`; input and output are [batch, place, channel]."""
+        """Attend like diffusers' `AttnProcessor2_0`, from and to [batch, place, channel]."""
         if torch.is_grad_enabled():
             return super().__call__(attn, hidden_states, *inputs, **settings)
         return attn.to_out[0](hidden_states.new_zeros(1, 1, attn.inner_dim)).expand_as(hidden_states)

@@ -35,7 +35,11 @@ def signal_and_noise(
 
 
 def target(scheduler: ConfigMixin, latent: Latents, noise: Latents, timestep: Int[Tensor, " batch"]) -> Latents:
-    """Return the true prediction for a latent and the noise added to it; raise like `prediction_type`."""
+    """Return the true prediction for a latent and the noise added to it.
+
+    Raises:
+        CompleteSplatError: as `prediction_type`.
+    """
     kind = prediction_type(scheduler)
     if kind == "v_prediction":
         signal, share = signal_and_noise(scheduler, timestep, latent)
@@ -44,7 +48,11 @@ def target(scheduler: ConfigMixin, latent: Latents, noise: Latents, timestep: In
 
 
 def clean_estimate(scheduler: ConfigMixin, noisy: Latents, predicted: Latents, timestep: Int[Tensor, ""]) -> Latents:
-    """Return the clean latent h that a prediction implies; raise like `prediction_type`."""
+    """Return the clean latent h that a prediction implies.
+
+    Raises:
+        CompleteSplatError: as `prediction_type`.
+    """
     kind = prediction_type(scheduler)
     signal, noise = signal_and_noise(scheduler, timestep, noisy)
     if kind == "epsilon":
@@ -60,7 +68,11 @@ def is_flow(scheduler: object) -> bool:
 
 
 def prediction_type(scheduler: ConfigMixin) -> str:
-    """Return one of `PREDICTION_TYPES`, or "flow"; raise CompleteSplatError if the scheduler has another type."""
+    """Return one of `PREDICTION_TYPES`, or "flow".
+
+    Raises:
+        CompleteSplatError: the scheduler has another type.
+    """
     if is_flow(scheduler):
         return "flow"
     kind: str = scheduler.config["prediction_type"]

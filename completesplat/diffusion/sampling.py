@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from completesplat.diffusion.guidance import Conditioning, Denoise, Latents, guided_noise
 from completesplat.diffusion.objective import clean_estimate, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.schema import Range
+from completesplat.quantities import Range
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
@@ -36,7 +36,12 @@ OnStep = Callable[[int, int, Tensor], None]
 
 # Scheduler options that training fixes for all later samplers.
 FORWARD_PROCESS = (
-    *("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type"),
+    "num_train_timesteps",
+    "beta_start",
+    "beta_end",
+    "beta_schedule",
+    "trained_betas",
+    "prediction_type",
     "rescale_betas_zero_snr",
 )
 
@@ -113,7 +118,7 @@ class Sampler:
         return torch.randint(self.training_timesteps, (count,), device=device)
 
     def add_noise(self, latent: Latents, noise: Tensor, timestep: Tensor) -> Latents:
-        """Apply the forward process h_t = a h + b eps (paper, Eq. 2; `objective.signal_and_noise`)."""
+        """Apply the forward process h_t = a h + b eps of the paper's Eq. 2 (`objective.signal_and_noise`)."""
         signal, share = signal_and_noise(self.scheduler, timestep, latent)
         return signal * latent + share * noise
 
@@ -129,11 +134,16 @@ def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any])
     Raises:
         CompleteSplatError: one of the two is for diffusion, the other for flow matching.
     """
-    names = [str(config["scheduler"].get("_target_")).rpartition(".")[2] for config in (sampler, trained)]
-    if names[0].startswith("FlowMatch") != names[1].startswith("FlowMatch"):
-        raise CompleteSplatError(f"sampler: {names[0]} cannot draw from a denoiser that was trained for {names[1]}")
+    name = _scheduler_name(sampler)
+    trained_name = _scheduler_name(trained)
+    if name.startswith("FlowMatch") != trained_name.startswith("FlowMatch"):
+        raise CompleteSplatError(f"sampler: {name} cannot draw from a denoiser that was trained for {trained_name}")
     fixed = {key: value for key, value in trained["scheduler"].items() if key in FORWARD_PROCESS}
     return {**sampler, "scheduler": {**sampler["scheduler"], **fixed}}
+
+
+def _scheduler_name(sampler: Mapping[str, Any]) -> str:
+    return str(sampler["scheduler"].get("_target_")).rpartition(".")[2]
 
 
 def draw_noise(
@@ -144,16 +154,23 @@ def draw_noise(
     Raises:
         CompleteSplatError: `seed` is neither one seed for all noise nor one seed for each image.
     """
-    seeds = list(seed) if isinstance(seed, Iterable) else [seed]
-    if isinstance(seed, Iterable) and len(seeds) != images:
-        raise CompleteSplatError(f"seed={seeds}: {len(seeds)} seeds for {images} images; give one for each image")
-    shape = (images * samples // len(seeds), *shape)
-    return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(int(number))) for number in seeds])
+    if isinstance(seed, Iterable):
+        seeds = list(seed)
+        if len(seeds) != images:
+            raise CompleteSplatError(f"seed={seeds}: {len(seeds)} seeds for {images} images; give one for each image")
+        return torch.cat([_noise((samples, *shape), image_seed) for image_seed in seeds])
+    return _noise((images * samples, *shape), seed)
+
+
+def _noise(shape: tuple[int, ...], seed: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(int(seed)))
 
 
 @contextmanager
 def one_thread_each(denoiser: nn.Module, device: torch.device) -> Iterator[int]:
-    """On a CPU, limit each operation of a small denoiser to one thread; yield how many threads torch had, else 0.
+    """On a CPU, limit each operation of a small denoiser to one thread.
+
+    It yields the number of threads that torch had before, or 0 if nothing is limited.
 
     A sample has hundreds of operations of a tenth of a millisecond. Threads that share one wait for each other after
     each, and longer beside another busy process. Threads that draw different samples do not. Neither parts (`part_of`)
@@ -177,6 +194,12 @@ def one_thread_each(denoiser: nn.Module, device: torch.device) -> Iterator[int]:
 def part_of(count: int) -> int:
     """Return how many of `count` samples a thread draws at a time: half of them, as large parts take less time each."""
     return min(max(count // 2, PART), LARGEST_PART)
+
+
+def in_bfloat16(denoise: Denoise, *inputs: Tensor) -> Latents:
+    """Call a denoiser whose matrix products and convolutions are computed in bfloat16."""
+    with torch.autocast(inputs[0].device.type, torch.bfloat16):
+        return denoise(*inputs)
 
 
 def in_parts(draw: Callable[[slice], T], count: int, most: int | None = None, threads: int = 0) -> list[T]:

@@ -21,7 +21,8 @@ log = logging.getLogger(__name__)
 
 def bounded(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:
     """Return a mask of Gaussians with finite values of at most 1e18."""
-    return gaussians.map(lambda values: values.where(values.abs() <= LARGEST, torch.inf)).finite()
+    limited = {name: values.where(values.abs() <= LARGEST, torch.inf) for name, values in vars(gaussians).items()}
+    return replace(gaussians, **limited).finite()
 
 
 def storable(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:
@@ -62,7 +63,7 @@ def with_screen_space_dilation(gaussians: Gaussians, reference: Cameras) -> Gaus
     """Return Gaussians enlarged by the blur that a rasterizer adds in the reference view.
 
     A rasterizer adds `blur` px^2 to each projected covariance. Training relies on this at its own image size, and makes
-    Gaussians far smaller than a pixel; in a larger image they would be dots with gaps between them. At depth z,
+    Gaussians far smaller than a pixel. In a larger image they would be dots with gaps between them. At depth z,
     `blur * (z / focal length)^2` is therefore added to the covariance in all directions, which preserves its axes.
     `reference` is the camera of the photo, unbatched, at the image size that the model was trained with.
     """

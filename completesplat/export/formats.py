@@ -1,6 +1,6 @@
 """Export of one scene to several file formats, and the writers of `.splat` and binary glTF (splats or a mesh).
 
-glTF has the extension KHR_gaussian_splatting; readers without it show a cloud of coloured points. Formats: the Khronos
+glTF has the extension KHR_gaussian_splatting. Readers without it show a cloud of coloured points. Formats: the Khronos
 Group's glTF 2.0 specification, and the text of the extension (`extensions/2.0/Khronos/` in their repository, version of
 15 April 2026).
 """
@@ -29,8 +29,8 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import transform_points
 from completesplat.geometry.harmonics import SH_C0
 from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.quantities import Format
 from completesplat.rasterizers import Rasterizer
-from completesplat.settings.schema import Format
 from completesplat.version import __version__
 
 FORMATS: tuple[str, ...] = get_args(Format)
@@ -45,6 +45,9 @@ RENDERING = {
 }
 UNLIT = "KHR_materials_unlit"
 MATERIAL = {"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "extensions": {UNLIT: {}}}
+ARRAY_BUFFER = 34962
+ELEMENT_ARRAY_BUFFER = 34963
+HEADER_BYTES = 12
 COMPONENTS = {"float32": 5126, "uint16": 5123, "uint32": 5125}
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 TO_GLTF = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
@@ -68,7 +71,7 @@ def write_format(
     the colours that the reference camera sees, if these depend on the direction. The `.ply` keeps colours above 1,
     because Gaussians may be seen through others, and all harmonics. All files keep the frame of the given
     Gaussians, except the page, which is turned upright. `.ply`, `.splat` and `.sog` keep our axes (+y down). `.glb` and
-    `.spz` prescribe +y up and +z towards the viewer; readers of `.spz` undo this. `.spz` omits `transparent` Gaussians.
+    `.spz` prescribe +y up and +z towards the viewer. Readers of `.spz` undo this. `.spz` omits `transparent` Gaussians.
 
     Returns:
         The file's name by its purpose: `NAME` for the `.ply`, `NAME_spz` and so on for the others.
@@ -81,8 +84,8 @@ def write_format(
     if kind == "ply":
         write_ply(path, gaussians, comments)
         return {name: path.name}
-    seen = gaussians.seen_from(view.reference.centers)
-    clipped = replace(seen, colors=seen.colors.clamp(0, 1))
+    one_color = gaussians.seen_from(view.reference.centers)
+    clipped = replace(one_color, colors=one_color.colors.clamp(0, 1))
     if kind == "splat":
         write_splat(path, clipped)
     elif kind == "glb":
@@ -110,7 +113,7 @@ def suffix(kind: str) -> str:
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> int:
-    """Write one unbatched set of Gaussians in its order, as `write_ply` does; clamp colours to [0, 1]."""
+    """Write one unbatched set of Gaussians in its order, as `write_ply` does, with colours clamped to [0, 1]."""
     stored = cleaned(gaussians, path).detach()
     records = np.zeros(stored.count, RECORD)
     records["means"] = stored.means.cpu()
@@ -127,7 +130,7 @@ def round_to_uint8(values: Tensor) -> UInt8[np.ndarray, "*shape"]:
 
 
 def write_glb(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
-    """Write one unbatched set of Gaussians; the file appears whole or not at all.
+    """Write one unbatched set of Gaussians to a file that appears whole or not at all.
 
     The frame has +y down and +z forward. Only the points' colours are clipped to [0, 1]. `comments` are metadata.
 
@@ -146,7 +149,7 @@ def write_glb(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
 
 
 def write_mesh(path: Path, mesh: Mesh, comments: Sequence[str] = ()) -> None:
-    """Write a mesh with colours at its vertices, in the frame of `write_glb`; log its resolution."""
+    """Write a mesh with colours at its vertices, in the frame of `write_glb`, and log its resolution."""
     arrays = {
         "POSITION": transform_points(TO_GLTF, mesh.vertices.cpu()).numpy().astype("<f4"),
         "COLOR_0": _linear(mesh.colors.cpu(), torch.ones(len(mesh.colors), 1)),
@@ -162,15 +165,16 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     """Return arrays [gaussian, component] by attribute name of the glTF primitive."""
     opacities = gaussians.opacities.clamp(0, 1)[:, None]
     colors = gaussians.colors.clamp(0, 1)
-    splats = {
-        "ROTATION": normalize_quaternion(gaussians.quaternions).roll(-1, dims=-1),  # x, y, z, w
-        "SCALE": gaussians.scales,
-        "OPACITY": opacities,
-        "SH_DEGREE_0_COEF_0": (gaussians.colors - 0.5) / SH_C0,
+    tensors = {
+        "POSITION": gaussians.means,
+        f"{EXTENSION}:ROTATION": normalize_quaternion(gaussians.quaternions).roll(-1, dims=-1),  # x, y, z, w
+        f"{EXTENSION}:SCALE": gaussians.scales,
+        f"{EXTENSION}:OPACITY": opacities,
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": (gaussians.colors - 0.5) / SH_C0,
     }
-    arrays = {"POSITION": gaussians.means} | {f"{EXTENSION}:{name}": values for name, values in splats.items()}
-    as_floats = {name: values.numpy().astype("<f4") for name, values in arrays.items()}
-    return as_floats | {"COLOR_0": _linear(colors, opacities)}
+    arrays = {name: values.numpy().astype("<f4") for name, values in tensors.items()}
+    arrays["COLOR_0"] = _linear(colors, opacities)
+    return arrays
 
 
 def _linear(colors: Float[Tensor, "n 3"], opacities: Float[Tensor, "n 1"]) -> np.ndarray:
@@ -180,27 +184,43 @@ def _linear(colors: Float[Tensor, "n 3"], opacities: Float[Tensor, "n 1"]) -> np
 
 
 def _write_gltf(path: str | Path, arrays: dict[str, np.ndarray], primitive: Any, others: Any, comments: Any) -> None:
-    """Write arrays [item, component] by name: `indices` are triangles, all others attributes of the primitive."""
+    """Write arrays [item, component] by name. `indices` are triangles, and all others attributes of the primitive."""
     accessors: list[dict[str, Any]] = []
     views: list[dict[str, int]] = []
+    attributes: dict[str, int] = {}
+    elements: dict[str, Any] = {"attributes": attributes}
     offset = 0
-    for name, array in arrays.items():
-        kind = {"componentType": COMPONENTS[array.dtype.name], "type": TYPES[array.shape[1]]}
-        accessors.append({"bufferView": len(views), "count": len(array), **kind})
-        target = 34963 if name == "indices" else 34962
+    for index, (name, array) in enumerate(arrays.items()):
+        accessor: dict[str, Any] = {
+            "bufferView": index,
+            "count": len(array),
+            "componentType": COMPONENTS[array.dtype.name],
+            "type": TYPES[array.shape[1]],
+        }
+        if name == "POSITION":
+            accessor["min"] = array.min(0).tolist()
+            accessor["max"] = array.max(0).tolist()
+        elif name == "COLOR_0":
+            accessor["normalized"] = True
+        accessors.append(accessor)
+        target = ELEMENT_ARRAY_BUFFER if name == "indices" else ARRAY_BUFFER
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target})
         offset += array.nbytes  # each a multiple of four bytes
-    names = {name: index for index, name in enumerate(arrays)}
-    positions = arrays["POSITION"]
-    accessors[names["POSITION"]] |= {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
-    accessors[names["COLOR_0"]] |= {"normalized": True}
-    indices = {"indices": names.pop("indices")} if "indices" in names else {}
+        if name == "indices":
+            elements["indices"] = index
+        else:
+            attributes[name] = index
+    elements.update(primitive)
     description = {
-        "asset": {"version": "2.0", "generator": f"completesplat {__version__}", "extras": {"comments": [*comments]}},
+        "asset": {
+            "version": "2.0",
+            "generator": f"completesplat {__version__}",
+            "extras": {"comments": list(comments)},
+        },
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": names, **indices, **primitive}]}],
+        "meshes": [{"primitives": [elements]}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],
@@ -209,5 +229,10 @@ def _write_gltf(path: str | Path, arrays: dict[str, np.ndarray], primitive: Any,
     text = json.dumps(description).encode()
     text += b" " * (-len(text) % 4)
     content = b"".join(array.tobytes() for array in arrays.values())
-    chunks = [struct.pack("<I4s", len(data), kind) + data for kind, data in ((b"JSON", text), (b"BIN\0", content))]
-    write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + sum(map(len, chunks))) + b"".join(chunks))
+    chunks = _chunk(b"JSON", text) + _chunk(b"BIN\0", content)
+    header = struct.pack("<4sII", b"glTF", 2, HEADER_BYTES + len(chunks))
+    write_bytes(path, header + chunks)
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack("<I4s", len(data), kind) + data

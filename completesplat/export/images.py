@@ -11,8 +11,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from completesplat.data.images.files import image_bytes, label_font
 from completesplat.files import write_bytes
+from completesplat.photo.saving import image_bytes, label_font
 
 Maps = Float[Tensor, "*batch 1 height width"]
 Colors = Float[Tensor, "*batch 3 height width"]
@@ -36,7 +36,11 @@ STOPS = [
 
 
 def to_pixels(images: Colors) -> UInt8[np.ndarray, "*batch height width 3"]:
-    """Convert images (sRGB, clamped to [0, 1]) to bytes, channels last; raise ValueError if a value is not finite."""
+    """Convert images (sRGB, clamped to [0, 1]) to bytes, channels last.
+
+    Raises:
+        ValueError: a value is not finite.
+    """
     if not images.isfinite().all():
         raise ValueError("images hold values that are not finite")
     scaled = images.detach().clamp(0, 1).mul(255).round().to(torch.uint8)
@@ -55,9 +59,12 @@ def enlarge(
 
 
 def image_grid(*rows: Float[Tensor, "_ 3 height width"], factor: int = 3) -> Image.Image:
-    """Return enlarged rows of images (sRGB, 0 to 1) of one size; short rows are filled with white."""
+    """Return enlarged rows of images (sRGB, 0 to 1) of one size, with white at the end of short rows."""
     columns = max(len(row) for row in rows)
-    filled = [torch.cat([row, torch.ones(columns - len(row), *row.shape[1:]).to(row)]) for row in rows]
+    filled = []
+    for row in rows:
+        white = row.new_ones(columns - len(row), *row.shape[1:])
+        filled.append(torch.cat([row, white]))
     whole = rearrange(torch.stack(filled), "row column rgb height width -> rgb (row height) (column width)")
     return Image.fromarray(to_pixels(enlarge(whole, factor)))
 
@@ -75,8 +82,10 @@ Sheet = list[list[SheetCell | None]]  # rows of a sheet
 
 def strip(images: Float[Tensor, "_ 3 height width"], label: str = "", width: int = 0) -> list[SheetCell | None]:
     """Return images side by side on a sheet, a label above the first, and empty cells up to `width`."""
-    cells = [SheetCell(image, "" if index else label) for index, image in enumerate(images)]
-    return [*cells, *[None] * (width - len(cells))]
+    cells: list[SheetCell | None] = []
+    for index, image in enumerate(images):
+        cells.append(SheetCell(image, label if index == 0 else ""))
+    return cells + [None] * (width - len(cells))
 
 
 def image_sheet(headings: Sequence[str] | None, rows: Sheet, title: str | None = None) -> Image.Image:
@@ -87,10 +96,12 @@ def image_sheet(headings: Sequence[str] | None, rows: Sheet, title: str | None =
         rows: at least one, none longer than `headings`; None leaves a cell empty. All images have the same size.
         title: the first line; None leaves no space for it.
     """
-    headings = [""] * max(map(len, rows)) if headings is None else headings
+    if headings is None:
+        headings = [""] * max(map(len, rows))
     first = next(cell.image for row in rows for cell in row if cell is not None)
     factor = max(1, round(READABLE_SIDE / max(first.shape[-2:])))
-    height, width = (side * factor for side in first.shape[-2:])
+    height = first.shape[-2] * factor
+    width = first.shape[-1] * factor
     heading_top = MARGIN + (0.0 if title is None else 1.5 * LINE)
     lefts = [MARGIN + column * (width + GAP) for column in range(len(headings) + 1)]
     tops = [int(heading_top) + 2 * LINE + row * (height + LINE + GAP) for row in range(len(rows) + 1)]
@@ -119,21 +130,22 @@ def color_depth(depth: Maps) -> tuple[Colors, tuple[float, float]]:
     Returns:
         The images, and the near and far depths at the ends of the scale (0, 0 if no surface is seen at all).
     """
-    seen = depth.isfinite() & (depth > 0)
-    if not seen.any():
-        return torch.full_like(depth, NOTHING).expand(*depth.shape[:-3], 3, *depth.shape[-2:]), (0.0, 0.0)
-    ordered = depth[seen].sort().values
+    surface = depth.isfinite() & (depth > 0)
+    if not surface.any():
+        grey = torch.full_like(depth, NOTHING).expand(*depth.shape[:-3], 3, *depth.shape[-2:])
+        return grey, (0.0, 0.0)
+    ordered = depth[surface].sort().values
     stray = len(ordered) // 50
     near = ordered[stray]
     far = ordered[-1 - stray]
-    inverse = 1 / torch.where(seen, depth, far)
+    inverse = 1 / torch.where(surface, depth, far)
     span = (1 / near - 1 / far).clamp(min=1e-12)
     colors = ramp((inverse - 1 / far) / span)
-    return torch.where(seen, colors, NOTHING), (near.item(), far.item())
+    return torch.where(surface, colors, NOTHING), (near.item(), far.item())
 
 
 def ramp(values: Maps) -> Colors:
-    """Return colours for values from 0 (dark) to 1 (bright); clamp other values."""
+    """Return colours for values from 0 (dark) to 1 (bright), to which other values are clamped."""
     position = values.clamp(0, 1) * (len(STOPS) - 1)
     stops = torch.tensor(STOPS, dtype=values.dtype, device=values.device)
     lower = position.floor().clamp(max=len(STOPS) - 2)

@@ -26,7 +26,7 @@ Maps = Float[Tensor, "view channel height width"]
 
 
 class Mesh(NamedTuple):
-    """Closed surface with sRGB colours; triangles run counter-clockwise, seen from outside."""
+    """Closed surface with sRGB colours, whose triangles run counter-clockwise, seen from outside."""
 
     vertices: Points
     faces: Faces
@@ -128,7 +128,10 @@ def surface_of(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Faces, Points
 
 
 def vertex_colors(vertices: Points, normals: Points, cameras: Cameras, maps: Maps, behind: float) -> Points:
-    """Return mean colours over views, by the squared cosine between normal and ray; hidden vertices hardly count."""
+    """Return mean colours over views, weighted by the squared cosine between normal and ray.
+
+    Views that do not see a vertex hardly count.
+    """
     total = torch.zeros_like(vertices)
     weights = torch.zeros_like(vertices[:, :1])
     for center, ((depth, *color), ahead) in zip(cameras.centers, looked_up(vertices, cameras, maps), strict=True):

@@ -32,20 +32,21 @@ log = logging.getLogger(__name__)
 
 
 def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
-    """Write one unbatched set of Gaussians in any frame; the file appears whole or not at all.
+    """Write one unbatched set of Gaussians in any frame to a file that appears whole or not at all.
 
     Opacities are clamped to [1e-6, 1 - 1e-6] before the logit. Reading the file with `read_ply` and writing it again
     gives the same bytes, except for clamped opacities. Quaternions may have any length. `comments` are lines of
-    metadata for the header; characters outside ASCII are escaped.
+    metadata for the header, in which characters outside ASCII are escaped.
 
     Returns:
-        Number of Gaussians in the file; those that cannot be stored are left out.
+        Number of Gaussians in the file, which omits those that cannot be stored.
 
     Raises:
         CompleteSplatError: no Gaussian of a nonempty set can be stored.
     """
     table = _table(cleaned(gaussians, path))
-    names = [*WRITTEN[:9], *_further_names(table.shape[1] - len(WRITTEN)), *WRITTEN[9:]]
+    further = _further_names(table.shape[1] - len(WRITTEN))
+    names = [*MEANS, *NORMALS, *COLORS, *further, "opacity", *SCALES, *QUATERNIONS]
     header = vertex_header(len(table), [(name, "float") for name in names], (AXES_COMMENT, *comments))
     write_bytes(path, header + table.numpy().astype("<f4").tobytes())
     return len(table)
@@ -77,7 +78,7 @@ def read_ply(path: str | Path) -> Gaussians:
     become 0, as in other 3DGS renderers.
 
     Raises:
-        PlyError: `read_vertices` fails, or no Gaussian is finite; a warning counts those that are not.
+        PlyError: `read_vertices` fails, or no Gaussian is finite. A warning counts those that are not.
     """
     try:
         vertices = read_vertices(path, REQUIRED)

@@ -29,9 +29,9 @@ from completesplat.ply_files import LONGEST_HEADER, PACKED
 
 HEADER = struct.Struct("<4sIIBBBBI")  # magic, version, count, degree, fractional bits, flags, streams, their table
 WIDTHS = {2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}  # bytes of a Gaussian in each part but harmonics
-EXTENDED = 2
-COORDINATES = 0xADBE0003
-RIGHT_UP_BACK = 4  # flag, type of an extension, its default
+EXTENDED = 2  # flag of files with extensions
+COORDINATES = 0xADBE0003  # type of the extension that names the axes
+RIGHT_UP_BACK = 4  # axes of files without it
 OUR_AXES = np.array([1, -1, 1])  # right, down, forward
 LARGEST_RATIO = 40  # of what a file unpacks to; splat-transform's have 2
 
@@ -61,13 +61,14 @@ def read_gaussians(path: str | Path) -> Gaussians:
 
 
 def _packed_format(path: Path) -> str | None:
-    """Return the name of a format that `splat-transform` unpacks, None for what `read_ply` reads or refuses."""
+    """Return the name of a format that `splat-transform` unpacks, or None for one that `read_ply` reads or refuses."""
     if path.suffix.lower() in (".sog", ".ksplat"):
         return path.suffix[1:].upper()
     if not path.is_file() or not os.access(path, os.R_OK):
         return None
     with path.open("rb") as file:
-        return "SuperSplat's compressed PLY" if f" {PACKED}\n".encode() in file.read(LONGEST_HEADER) else None
+        start = file.read(LONGEST_HEADER)
+    return "SuperSplat's compressed PLY" if f" {PACKED}\n".encode() in start else None
 
 
 def _read_by_splat_transform(path: Path, kind: str) -> Gaussians:
@@ -94,30 +95,40 @@ def _read_spz(content: bytes) -> list[np.ndarray]:
     ends = count * np.cumsum([*WIDTHS.get(version, ()), 3 * coefficients(degree)])
     if magic != b"NGSP" or version not in WIDTHS or degree > 4 or ends[-1] > most:
         raise ValueError(f"version {version}, {count} Gaussians, harmonics of degree {degree}")
-    signs = _signs(data[32:table] if version == 4 and flags & EXTENDED else b"")
-    sizes = np.diff(ends, prepend=0)
-    parts = _unpacked(data, table, streams, sizes[sizes > 0]) if version == 4 else data[16 : 16 + ends[-1]]
-    blocks = np.split(np.frombuffer(parts, np.uint8, ends[-1]), ends[:-1])
-    places, opacities, colors, scales, rotations = (block.reshape(count, -1) for block in blocks[:5])
-    values = blocks[5].reshape(count, coefficients(degree), 3)[:, : coefficients(LARGEST_DEGREE)]
-    harmonics = torch.from_numpy(values / 128 - 1)
-    whole = np.pad(places.reshape(count, 3, 3), ((0, 0), (0, 0), (1, 0)))  # 24 bits in the upper part of 32
-    return [
-        np.ldexp(whole.view("<i4")[..., 0] >> 8, -bits) * signs,
-        _quaternions(rotations) * [1, *(signs.prod() * signs)],
+    extensions = b""
+    if version == 4:
+        if flags & EXTENDED:
+            extensions = data[32:table]
+        sizes = np.diff(ends, prepend=0)
+        body = _unpacked(data, table, streams, sizes[sizes > 0])
+    else:
+        body = data[16 : 16 + ends[-1]]
+    blocks = np.split(np.frombuffer(body, np.uint8, ends[-1]), ends[:-1])
+    positions, opacities, colors, scales, rotations = (block.reshape(count, -1) for block in blocks[:5])
+    signs = _signs(extensions)
+    # 24 bits of a fixed-point number in the upper part of 32
+    fixed = np.pad(positions.reshape(count, 3, 3), ((0, 0), (0, 0), (1, 0))).view("<i4")[..., 0] >> 8
+    arrays = [
+        np.ldexp(fixed, -bits) * signs,
+        _quaternions(rotations) * np.append(1, signs.prod() * signs),
         np.exp(scales / 16 - 10),
         opacities[:, 0] / 255,
         np.maximum(0.5 + SH_C0 * (colors / 255 - 0.5) / 0.15, 0),
-        *([rotated(harmonics, torch.from_numpy(np.diag(signs * 1.0))).numpy()] if degree else []),
     ]
+    if degree > 0:
+        values = blocks[5].reshape(count, coefficients(degree), 3)[:, : coefficients(LARGEST_DEGREE)]
+        harmonics = torch.from_numpy(values / 128 - 1)
+        arrays.append(rotated(harmonics, torch.from_numpy(np.diag(signs * 1.0))).numpy())
+    return arrays
 
 
 def _signs(extensions: bytes) -> np.ndarray:
-    """Return the signs that turn the axes of a file to ours; its extensions may name them (0 to 8)."""
+    """Return the signs that turn the axes of a file to ours. Its extensions may name them (0 to 8)."""
     system = 0
     while len(extensions) >= 12:
         kind, size, value = struct.unpack_from("<III", extensions)
-        system = value if kind == COORDINATES else system
+        if kind == COORDINATES:
+            system = value
         extensions = extensions[8 + size :]
     if system > 8:
         raise ValueError(f"coordinate system {system}")
@@ -126,13 +137,17 @@ def _signs(extensions: bytes) -> np.ndarray:
 
 
 def _unpacked(data: bytes, table: int, streams: int, sizes: np.ndarray) -> bytes:
-    """Unpack the streams of version 4, behind a table of their sizes: packed, unpacked."""
+    """Unpack the streams of version 4, which follow a table with the packed and the unpacked size of each."""
     import pyarrow
 
     rows = np.frombuffer(data, "<i8", 2 * streams, table).reshape(streams, 2)[: len(sizes)]
-    ends = table + 16 * streams + np.cumsum(rows[:, 0])
-    packed = [data[end - length : end] for end, (length, _) in zip(ends, rows, strict=True)]
-    return b"".join(pyarrow.decompress(x, int(n), "zstd", asbytes=True) for x, n in zip(packed, sizes, strict=True))
+    start = table + 16 * streams
+    parts = []
+    for packed_size, size in zip(rows[:, 0].tolist(), sizes.tolist(), strict=True):
+        packed = data[start : start + packed_size]
+        parts.append(pyarrow.decompress(packed, size, "zstd", asbytes=True))
+        start += packed_size
+    return b"".join(parts)
 
 
 def _quaternions(packed: UInt8[np.ndarray, "gaussian bytes"]) -> Float[np.ndarray, "gaussian 4"]:

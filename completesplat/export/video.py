@@ -1,6 +1,7 @@
 """Videos of finished scenes along camera paths, in a format that every browser plays."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,9 +65,15 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
     height, width = frames.shape[-2:]
     factor = -(-SMALLEST_SIDE // min(height, width))
     with atomic_path(path) as temporary:
-        options = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p", "macro_block_size": 2}
-        options["output_params"] = ["-preset", "veryfast"]  # two fifths of the default's time; files of about its size
-        with imageio.get_writer(temporary, format="FFMPEG", fps=fps, **options) as writer:  # type: ignore[arg-type]
+        options: dict[str, Any] = {
+            "codec": "libx264",
+            "quality": 8,
+            "pixelformat": "yuv420p",
+            "macro_block_size": 2,
+            # Two fifths of the default's time, for files of about its size.
+            "output_params": ["-preset", "veryfast"],
+        }
+        with imageio.get_writer(temporary, format="FFMPEG", fps=fps, **options) as writer:
             for frame in frames:
                 large = to_pixels(frame).repeat(factor, axis=0).repeat(factor, axis=1)
                 padded = np.pad(large, ((0, len(large) % 2), (0, large.shape[1] % 2), (0, 0)), mode="edge")
@@ -84,7 +91,8 @@ def _is_whole(path: Path) -> bool:
     while at + 8 <= len(content):
         length = int.from_bytes(content[at : at + 4])
         kind = content[at + 4 : at + 8]
-        length = int.from_bytes(content[at + 8 : at + 16]) if length == 1 else length
+        if length == 1:
+            length = int.from_bytes(content[at + 8 : at + 16])
         if length < 8:
             return False
         kinds.add(kind)

@@ -1,7 +1,7 @@
 """Pinhole cameras and their conventions, which are stated here only.
 
 Axes are OpenCV's: +x right, +y down, +z forward. `world_to_camera` maps homogeneous world points to camera
-points. Intrinsics are in pixels; pixel (column i, row j) covers [i, i + 1) x [j, j + 1), so its centre lies at
+points. Intrinsics are in pixels. Pixel (column i, row j) covers [i, i + 1) x [j, j + 1), so its centre lies at
 (i + 0.5, j + 0.5) and (0, 0) is the top left corner of the image.
 """
 
@@ -77,7 +77,7 @@ def project(cameras: Cameras, points: Points) -> tuple[Float[Tensor, "*batch n 2
 
 
 def unproject(cameras: Cameras, pixels: Pixels, depth: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*batch n 3"]:
-    """Convert pixel coordinates with depth along the optical axis to world points; the inverse of `project`."""
+    """Convert pixel coordinates with depth along the optical axis to world points (the inverse of `project`)."""
     camera_points = rays_through(cameras.intrinsics, pixels) * depth[..., None]
     return transform_points(cameras.camera_to_world, camera_points)
 
@@ -112,7 +112,7 @@ def pinhole(fov_degrees: float, size: int) -> Float[Tensor, "3 3"]:
 
 
 def nearest_to_axes(cameras: Cameras, least_spread: float = PARALLEL) -> Float[Tensor, "3"] | None:
-    """Return the point (float64) nearest to all optical axes (least squares); None if the axes are too parallel."""
+    """Return the point (float64) nearest to all optical axes (least squares), or None if they are too parallel."""
     axes = cameras.camera_to_world[:, :3, 2].double()
     centers = cameras.centers.double()
     across = torch.eye(3, dtype=axes.dtype, device=axes.device) - axes[:, :, None] * axes[:, None]

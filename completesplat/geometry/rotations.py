@@ -12,7 +12,7 @@ SMALLEST_NORM = 1e-12
 
 
 def normalize_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Scale a quaternion to unit length; a zero quaternion becomes (1, 0, 0, 0) with zero gradient."""
+    """Scale a quaternion to unit length, and turn a zero quaternion into (1, 0, 0, 0) with zero gradient."""
     squared = quaternion.square().sum(-1, keepdim=True)
     usable = squared > SMALLEST_NORM**2
     # The norm is taken of a sanitised value, so that the unused branch of `where` has a finite gradient too.

@@ -34,7 +34,7 @@ def normals_from_depth(depth: DepthMaps, cameras: Cameras) -> VectorMaps:
 
 
 def _difference(points: VectorMaps, known: Bool[Tensor, "*batch 1 height width"], axis: int) -> VectorMaps:
-    """Subtract the point before from the next one; the point itself replaces a missing one."""
+    """Subtract the point before from the next one, where the point itself replaces a missing one."""
     indices = torch.arange(points.shape[axis], device=points.device)
     before, following = (
         torch.where(known.index_select(axis, index), points.index_select(axis, index), points)

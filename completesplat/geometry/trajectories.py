@@ -2,14 +2,12 @@
 
 import math
 from dataclasses import replace
-from typing import get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.geometry.cameras import Cameras, look_at
-from completesplat.settings.schema import CameraPath
 
 Vector = Float[Tensor, "3"]
 
@@ -17,7 +15,7 @@ Vector = Float[Tensor, "3"]
 def orbit(reference: Cameras, pivot: Vector, up: Vector, frames: int, degrees: float = 360.0) -> Cameras:
     """Return cameras that circle the axis through `pivot` along `up`, starting at the reference camera.
 
-    The reference camera (unbatched) keeps its distance and height; every camera looks at `pivot`. The last frame
+    The reference camera (unbatched) keeps its distance and height. Every camera looks at `pivot`. The last frame
     stops one step short of `degrees`, so that a full turn loops smoothly.
 
     Returns:
@@ -62,7 +60,7 @@ def wobble(reference: Cameras, pivot: Vector, up: Vector, frames: int, radius: f
     return _looking_at(reference, eyes, pivot, up)
 
 
-PATHS = dict(zip(get_args(CameraPath), (orbit, swipe, wobble), strict=True))
+PATHS = {"orbit": orbit, "swipe": swipe, "wobble": wobble}
 
 
 def _full_turn(frames: int, like: Tensor) -> Float[Tensor, " frame"]:

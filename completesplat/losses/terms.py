@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Protocol, TypedDict
+from typing import Protocol, TypedDict
 
 import torch
 from jaxtyping import Float
@@ -12,8 +12,8 @@ from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.losses.ssim import structural_similarity
+from completesplat.quantities import Natural, NonNegative
 from completesplat.scene import Views
-from completesplat.settings.schema import Natural, Range
 from completesplat.tensors import TensorDataclass
 
 
@@ -35,7 +35,7 @@ class LossTerm(Protocol):
 class Term(TypedDict, total=False):
     """Loss term, its weight in the sum, and the optimizer step from which on it counts (by default 0)."""
 
-    weight: Annotated[float, Range(0)]
+    weight: NonNegative
     term: LossTerm
     start_step: Natural
 
@@ -54,8 +54,8 @@ class WeightedSum:
         self.terms = {name: entry for name, entry in terms.items() if entry and entry["weight"]}
         for name, entry in self.terms.items():
             if "term" not in entry or entry.keys() - Term.__annotations__:
-                given = ", ".join(entry)
-                raise CompleteSplatError(f"loss.terms.{name}: give weight, term and perhaps start_step, not {given}")
+                keys = ", ".join(entry)
+                raise CompleteSplatError(f"loss.terms.{name}: give weight, term and perhaps start_step, not {keys}")
         if all(entry.get("start_step", 0) > 0 for entry in self.terms.values()):
             raise CompleteSplatError("no loss at step 0: loss.terms needs a term with start_step=0")
 
@@ -66,10 +66,14 @@ class WeightedSum:
 
         A term is not computed before its `start_step`.
         """
-        active = {name: entry for name, entry in self.terms.items() if step >= entry.get("start_step", 0)}
-        values = {name: entry["term"](prediction, truth) for name, entry in active.items()}
-        total = torch.stack([self.terms[name]["weight"] * value for name, value in values.items()]).sum()
-        return total, {name: value.detach() for name, value in values.items()}
+        values: dict[str, Tensor] = {}
+        weighted: list[Tensor] = []
+        for name, entry in self.terms.items():
+            if step >= entry.get("start_step", 0):
+                value = entry["term"](prediction, truth)
+                weighted.append(entry["weight"] * value)
+                values[name] = value.detach()
+        return torch.stack(weighted).sum(), values
 
 
 class MeanSquaredError:
@@ -87,7 +91,7 @@ class MeanAbsoluteError:
 
 
 class StructuralDissimilarity:
-    """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term; the paper may mean half of it)."""
+    """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term). The paper may mean half of it."""
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
         return 1 - structural_similarity(prediction.images.flatten(0, 1), truth.images.flatten(0, 1)).mean()

@@ -1,7 +1,7 @@
-"""Swappable rasterizers: their interface and shared constants; each backend has a file.
+"""Interface and shared constants of the swappable rasterizers.
 
-Every backend computes the same function, with gsplat's conventions: alpha = min(max_alpha, opacity * exp(-sigma)),
-composited from front to back, with the constants of one shared config.
+Each backend has a file. Every backend computes the same function, with gsplat's conventions:
+alpha = min(max_alpha, opacity * exp(-sigma)), composited from front to back, with the constants of one shared config.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from completesplat.tensors import TensorDataclass
 
 @dataclass(frozen=True)
 class RenderingConstants:
-    """Constants on which all backends agree; by default those compiled into the kernels of gsplat 1.5.
+    """Constants on which all backends agree. The defaults are those compiled into the kernels of gsplat 1.5.
 
     Attributes:
         blur: added to the diagonal of the projected covariance, in px^2.
@@ -59,7 +59,7 @@ class Rendering(TensorDataclass):
         return self.color + (1 - self.alpha) * background
 
     def expected_depth(self) -> Float[Tensor, "*batch 1 height width"]:
-        """Return the mean depth of what a pixel shows; 0 where it shows nothing."""
+        """Return the mean depth of what a pixel shows, and 0 where it shows nothing."""
         return self.depth / self.alpha.clamp(min=1e-10)
 
     def surface_depth(self) -> Float[Tensor, "*batch 1 height width"]:
@@ -85,7 +85,7 @@ def with_view_colors(render: Render) -> Render:
     """
 
     @wraps(render)
-    def drawn(backend: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+    def render_view_colors(backend: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         if not isinstance(gaussians, DirectionalGaussians):
             return render(backend, gaussians, cameras)
         shape = cameras.world_to_camera.shape[:2]
@@ -94,11 +94,11 @@ def with_view_colors(render: Render) -> Render:
         rendering = render(backend, for_each_view.seen_from(cameras.centers.flatten(0, 1)), single)
         return rendering.map(lambda values: values.view(*shape, *values.shape[2:]))
 
-    return cast(Render, drawn)
+    return cast(Render, render_view_colors)
 
 
 def require_float32(name: str, gaussians: Gaussians, cameras: Cameras, device: torch.device) -> None:
-    """Check that all tensors are float32 and on this device; the error names the rasterizer."""
+    """Raise CompleteSplatError, naming the rasterizer, unless all tensors are float32 and on this device."""
     tensors = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
     for key, tensor in tensors.items():
         if tensor.dtype != torch.float32 or tensor.device != device:

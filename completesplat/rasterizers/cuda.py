@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import pad
 
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
@@ -69,7 +68,10 @@ class CudaRasterizer:
 
     @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Render scenes [batch] from cameras [batch view]; CPU tensors are copied to the GPU and the images back."""
+        """Render scenes [batch] from cameras [batch view].
+
+        CPU tensors are copied to the GPU, and their images back.
+        """
         home = gaussians.means.device
         if home.type != DEVICE:
             return self(gaussians.to(DEVICE), cameras.to(DEVICE)).to(home)
@@ -80,13 +82,20 @@ class CudaRasterizer:
         height, width = cameras.image_size
         prepared = padded(gaussians, drawable(gaussians, cameras, self.constants))
         images, alphas, _ = self._rasterization(
-            **dict(zip(("means", "quats", "scales", "opacities", "colors"), vars(prepared).values(), strict=True)),
-            **{"viewmats": cameras.world_to_camera, "Ks": cameras.intrinsics, "width": width, "height": height},
+            means=prepared.means,
+            quats=prepared.quaternions,
+            scales=prepared.scales,
+            opacities=prepared.opacities,
+            colors=prepared.colors,
+            viewmats=cameras.world_to_camera,
+            Ks=cameras.intrinsics,
+            width=width,
+            height=height,
             near_plane=self._near_plane,
             far_plane=FARTHEST,
             eps2d=self.constants.blur,
-            # Packing gains little, because views see nearly every Gaussian; and gsplat's packed kernels can add
-            # the gradients of one scene to another's (https://github.com/nerfstudio-project/gsplat/pull/1059).
+            # Packing gains little, because views see nearly every Gaussian. And gsplat's packed kernels can add the
+            # gradients of one scene to another's (https://github.com/nerfstudio-project/gsplat/pull/1059).
             packed=False,
             render_mode="RGB+D",
             rasterize_mode="classic",
@@ -125,7 +134,7 @@ def _magnification(cameras: Cameras, constants: RenderingConstants) -> Float[Ten
 def padded(gaussians: Gaussians, mask: Bool[Tensor, "batch gaussian"]) -> Gaussians:
     """Return Gaussians that are safe for gsplat: unit quaternions, and zeros for those outside of the mask.
 
-    Zero opacity keeps a Gaussian out of the image; zeros for its other values keep NaN out of the gradients. The
+    Zero opacity keeps a Gaussian out of the image. Zeros for its other values keep NaN out of the gradients. The
     number of Gaussians is padded to a multiple of 32, at least 32, for two reasons. gsplat fails without Gaussians (a
     division by zero in `ProjectionEWA3DGSFused.cu`). And its backward pass sums over the lanes of a warp that agree in
     the index of the Gaussian or the view, whatever their scene, so no warp may reach into a second scene.
@@ -133,8 +142,10 @@ def padded(gaussians: Gaussians, mask: Bool[Tensor, "batch gaussian"]) -> Gaussi
     missing = max(WARP - gaussians.count, -gaussians.count % WARP)
 
     def clean(tensor: Tensor) -> Tensor:
-        values = torch.where(mask.reshape(*mask.shape, *[1] * (tensor.ndim - mask.ndim)), tensor, 0.0)
-        return pad(values, (*[0, 0] * (tensor.ndim - mask.ndim), 0, missing))
+        channels = tensor.shape[2:]
+        values = torch.where(mask.view(*mask.shape, *(1 for _ in channels)), tensor, 0.0)
+        zeros = values.new_zeros(len(values), missing, *channels)
+        return torch.cat([values, zeros], dim=1)
 
     cleaned = gaussians.map(clean)
     # Scale components to at most 1 first, because the square of a long quaternion overflows.

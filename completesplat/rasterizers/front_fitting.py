@@ -33,7 +33,7 @@ def fit_front(
 ) -> Gaussians:
     """Fit colours, opacities and scales of Gaussians [batch], so that each set looks like its image from its camera.
 
-    Each round is a step of Adam on the squared error, until it is `ENOUGH`; the best of all rounds is returned.
+    Each round is a step of Adam on the squared error, until it is `ENOUGH`. The best of all rounds is returned.
     Gaussians that the image hides stay as they are, and none changes its place. Of `DirectionalGaussians`, the means of
     the colours change.
 
@@ -46,11 +46,12 @@ def fit_front(
     with torch.inference_mode(False), torch.enable_grad():
         # Autograd cannot use tensors that were made in inference mode, but it can use copies.
         fixed = gaussians.map(torch.clone).detach()
-        views = cameras.map(lambda x: x[:, None].clone())
+        views = cameras[:, None].map(torch.clone)
         image = images[:, None].clone()
         mask = torch.ones_like(image) if visible is None else visible[:, None].expand_as(image).clone()
         moves = [torch.zeros_like(getattr(fixed, name), requires_grad=True) for name in RATES]
-        means, squares = ([torch.zeros_like(move) for move in moves] for _ in range(2))
+        means = [torch.zeros_like(move) for move in moves]
+        squares = [torch.zeros_like(move) for move in moves]
         best = gaussians
         least = math.inf
         for number in range(1, rounds + 2):
@@ -62,7 +63,7 @@ def fit_front(
             if number > rounds or least <= ENOUGH * mask.sum().item() / 2:
                 break
             grads = torch.autograd.grad(error, moves)
-            # torch.optim's Adam is the same; its first step imports torch's compiler, which takes a second.
+            # torch.optim's Adam is the same, but its first step imports torch's compiler, which takes a second.
             factor = min(1, number / WARM_UP) * (1 + math.cos(math.pi * (number - 1) / rounds)) / 2
             for move, mean, square, grad, rate in zip(moves, means, squares, grads, RATES.values(), strict=True):
                 mean.lerp_(grad, 1 - BETAS[0])
@@ -73,7 +74,7 @@ def fit_front(
 
 
 def _moved(gaussians: Gaussians, colors: Tensor, opacities: Tensor, scales: Tensor) -> Gaussians:
-    """Return Gaussians with changed values; where a change is 0, the value stays exactly as it is."""
+    """Return Gaussians with changed values. Where a change is 0, the value stays exactly as it is."""
     logits = torch.logit(gaussians.opacities, SMALLEST)
     return replace(
         gaussians,

@@ -34,10 +34,11 @@ FASTER: dict[str, Callable[[RenderingConstants | None], Rasterizer]] = {"cuda": 
 
 
 def auto(constants: RenderingConstants | None = None) -> Rasterizer:
-    """Return the fastest backend that works here with these constants; log the choice if there is a GPU, and failures.
+    """Return the fastest backend that works here with these constants.
 
-    Every backend takes tensors of any device, so the choice does not depend on where a model runs: if there is a GPU,
-    the Gaussians of a model on the CPU are drawn on it, too.
+    The choice is logged if there is a GPU, and so are backends that do not work. Every backend takes tensors of any
+    device, so the choice does not depend on where a model runs: if there is a GPU, the Gaussians of a model on the CPU
+    are drawn on it, too.
     """
     gpu = torch.cuda.is_available()
     for name, make in FASTER.items():
@@ -53,7 +54,11 @@ def auto(constants: RenderingConstants | None = None) -> Rasterizer:
 
 
 def cuda(constants: RenderingConstants | None = None) -> Rasterizer:
-    """Return the `cuda` backend, without which training takes far too long; fail if it does not work here."""
+    """Return the `cuda` backend, without which training takes far too long.
+
+    Raises:
+        CompleteSplatError: it does not work here.
+    """
     try:
         return CudaRasterizer(constants)
     except CompleteSplatError as error:
@@ -68,7 +73,8 @@ def failure(name: str, constants: RenderingConstants | None) -> str | None:
     processor that numba does not know, a broken cache, refused constants.
     """
     try:
-        actual, expected = map(_image_and_gradient, (FASTER[name](constants), ReferenceRasterizer(constants)))
+        actual = _image_and_gradient(FASTER[name](constants))
+        expected = _image_and_gradient(ReferenceRasterizer(constants))
     except CompleteSplatError as error:
         return str(error)
     except Exception as error:
@@ -98,7 +104,7 @@ def _proof(constants: RenderingConstants | None) -> Path:
 
     folder = cache_directory() or Path(os.devnull)
     settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
-    files = *sorted(Path(__file__).parent.glob("*.py")), *sorted(folder.glob("kernels_*/*.nb?"))
+    files = sorted(Path(__file__).parent.glob("*.py")) + sorted(folder.glob("kernels_*/*.nb?"))
     facts = repr((settings, constants, torch.__version__)).encode()
     digest = sha256(b"".join([facts, *(path.read_bytes() for path in files)])).hexdigest()
     return folder / f"passed-{digest}"
@@ -106,7 +112,7 @@ def _proof(constants: RenderingConstants | None) -> Path:
 
 @torch.enable_grad()
 def _image_and_gradient(rasterizer: Rasterizer) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render a Gaussian off the centre of a 6 x 5 image; return the image and a gradient of the mean."""
+    """Render a Gaussian off the centre of a 6 x 5 image, and return the image and a gradient of the mean."""
     mean = torch.tensor([[[0.05, -0.02, 2.0]]], requires_grad=True)
     quaternion = torch.tensor([[[1.0, 0.2, -0.1, 0.3]]])
     scale = torch.tensor([[[0.3, 0.2, 0.1]]])

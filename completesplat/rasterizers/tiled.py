@@ -12,7 +12,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rendering, RenderingConstants, require_float32, with_view_colors
 from completesplat.rasterizers.kernels import array_layout as layout
-from completesplat.rasterizers.kernels.drawing import Drawing, Parameters, RenderedImages
+from completesplat.rasterizers.kernels.batch import BatchRendering, Parameters, RenderedImages
 
 WIDTHS: dict[str, list[int]] = {"means": [3], "quaternions": [4], "scales": [3], "opacities": [], "colors": [3]}
 SMALLEST_BLUR = 1e-5  # px^2; with it, the reference's clamp on the determinant (1e-10) never applies
@@ -38,7 +38,10 @@ class TiledRasterizer:
 
     @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Render scenes [batch] from cameras [batch view]; a GPU's tensors are copied here and the images back."""
+        """Render scenes [batch] from cameras [batch view].
+
+        A GPU's tensors are copied to the CPU, and their images back.
+        """
         if gaussians.means.device.type != "cpu":
             return self(gaussians.to("cpu"), cameras.to("cpu")).to(gaussians.means.device)
         _check(gaussians, cameras)
@@ -85,23 +88,24 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, cameras: Cameras, constants: RenderingConstants, *tensors: Tensor) -> tuple[Tensor, ...]:
         parameters = Parameters(*_arrays([tensor.detach().contiguous() for tensor in tensors]))
         packed = pack_cameras(cameras, constants.frustum_margin)
-        drawing = Drawing(parameters, packed, cameras.image_size, constants, keep=any(ctx.needs_input_grad))
-        images = tuple(torch.from_numpy(image) for image in drawing.draw())
+        rendering = BatchRendering(parameters, packed, cameras.image_size, constants, keep=any(ctx.needs_input_grad))
+        images = tuple(torch.from_numpy(image) for image in rendering.render())
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*tensors, *images)
-        ctx.drawing = drawing
+        ctx.rendering = rendering
         return images
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *image_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         images = ctx.saved_tensors[5:]
-        filled = [
-            # Zeros from NumPy, because torch would wake its threads, which then spin for a while on the kernels' cores.
-            torch.from_numpy(np.zeros(image.shape, np.float32)) if gradient is None else gradient.contiguous()
-            for image, gradient in zip(images, image_gradients, strict=True)
-        ]
-        gradients = ctx.drawing.backward(RenderedImages(*_arrays(images)), RenderedImages(*_arrays(filled)))
+        filled = []
+        for image, gradient in zip(images, image_gradients, strict=True):
+            if gradient is None:
+                # NumPy's zeros: torch would wake its threads, which then spin on the kernels' cores for a while.
+                gradient = torch.from_numpy(np.zeros(image.shape, np.float32))
+            filled.append(gradient.contiguous())
+        gradients = ctx.rendering.backward(RenderedImages(*_arrays(images)), RenderedImages(*_arrays(filled)))
         return None, None, *(torch.from_numpy(gradient) for gradient in gradients)
 
 

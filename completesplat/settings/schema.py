@@ -4,66 +4,16 @@ import inspect
 import math
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypedDict
 
 from completesplat.errors import CompleteSplatError
+from completesplat.quantities import CameraPath, Entries, Format, NonNegative, Positive, Range, Seed, Share
 
-MOST_SHOWN = 1e6  # help texts leave out larger bounds
-NUMBERS: Mapping[type, type] = {int: Integral, float: Real}  # NumPy's are such, too
+NOT_A_LIST = "must be a list"
+NUMBERS: Mapping[type, type] = {int: Integral, float: Real}  # which include NumPy's numbers
 KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "null"}
-
-
-@dataclass(frozen=True)
-class Range:
-    """Rule for `Annotated`: a finite number between two bounds, both included."""
-
-    least: float
-    most: float = math.inf
-
-    def refusal(self, value: float) -> str | None:
-        if value == math.inf:
-            return "must be finite"
-        if self.least <= value <= self.most:
-            return None
-        if math.isinf(self.most):
-            return f"must be at least {self.least:g}"
-        return f"must lie between {self.least:g} and {self.most:g}"
-
-    def words(self) -> str:
-        return f"at least {self.least:g}" if self.most > MOST_SHOWN else f"{self.least:g} to {self.most:g}"
-
-
-@dataclass(frozen=True)
-class Entries:
-    """Rule for `Annotated`: a list with a minimum and a maximum number of entries."""
-
-    least: int = 0
-    most: float = math.inf
-
-    def refusal(self, value: Sequence[object]) -> str | None:
-        if self.least <= len(value) <= self.most:
-            return None
-        if math.isinf(self.most):
-            return "must not be empty"
-        return f"must have {'' if self.least == self.most else 'at most '}{self.most} entries"
-
-
-Positive = Annotated[int, Range(1)]
-Natural = Annotated[int, Range(0)]
-Seed = Annotated[int, Range(0, 2**63 - 1)]
-Share = Annotated[float, Range(0, 1)]
-Side = Annotated[int, Range(8, 4096)]  # of an image, in pixels
-Format = Literal["ply", "splat", "glb", "mesh", "spz", "sog", "html"]  # of a scene's files
-CameraPath = Literal["orbit", "swipe", "wobble"]  # of a video
-
-# Sizes of networks. Their bounds lie beyond what anyone trains, and protect from configs that strangers wrote.
-Width = Annotated[int, Range(1, 8192)]
-Widths = Annotated[Sequence[Width], Entries(1), Entries(most=8)]
-Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], Entries(most=8)]
-Few = Annotated[int, Range(1, 16)]
 
 
 Precision = Literal["32-true", "bf16-mixed", "16-mixed", 32, "bf16", 16]
@@ -77,7 +27,7 @@ class TrainerSettings(TypedDict):
     accumulate_grad_batches: Positive
     val_check_interval: Annotated[float, Range(1e-6)] | str | Mapping[str, int] | None
     check_val_every_n_epoch: Positive | None
-    gradient_clip_val: Annotated[float, Range(0)] | None
+    gradient_clip_val: NonNegative | None
 
 
 class EvaluationSettings(TypedDict):
@@ -155,7 +105,7 @@ class ModelSettings(TypedDict):
 
 
 class TestSettings(ModelSettings, total=False):
-    """Settings of `completesplat test`, all of which `TrainedModel` takes."""
+    """Settings of `completesplat test`, all of which `trained_model` takes."""
 
     scenes: str | None
     frame: Literal["opencv", "opengl"]
@@ -194,22 +144,30 @@ def check_settings(function: object, settings: Mapping[str, object]) -> None:
         CompleteSplatError: a setting does not fit. The message names the first one, and the values that it may have.
     """
     hints = hints_of(function)
-    for name in [name for name in settings if name in hints]:
-        check_value(name, hints[name], settings[name])
+    for name in settings:
+        if name in hints:  # others may be missing in a config
+            check_value(name, hints[name], settings[name])
 
 
 def check_value(key: str, annotation: object, value: object) -> None:
     """Raise CompleteSplatError, with the values that are allowed, if a setting does not fit an annotation."""
-    for place, part, reason in violations(annotation, value):
-        example = f", such as {key}{place}=[{part}]" if reason == "must be a list" and part is not None else ""
-        raise CompleteSplatError(f"{key}{place}={'null' if part is None else part}: {reason}{example}")
+    unfit = violations(annotation, value)
+    if not unfit:
+        return
+    place, part, reason = unfit[0]
+    written = "null" if part is None else part
+    if reason == NOT_A_LIST and part is not None:
+        reason = f"{reason}, such as {key}{place}=[{part}]"
+    raise CompleteSplatError(f"{key}{place}={written}: {reason}")
 
 
 def hints_of(function: object) -> dict[str, object]:
-    """Return annotations by name, of a function's arguments or a `TypedDict`; expand `**name: Unpack[...]`."""
+    """Return annotations by name, of a function's arguments or a `TypedDict`, with those in `**name: Unpack[...]`."""
     hints = typing.get_type_hints(function, include_extras=True)
-    for shared in [typing.get_args(hint)[0] for hint in hints.values() if typing.get_origin(hint) is typing.Unpack]:
-        hints |= typing.get_type_hints(shared, include_extras=True)
+    for hint in list(hints.values()):
+        if typing.get_origin(hint) is typing.Unpack:
+            shared = typing.get_args(hint)[0]
+            hints.update(typing.get_type_hints(shared, include_extras=True))
     return hints
 
 
@@ -218,13 +176,14 @@ def arguments_of(target: Callable[..., object] | type) -> tuple[dict[str, object
 
     If a class passes further settings on to its base class, the arguments of the base class are included.
     """
-    kinds = target.__mro__ if isinstance(target, type) else ()
-    functions = [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [target]
+    functions: list[Callable[..., object]] = [target]
+    if isinstance(target, type):
+        functions = [vars(kind)["__init__"] for kind in target.__mro__ if "__init__" in vars(kind)]
     annotations: dict[str, object] = {}
     for function in functions:
         try:
             further, passes_on = _named_arguments(function)
-        except (NameError, TypeError, ValueError):  # other packages: names only under TYPE_CHECKING
+        except (NameError, TypeError, ValueError):  # annotations of other packages may name what only checkers import
             return annotations, False
         annotations = further | annotations
         if not passes_on:
@@ -235,17 +194,18 @@ def arguments_of(target: Callable[..., object] | type) -> tuple[dict[str, object
 def _named_arguments(function: Callable[..., object]) -> tuple[dict[str, object], bool]:
     """Return annotations of a function's arguments by name, and whether it has a `**` that takes any others."""
     hints = hints_of(function)
-    parameters = inspect.signature(function).parameters.values()
-    named = {param.name for param in parameters if param.kind in (param.POSITIONAL_OR_KEYWORD, param.KEYWORD_ONLY)}
-    unpacked = hints.keys() - {param.name for param in parameters} - {"return"}
-    others = [hints.get(param.name) for param in parameters if param.kind is param.VAR_KEYWORD]
-    annotations = {name: hints.get(name, object) for name in (named | unpacked) - {"self"}}
-    return annotations, any(typing.get_origin(hint) is not typing.Unpack for hint in others)
-
-
-def start_weights(kind: object) -> Mapping[str, str]:
-    """Return the settings of weights that training starts from, with examples, as a part's class declares them."""
-    return getattr(kind, "start_weights", {})
+    annotations: dict[str, object] = {}
+    takes_any = False
+    for name, parameter in inspect.signature(function).parameters.items():
+        hint = hints.pop(name, object)
+        if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
+            annotations[name] = hint
+        elif parameter.kind is parameter.VAR_KEYWORD and typing.get_origin(hint) is not typing.Unpack:
+            takes_any = True
+    annotations.update(hints)  # the names in `**name: Unpack[...]`
+    annotations.pop("self", None)
+    annotations.pop("return", None)
+    return annotations, takes_any
 
 
 def violations(annotation: object, value: object) -> list[Violation]:
@@ -253,8 +213,7 @@ def violations(annotation: object, value: object) -> list[Violation]:
     origin = typing.get_origin(annotation)
     arguments = typing.get_args(annotation)
     if origin is Annotated:
-        kind, *rules = arguments
-        return violations(kind, value) or [Violation("", value, x) for rule in rules if (x := rule.refusal(value))]
+        return _in_bounds(arguments[0], arguments[1:], value)
     if origin is Literal:
         return _in_choice(arguments, value)
     if origin in (typing.Union, UnionType):
@@ -271,29 +230,78 @@ def violations(annotation: object, value: object) -> list[Violation]:
     return []
 
 
+def _in_bounds(kind: object, rules: Sequence[object], value: Any) -> list[Violation]:
+    unfit = violations(kind, value)
+    if unfit:
+        return unfit
+    for rule in rules:
+        reason = None
+        if isinstance(rule, Range):
+            reason = _range_reason(rule, value)
+        elif isinstance(rule, Entries):
+            reason = _entries_reason(rule, len(value))
+        if reason is not None:
+            unfit.append(Violation("", value, reason))
+    return unfit
+
+
+def _range_reason(allowed: Range, value: float) -> str | None:
+    """Return why a number lies outside of a range, or None."""
+    if value == math.inf:
+        return "must be finite"
+    if allowed.least <= value <= allowed.most:
+        return None
+    if math.isinf(allowed.most):
+        return f"must be at least {allowed.least:g}"
+    return f"must lie between {allowed.least:g} and {allowed.most:g}"
+
+
+def _entries_reason(allowed: Entries, count: int) -> str | None:
+    """Return why a list has too few or too many entries, or None."""
+    if allowed.least <= count <= allowed.most:
+        return None
+    if math.isinf(allowed.most):
+        return "must not be empty"
+    if allowed.least == allowed.most:
+        return f"must have {allowed.most} entries"
+    return f"must have at most {allowed.most} entries"
+
+
 def _in_choice(choices: Sequence[object], value: object) -> list[Violation]:
+    if value in choices:
+        return []
     written = ", ".join("null" if choice is None else str(choice) for choice in choices)
-    return [] if value in choices else [Violation("", value, f"choose one of {written}")]
+    return [Violation("", value, f"choose one of {written}")]
 
 
 def _in_union(members: Sequence[object], value: object) -> list[Violation]:
     if all(typing.get_origin(member) is Literal or member is NoneType for member in members):
-        return _in_choice([choice for member in members for choice in typing.get_args(member) or (None,)], value)
+        choices: list[object] = []
+        for member in members:
+            choices.extend([None] if member is NoneType else typing.get_args(member))
+        return _in_choice(choices, value)
     # Of `float | Tensor` only float counts, because no setting is a tensor. Classes without numbers accept everything.
     if {int, float} & set(members) and isinstance(value, str | int | float | Sequence):
         members = [member for member in members if not isinstance(member, type) or member in KINDS]
-    if isinstance(value, Sequence) and not isinstance(value, str):  # for the reason that its entries do not fit
-        members = [*(member for member in members if typing.get_origin(member) is Sequence), *members]
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        # Lists first, because the message gives the first reason.
+        lists = [member for member in members if typing.get_origin(member) is Sequence]
+        members = lists + [member for member in members if member not in lists]
     attempts = [violations(member, value) for member in members]
     if [] in attempts:
         return []
-    others = [described(x) or "null" for x in members if x is NoneType or typing.get_origin(x) is Literal]
-    return [unfit._replace(reason=", or ".join([unfit.reason, *others])) for unfit in attempts[0]]
+    alternatives: list[str] = []
+    for member in members:
+        if member is NoneType:
+            alternatives.append("null")
+        elif typing.get_origin(member) is Literal:
+            alternatives.append(", ".join(map(str, typing.get_args(member))))
+    return [unfit._replace(reason=", or ".join([unfit.reason, *alternatives])) for unfit in attempts[0]]
 
 
 def _in_list(kind: object, value: object) -> list[Violation]:
     if isinstance(value, str) or not isinstance(value, Sequence):
-        return [Violation("", value, "must be a list")]
+        return [Violation("", value, NOT_A_LIST)]
     # If an entry does not fit, the whole list is reported.
     return [Violation("", value, unfit.reason) for entry in value for unfit in violations(kind, entry)]
 
@@ -301,34 +309,20 @@ def _in_list(kind: object, value: object) -> list[Violation]:
 def _in_mapping(annotation: object, value: object) -> list[Violation]:
     if not isinstance(value, Mapping):
         return [Violation("", value, "must be a mapping")]
-    hints = typing.get_type_hints(annotation, include_extras=True) if typing.is_typeddict(annotation) else None
+    hints: Mapping[str, object] = {}
+    default: object = object
+    if typing.is_typeddict(annotation):
+        hints = typing.get_type_hints(annotation, include_extras=True)
+    else:
+        default = typing.get_args(annotation)[1]
     result = []
     for key, part in value.items():
-        kind = typing.get_args(annotation)[1] if hints is None else hints.get(key, object)
-        result += [unfit._replace(place=f".{key}{unfit.place}") for unfit in violations(kind, part)]
+        for unfit in violations(hints.get(key, default), part):
+            result.append(unfit._replace(place=f".{key}{unfit.place}"))
     return result
 
 
-def described(annotation: object) -> str:
-    """Describe the values that an annotation allows in a few words; return an empty text if unknown."""
-    origin = typing.get_origin(annotation)
-    arguments = typing.get_args(annotation)
-    if origin is Annotated:
-        kind, *rules = arguments
-        ranges = [rule.words() for rule in rules if isinstance(rule, Range)]
-        return ", ".join(filter(None, [described(kind), *ranges]))
-    if origin in (typing.Union, UnionType):
-        return " or ".join(dict.fromkeys(filter(None, map(described, arguments))))
-    if origin is Literal:
-        return ", ".join(map(str, arguments))
-    if origin is Sequence:
-        return "list"
-    if origin is Mapping or typing.is_typeddict(annotation):
-        return "mapping"
-    return KINDS.get(annotation, "").removeprefix("a ") if isinstance(annotation, type) else ""
-
-
 def _is_a(kind: type, value: object) -> bool:
-    if kind is bool or isinstance(value, bool):
-        return kind is bool and isinstance(value, bool)
+    if isinstance(value, bool):
+        return kind is bool
     return isinstance(value, NUMBERS.get(kind, kind))

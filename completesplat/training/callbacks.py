@@ -19,8 +19,8 @@ from torch.optim import Optimizer
 
 from completesplat.data.loading.distributed import gather_values, mean_of_processes
 from completesplat.errors import DivergenceError
+from completesplat.quantities import Positive, Share
 from completesplat.scene import Batch
-from completesplat.settings.schema import Positive, Share
 from completesplat.training.stage import Stage
 
 BAD_STEPS = "train/bad_steps"
@@ -63,7 +63,8 @@ class BadSteps(Callback):
 
     def __init__(self, most_bad_steps: Positive = 10) -> None:
         self.most_bad_steps = most_bad_steps
-        self.total = self.in_a_row = 0
+        self.total = 0
+        self.in_a_row = 0
         self.losses: list[Tensor] = []
         self.last: tuple[Tensor, torch.cuda.Event] | None = None  # whether the last step was bad, on its way here
         self.divergence = "all steps had a loss or gradients that are not finite"
@@ -89,10 +90,12 @@ class BadSteps(Callback):
         # Processes have different losses, but the same gradients.
         bad = trainer.strategy.reduce((~finite).float(), reduce_op="sum").clamp(max=1)
         self._count_last()
-        if fused := bool(optimizer.defaults.get("fused")):
+        fused = bool(optimizer.defaults.get("fused"))
+        if fused:
             optimizer.found_inf = bad  # type: ignore[attr-defined]  # the protocol of `torch.amp.GradScaler`
         if fused and bad.is_cuda and not self.in_a_row and self.most_bad_steps > 1:
-            self.last = bad.to("cpu", non_blocking=True), torch.cuda.current_stream().record_event()
+            copied = bad.to("cpu", non_blocking=True)
+            self.last = (copied, torch.cuda.current_stream().record_event())
         elif self._count(bool(bad)):
             self.divergence = _divergence(trainer, pl_module, self.in_a_row)
             if self.in_a_row >= self.most_bad_steps:
@@ -121,14 +124,20 @@ class BadSteps(Callback):
 
 
 def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:
-    """Describe a bad step: its number, and the loss term and first layer that are not finite."""
-    logged = {name.removeprefix("train/"): x for name, x in trainer.callback_metrics.items() if "train/" in name}
-    terms = [f"{name} is {value.item()}" for name, value in logged.items() if not value.isfinite()]
+    """Describe a bad step: its number, and the loss term and first layer that are not finite in any process."""
+    terms: list[str] = []
+    for name, value in trainer.callback_metrics.items():
+        if name.startswith("train/") and not value.isfinite():
+            terms.append(f"{name.removeprefix('train/')} is {value.item()}")
     terms.sort(key=lambda term: term.startswith("loss "))  # the sum says less than its terms
-    layers = [n for n, p in module.named_parameters() if p.grad is not None and not p.grad.isfinite().all()]
-    results = gather_values((terms, layers))
-    term = next((f"loss term {terms[0]}" for terms, _ in results if terms), "the last losses are finite")
-    layer = next((f"that of {layers[0]} is the first" for _, layers in results if layers), "their norm is too large")
+    layers: list[str] = []
+    for name, parameter in module.named_parameters():
+        if parameter.grad is not None and not parameter.grad.isfinite().all():
+            layers.append(name)
+    all_terms = [term for process_terms in gather_values(terms) for term in process_terms]
+    all_layers = [layer for process_layers in gather_values(layers) for layer in process_layers]
+    term = f"loss term {all_terms[0]}" if all_terms else "the last losses are finite"
+    layer = f"that of {all_layers[0]} is the first" if all_layers else "their norm is too large"
     return (
         f"step {trainer.global_step}: {steps} steps in a row had a loss or gradients that are not finite: {term}; "
         f"of the gradients {layer}; lower optimizer.lr, or start again from an earlier checkpoint with another seed"
@@ -136,10 +145,10 @@ def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:
 
 
 class ExponentialMovingAverage(WeightAveraging):
-    """Average of the weights over the steps; checkpoints, validation and the end of training use the average.
+    """Average of the weights over the steps, which checkpoints, validation and the end of training use.
 
     Lightning's own `EMAWeightAveraging` computes decay * a + (1 - decay) * b, which lets frozen weights and measured
-    buffers drift by rounding; linear interpolation leaves them exactly as they are. The paper states no `decay`.
+    buffers drift by rounding. Linear interpolation leaves them exactly as they are. The paper states no `decay`.
     Lightning also keeps the average on the CPU, because it makes it before the model moves to a GPU.
     """
 
@@ -162,22 +171,26 @@ class ExponentialMovingAverage(WeightAveraging):
 
     @torch.no_grad()
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
-        """Update the average after an optimizer step; torch's own way waits for the GPU twice."""
-        if (step := trainer.global_step) == self._latest_update_step:
+        """Update the average after an optimizer step. (Torch's own way waits for the GPU twice.)"""
+        if trainer.global_step == self._latest_update_step:
             return
         average = self._average_model
         assert average is not None
-        parts = [[*x.parameters(), *x.buffers()] for x in (average.module, pl_module)]
-        floats, others = ([x for x in part if x.is_floating_point()] for part in parts)
-        torch._foreach_lerp_(floats, others, 1 - self.decay if self._latest_update_step else 1.0)
+        share = 1 - self.decay if self._latest_update_step else 1.0
+        torch._foreach_lerp_(_floating_tensors(average.module), _floating_tensors(pl_module), share)
         average.n_averaged += 1
-        self._latest_update_step = step
+        self._latest_update_step = trainer.global_step
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Wait for `on_fit_end`, because the checkpoint that is written now must also hold the weights themselves."""
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_train_end(trainer, pl_module)
+
+
+def _floating_tensors(module: torch.nn.Module) -> list[Tensor]:
+    """Return a module's parameters and buffers of floating-point numbers."""
+    return [tensor for tensor in (*module.parameters(), *module.buffers()) if tensor.is_floating_point()]
 
 
 class Progress(RichProgressBar):
@@ -206,30 +219,37 @@ class Progress(RichProgressBar):
 
     def _update_metrics(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Show figures at most once a second, because reading them waits for the GPU."""
-        if (now := time.perf_counter()) - self.updated_at >= 1:
+        now = time.perf_counter()
+        if now - self.updated_at >= 1:
             self.updated_at = now
             super()._update_metrics(trainer, pl_module)
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
-        logged = {name: x.item() for name, x in trainer.callback_metrics.items() if name in IN_PROGRESS_BAR}
-        hidden = {"v_num"} if logged.get(BAD_STEPS) else {"v_num", BAD_STEPS}
-        metrics = super().get_metrics(trainer, pl_module) | logged
-        step = {} if trainer.max_steps > 0 else {"step": trainer.global_step}  # else the bar counts the steps
-        return step | {name: value for name, value in metrics.items() if name not in hidden}
+        metrics: dict[str, Any] = {}
+        if trainer.max_steps <= 0:  # otherwise the bar itself counts the steps
+            metrics["step"] = trainer.global_step
+        metrics.update(super().get_metrics(trainer, pl_module))
+        for name in IN_PROGRESS_BAR:
+            if name in trainer.callback_metrics:
+                metrics[name] = trainer.callback_metrics[name].item()
+        metrics.pop("v_num", None)
+        if not metrics.get(BAD_STEPS):
+            metrics.pop(BAD_STEPS, None)
+        return metrics
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_validation_end(trainer, pl_module)
         if get_console().is_terminal or not trainer.is_global_zero:
             return
-        metrics = {k: v for k, v in trainer.callback_metrics.items() if k == "train/loss" or k.startswith("val/")}
-        logger.info("step %s: %s", _steps(trainer), ", ".join(f"{k} {v:.4g}" for k, v in metrics.items()))
+        figures: list[str] = []
+        for name, value in trainer.callback_metrics.items():
+            if name == "train/loss" or name.startswith("val/"):
+                figures.append(f"{name} {value:.4g}")
+        steps = f"{trainer.global_step}/{trainer.max_steps}" if trainer.max_steps > 0 else f"{trainer.global_step}"
+        logger.info("step %s: %s", steps, ", ".join(figures))
 
     def _get_train_description(self, current_epoch: int) -> str:
         return "Training" if self.trainer.max_steps > 0 else f"Epoch {current_epoch}"
-
-
-def _steps(trainer: Trainer) -> str:
-    return f"{trainer.global_step}" + (f"/{trainer.max_steps}" if trainer.max_steps > 0 else "")
 
 
 class Throughput(Callback):
@@ -254,12 +274,12 @@ class Throughput(Callback):
         self.scenes = 0
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
-        self.begun: float | None = time.perf_counter()
+        self.started: float | None = time.perf_counter()
         if self.ended is not None:
-            self.waits.append(self.begun - self.ended)
+            self.waits.append(self.started - self.ended)
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: object) -> None:
-        self.begun = None
+        self.started = None
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.ended = None
@@ -268,8 +288,8 @@ class Throughput(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
     ) -> None:
         self.ended = time.perf_counter()
-        if self.begun is not None:
-            self.batches.append(self.ended - self.begun)
+        if self.started is not None:
+            self.batches.append(self.ended - self.started)
             self.scenes += len(batch.names)
         stepped = trainer.global_step != self.step
         self.step = trainer.global_step
@@ -288,7 +308,7 @@ class Throughput(Callback):
 
 
 def memory(device: torch.device) -> dict[str, float]:
-    """Return `memory/process_gb`, that of this process (on Linux), and `memory/gpu_gb`, torch's peak, both in GiB."""
+    """Return `memory/process_gb` of this process (on Linux) and `memory/gpu_gb`, torch's peak, both in GiB."""
     values = {}
     if STATUS.exists():
         lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())

@@ -1,4 +1,4 @@
-"""Checkpoints: when they are written, how files are replaced atomically, and how damaged files are recognised."""
+"""Checkpoints: the moments at which they are written, their atomic files, and the choice of one that is whole."""
 
 import logging
 import os
@@ -18,7 +18,7 @@ from torch import Tensor
 from completesplat.data.loading.distributed import gather_values
 from completesplat.errors import DivergenceError, WeightsError
 from completesplat.files import atomic_path, make_folder
-from completesplat.settings.schema import Positive
+from completesplat.quantities import Positive
 from completesplat.signals import keep_signals, restore_handlers
 from completesplat.training.loggers import ContinuedCSVLogger
 from completesplat.training.stopping import agreed_signal, end_training
@@ -41,7 +41,11 @@ class CheckpointFiles(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: object = None
     ) -> None:
-        """Replace the file at this path; if the disk refuses, raise DiskError and keep the old file."""
+        """Replace the file at this path.
+
+        Raises:
+            DiskError: the disk refuses. The old file stays.
+        """
         with _replaced(Path(path)) as unfinished:
             torch.save(checkpoint, unfinished)
 
@@ -89,24 +93,25 @@ class Checkpoints(Checkpoint):
         trainer.callback_metrics.update(self.figures)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.step = self.saved_step = trainer.global_step
+        self.step = trainer.global_step
+        self.saved_step = trainer.global_step
         self.saved_at = monotonic()
         for run_logger in trainer.loggers:
             if isinstance(run_logger, ContinuedCSVLogger):
                 run_logger.experiment.goes_on_from = trainer.global_step
         if trainer.is_global_zero:
-            for own in trainer.checkpoint_callbacks:  # folders that a user gave to Lightning's own callback
-                Path(getattr(own, "dirpath", None) or self.folder.parent).mkdir(parents=True, exist_ok=True)
+            for callback in trainer.checkpoint_callbacks:  # folders that a user gave to Lightning's own callback
+                Path(getattr(callback, "dirpath", None) or self.folder.parent).mkdir(parents=True, exist_ok=True)
             make_folder(self.folder)  # only here: a run whose folder is removed must not go on
-            begun = Path(trainer.ckpt_path or "")
+            resumed = Path(trainer.ckpt_path or "")
             last = self.folder / LAST
-            if begun != last and begun.parent == self.folder:
-                link(begun, last)  # replace a damaged file, which must not become `previous.ckpt`
+            if resumed != last and resumed.parent == self.folder:
+                link(resumed, last)  # replace a damaged file, which must not become `previous.ckpt`
         restore_handlers()  # Lightning's wait for other processes within a step, for ever if these are gone
         keep_signals(True)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
-        # Several batches share an optimizer step if gradients are accumulated; checkpoints lack accumulated gradients.
+        # Several batches share an optimizer step if gradients are accumulated. Checkpoints lack accumulated gradients.
         stepped = trainer.global_step != self.step
         self.step = trainer.global_step
         if stepped:
@@ -126,8 +131,9 @@ class Checkpoints(Checkpoint):
         if trainer.is_global_zero:
             (self.folder / PREVIOUS).unlink(missing_ok=True)
         keep_signals(False)
-        if (number := agreed_signal(trainer)) is not None:
-            end_training(trainer, number)
+        signal = agreed_signal(trainer)
+        if signal is not None:
+            end_training(trainer, signal)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         keep_signals(False)
@@ -153,11 +159,13 @@ class Checkpoints(Checkpoint):
         return trainer.strategy.broadcast(monotonic() - self.saved_at >= 60 * self.every_minutes)
 
     def _save(self, trainer: Trainer, module: LightningModule) -> None:
-        if (name := next(filter(None, gather_values(not_finite(module.state_dict()))), None)) is not None:
-            message = f"{name} is not finite; no checkpoint is written of it, earlier ones stay in {self.folder}"
+        names = [name for name in gather_values(not_finite(module.state_dict())) if name is not None]
+        if names:
+            message = f"{names[0]} is not finite; no checkpoint is written of it, earlier ones stay in {self.folder}"
             raise DivergenceError(f"step {trainer.global_step}: {message}")
         self.due = False
-        self.step = self.saved_step = trainer.global_step
+        self.step = trainer.global_step
+        self.saved_step = trainer.global_step
         self.saved_at = monotonic()
         last = self.folder / LAST
         if trainer.is_global_zero and last.is_file():
@@ -172,7 +180,7 @@ class Checkpoints(Checkpoint):
 
 
 def link(source: Path, target: Path) -> None:
-    """Give a file a second name, which may be another file's until then; copy it if there are no hard links."""
+    """Give a file a second name, which may be another file's until then, or copy it if there are no hard links."""
     with _replaced(target) as unfinished:
         try:
             os.link(source, unfinished)
@@ -181,27 +189,37 @@ def link(source: Path, target: Path) -> None:
 
 
 def _replaced(path: Path) -> AbstractContextManager[Path]:
-    """Write a file atomically; its unfinished file has a fixed name, so that repeated kills leave one at most."""
+    """Write a file atomically. Its unfinished file has a fixed name, so that repeated kills leave one at most."""
     return atomic_path(path, f".{path.name}.unfinished")
 
 
 def newest_whole(last: Path) -> Path | None:
-    """Return `last.ckpt`, or with a warning an older checkpoint if it is damaged or missing; None if there is none.
+    """Return `last.ckpt`, or with a warning the newest older checkpoint if it is damaged or missing.
+
+    Returns:
+        None if there are no checkpoints.
 
     Raises:
         WeightsError: all of them are damaged.
     """
-    steps = {path: path.stem.partition("=")[2] for path in last.parent.glob("step=*.ckpt")}
-    milestones = sorted((path for path, step in steps.items() if step.isdecimal()), key=lambda p: -int(steps[p]))
+    milestones: dict[int, Path] = {}
+    for path in last.parent.glob("step=*.ckpt"):
+        step = path.stem.removeprefix("step=")
+        if step.isdecimal():
+            milestones[int(step)] = path
+    newest_first = [milestones[step] for step in sorted(milestones, reverse=True)]
     refusal: WeightsError | None = None
-    for path in filter(Path.is_file, (last, last.with_name(PREVIOUS), *milestones)):
+    for path in (last, last.with_name(PREVIOUS), *newest_first):
+        if not path.is_file():
+            continue
         try:
             check_whole(path)
-            if path != last:
-                logger.warning("%s; going on from %s", refusal or f"{last}: is not there", path)
-            return path
         except WeightsError as error:
             refusal = refusal or error
+            continue
+        if path != last:
+            logger.warning("%s; going on from %s", refusal or f"{last}: is not there", path)
+        return path
     if refusal is not None:
         raise refusal
     return None

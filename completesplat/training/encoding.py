@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -48,17 +47,20 @@ def fingerprint(module: nn.Module) -> str:
 
 def fingerprints(model: VariationalAutoReconstructor, conditioning: nn.Module | None) -> tuple[str, str | None]:
     """Return the fingerprint of all weights that latents depend on, and that of a frozen conditioning, else None."""
-    encoder = model.encoder
-    views = model.view_encoder
-    latents = fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
-    return latents, fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
+    encoder: nn.Module = model.encoder
+    if model.view_encoder is not None:
+        encoder = nn.ModuleList([encoder, model.view_encoder])
+    features = None
+    if conditioning is not None and conditioning.frozen:
+        features = fingerprint(conditioning)
+    return fingerprint(encoder), features
 
 
 def check_cache(store: LatentCache, autoreconstructor: VariationalAutoReconstructor, conditioning: nn.Module) -> None:
     """Raise WeightsError if a cache was made with other networks. (The data module checks data and their settings.)
 
     Args:
-        conditioning: the run's; the cache must hold its features if it is frozen, else images.
+        conditioning: the run's. The cache must hold its features if it is frozen, else images.
     """
     latents, features = fingerprints(autoreconstructor, conditioning)
     if store.origin.encoder != latents:
@@ -91,31 +93,47 @@ class FrameEncoder:
         if self.conditioning is not None and not self.conditioning.frozen:
             message = "a conditioning that is trained needs images, not features: leave conditioning out"
             raise CompleteSplatError(message)
-        for network in filter(None, (self.autoreconstructor, self.conditioning)):
-            network.to(self.device).eval()
+        self.autoreconstructor.to(self.device).eval()
+        if self.conditioning is not None:
+            self.conditioning.to(self.device).eval()
 
     @torch.no_grad()
     def __call__(self, scenes: SceneBatch) -> Rows:
-        """Encode the reference images of scenes; return the rows "mean", "log_variance" and "condition"."""
+        """Encode the reference images of scenes.
+
+        Returns:
+            The rows "mean", "log_variance" and "condition".
+        """
         scenes = scenes.to(self.device)
         network = self.autoreconstructor
         images = scenes.reference.images
         views = scenes.all_views() if network.sees_views else None
         posterior, _ = network.posterior(images, views, scenes.depth_range)
-        outputs = {"mean": posterior.mean, "log_variance": posterior.log_variance}
-        if self.conditioning is not None:
-            outputs["condition"] = self.conditioning(images)
-        rows = {name: value.to(PRECISIONS[self.precision]).cpu().numpy() for name, value in outputs.items()}
-        if self.conditioning is not None:
-            return rows
-        return {"condition": (images * 255).round().to(torch.uint8).cpu().numpy(), **rows}
+        precision = PRECISIONS[self.precision]
+        if self.conditioning is None:
+            condition = (images * 255).round().to(torch.uint8)
+        else:
+            condition = self.conditioning(images).to(precision)
+        return {
+            "condition": condition.cpu().numpy(),
+            "mean": posterior.mean.to(precision).cpu().numpy(),
+            "log_variance": posterior.log_variance.to(precision).cpu().numpy(),
+        }
 
     def origin(self, data: SceneDataModule, frames: int | None, views: int) -> Origin:
-        """Return what determines the content of a cache of the training data."""
+        """Return all that determines the content of a cache of the training data."""
         encoder, features = fingerprints(self.autoreconstructor, self.conditioning)
-        fingerprint = data.source("train").fingerprint()
-        settings = data.packed_settings()
-        return Origin(encoder, features, fingerprint, settings, data.image_size, frames, views, self.precision)
+        source = data.source("train").fingerprint()
+        return Origin(
+            encoder,
+            features,
+            source,
+            dict(data.packed_settings()),
+            data.image_size,
+            frames,
+            views,
+            self.precision,
+        )
 
 
 def moment_sums(mean: Moments, log_variance: Moments) -> Sums:
@@ -138,8 +156,8 @@ def encode_training_set(
 ) -> LatentCache:
     """Encode every frame of every sequence of a packed training set, without augmentation.
 
-    A finished cache stays unchanged; that of an interrupted run is unreadable. Several processes share the batches, and
-    `data.workers` processes of each read them.
+    A finished cache stays unchanged, and that of an interrupted run is unreadable. Several processes share the
+    batches, and `data.workers` processes of each read them.
 
     Args:
         frames: at most this many frames of a sequence, evenly spaced; None: all.
@@ -155,17 +173,20 @@ def encode_training_set(
         raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
     origin = encode.origin(data, frames, views)
     if (out / MANIFEST).is_file():
-        if (store := LatentCache(out)).origin != origin:
+        store = LatentCache(out)
+        if store.origin != origin:
             raise DataError("already holds another store: choose another folder, or remove this one", str(out))
         logger.info("%s already holds these encodings", out)
         return store
     out.mkdir(parents=True, exist_ok=True)
-    counts = {name: len(source.read(name).frames) for name in source.names}
-    sequences = [CachedSequence(name, count, tuple(spread_places(count, frames))) for name, count in counts.items()]
+    sequences: list[CachedSequence] = []
+    for name in source.names:
+        count = len(source.read(name).frames)
+        sequences.append(CachedSequence(name, count, tuple(spread_places(count, frames))))
     places = [(sequence.name, place) for sequence in sequences for place in sequence.stored]
     references = References(SceneStore(source), views, places)
-    blank = encode(_scenes(collate([references[0]])))
-    _check_space(len(places), len(sequences), sum(rows.nbytes for rows in blank.values()), out)
+    first_frame = encode(_scenes(collate([references[0]])))
+    _check_space(len(places), len(sequences), sum(rows.nbytes for rows in first_frame.values()), out)
     batches = _encoded_batches(references, encode, batch_size, data.workers, progress)
     if processes()[0] == 0:
         write_cache(out, origin, batches, sequences)
@@ -217,17 +238,18 @@ def _encoded_batches(
     """
     rank, count = processes()
     batches = [batch.tolist() for batch in torch.split(torch.arange(len(references)), batch_size)]
-    settings: dict[str, Any] = {"num_workers": workers, "collate_fn": collate, "worker_init_fn": leave_to_parent}
-    loaded = iter(DataLoader(references, batch_sampler=batches[rank::count], **settings))
+    loader: DataLoader[LoadedScenes] = DataLoader(
+        references,
+        batch_sampler=batches[rank::count],
+        num_workers=workers,
+        collate_fn=collate,
+        worker_init_fn=leave_to_parent,
+    )
+    loaded = iter(loader)
     for first in track(range(0, len(batches), count), "encoding", disable=not progress or rank > 0):
         result: tuple[Rows, Sums] | DataError | None = None
         if first + rank < len(batches):
-            try:
-                rows = encode(_scenes(next(loaded)))
-                _refuse_not_finite(rows, references, batches[first + rank])
-                result = rows, moment_sums(rows["mean"], rows["log_variance"])
-            except DataError as error:  # all processes raise it below
-                result = error
+            result = _encoded_batch(next(loaded), references, encode, batches[first + rank])
         for rank_result in gather_values(result):
             if isinstance(rank_result, DataError):
                 raise rank_result
@@ -235,8 +257,24 @@ def _encoded_batches(
                 yield rank_result
 
 
+def _encoded_batch(
+    loaded: LoadedScenes, references: References, encode: FrameEncoder, batch: Sequence[int]
+) -> tuple[Rows, Sums] | DataError:
+    """Return a batch's rows and sums, or an error, which all processes will raise together."""
+    try:
+        rows = encode(_scenes(loaded))
+        _refuse_not_finite(rows, references, batch)
+    except DataError as error:
+        return error
+    return rows, moment_sums(rows["mean"], rows["log_variance"])
+
+
 def _check_space(frames: int, sequences: int, bytes_per_frame: int, out: Path) -> None:
-    """Log the size of the future store; raise DataError if the disk has less space."""
+    """Log the size of the future store.
+
+    Raises:
+        DataError: the disk has less space.
+    """
     size = frames * bytes_per_frame
     free = shutil.disk_usage(out).free
     contents = f"{counted(frames, 'frame')} of {counted(sequences, 'sequence')}"

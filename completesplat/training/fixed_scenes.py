@@ -17,16 +17,16 @@ from PIL import Image
 from torch import Tensor
 
 from completesplat.export.cleaning import storable, with_screen_space_dilation
-from completesplat.export.images import Sheet, SheetCell, color_depth, image_sheet, write_png
+from completesplat.export.description import plain_camera
+from completesplat.export.images import Sheet, SheetCell, color_depth, image_sheet, strip, write_png
 from completesplat.export.ply import write_ply
-from completesplat.export.prediction import plain_camera
 from completesplat.files import make_folder, write_json
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
-from completesplat.metrics.scoring import diversity
+from completesplat.metrics.sample_scores import diversity
+from completesplat.quantities import Positive
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Positive
 from completesplat.tensors import stack
 from completesplat.training.callbacks import ExponentialMovingAverage
 from completesplat.training.stage import Stage
@@ -41,7 +41,7 @@ class DrawsFixedScenes(Callback):
 
     Args:
         folder, scenes: folder of the images, and the number of scenes in them.
-        every_n_steps: optimizer steps between drawings; the last drawing is at the end of training.
+        every_n_steps: optimizer steps between drawings. The last drawing is at the end of training.
         views: number of targets drawn for each scene, evenly spread over its targets; all if it has fewer.
     """
 
@@ -50,14 +50,16 @@ class DrawsFixedScenes(Callback):
         self.every_n_steps = every_n_steps
         self.count = scenes
         self.views = views
+        self.scenes: list[SceneBatch] = []
+        self.last_step = 0
 
     @abstractmethod
     def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> tuple[Image.Image, dict[str, float]]:
         """Return an image of the model's results for the scenes [view], which are on the CPU, and figures to log."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.scenes: list[SceneBatch] = []
-        self.drawn = trainer.global_step
+        self.scenes = []
+        self.last_step = trainer.global_step
         if trainer.is_global_zero:
             make_folder(self.folder)
 
@@ -69,30 +71,30 @@ class DrawsFixedScenes(Callback):
         self._draw_once(trainer, pl_module)
 
     def _draw_once(self, trainer: Trainer, module: LightningModule) -> None:
-        if trainer.global_step == self.drawn:
+        if trainer.global_step == self.last_step:
             return
         assert isinstance(module, Stage)
-        self.drawn = trainer.global_step
+        self.last_step = trainer.global_step
         if not trainer.is_global_zero:
             return
         with restored_afterwards(trainer, module):
             if not self.scenes:
                 self.scenes = fixed_scenes(module.data.val_dataloader(), self.count, self.views)
             sheet, figures = self.draw(trainer, module, self.scenes)
-        write_png(self.folder / f"step_{self.drawn:06}.png", sheet)
+        write_png(self.folder / f"step_{self.last_step:06}.png", sheet)
+        row = self.last_step - 1  # Lightning numbers a row by the optimizer steps before it
         for logger in trainer.loggers:
-            # Lightning numbers a row by the optimizer steps before it.
-            logger.log_metrics(figures, step=self.drawn - 1)
+            logger.log_metrics(figures, step=row)
             if isinstance(logger, WandbLogger):
                 import wandb
 
                 media: dict[str, Any] = {self.folder.name: wandb.Image(sheet)}
-                logger.log_metrics(media, step=self.drawn - 1)
+                logger.log_metrics(media, step=row)
 
 
 @contextmanager
 def restored_afterwards(trainer: Trainer, module: LightningModule) -> Iterator[None]:
-    """Switch to evaluation mode and averaged weights, if any; then restore them and the random generators."""
+    """Switch to evaluation mode and averaged weights, if any, and restore modes, weights and random generators."""
     modes = {part: part.training for part in module.modules()}
     devices = [module.device] if module.device.type == "cuda" else []
     with torch.no_grad(), torch.random.fork_rng(devices), ExitStack() as contexts:
@@ -110,16 +112,18 @@ def restored_afterwards(trainer: Trainer, module: LightningModule) -> Iterator[N
 def fixed_scenes(batches: Iterable[SceneBatch], count: int, views: int = 1) -> list[SceneBatch]:
     """Return the first `count` scenes of the batches, each with `views` of its targets."""
     scenes = (batch[index] for batch in batches for index in range(len(batch.names)))
-    return [replace(scene, targets=scene.targets[_spread(scene, views)]) for scene in islice(scenes, count)]
+    return [_with_targets(scene, views) for scene in islice(scenes, count)]
 
 
-def _spread(scene: SceneBatch, views: int) -> list[int]:
-    targets = len(scene.targets.images)
-    return [i * targets // views for i in range(views)] if targets > views else list(range(targets))
+def _with_targets(scene: SceneBatch, views: int) -> SceneBatch:
+    """Return a scene with `views` of its targets, evenly spread, or with all if it has fewer."""
+    count = len(scene.targets.images)
+    views = min(views, count)
+    return replace(scene, targets=scene.targets[[i * count // views for i in range(views)]])
 
 
 class FixedScenes(DrawsFixedScenes):
-    """Callback that draws the first target of each scene and logs figures of its Gaussians; see `DrawsFixedScenes`.
+    """Callback that draws the first target of each scene and logs figures of its Gaussians (`DrawsFixedScenes`).
 
     `folder/step_000500.png` has a row for each scene (`scene_panels`); `folder/newest/` holds the scenes
     themselves (`write_newest`). All loggers get `gaussian_figures`, `layer_figures` and the model's `latent_figures`;
@@ -136,7 +140,10 @@ class FixedScenes(DrawsFixedScenes):
             latents = module.latent_figures(batch)
         with torch.autocast(module.device.type, enabled=False):
             panels = scene_panels(module.rasterizer, gaussians, batch, module.background)
-        sheet = image_sheet(list(panels), [list(map(SheetCell, row)) for row in zip(*panels.values(), strict=True)])
+        rows: Sheet = []
+        for scene in range(len(batch.names)):
+            rows.append([SheetCell(images[scene]) for images in panels.values()])
+        sheet = image_sheet(list(panels), rows)
         write_newest(self.folder / "newest", trainer.global_step, gaussians, batch, module.up)
         return sheet, gaussian_figures(gaussians) | layer_figures(gaussians, batch) | latents
 
@@ -183,10 +190,11 @@ def scene_panels(
         "depth": torch.stack([color_depth(depth)[0] for depth in whole.expected_depth()]),
         "opacity": whole.alpha.expand(-1, 3, -1, -1),
     }
-    pixels = scenes.reference.images.shape[-2] * scenes.reference.images.shape[-1]
-    for layer in range(0 if gaussians.count % pixels else gaussians.count // pixels):  # captures have none
-        part = gaussians[:, layer * pixels : (layer + 1) * pixels]
-        panels[f"layer {layer + 1}"] = render(part).over(background)
+    pixels = scenes.reference.images.shape[-2:].numel()
+    if gaussians.count % pixels == 0:  # Gaussians that were fitted to a capture have no layers
+        for layer in range(gaussians.count // pixels):
+            part = gaussians[:, layer * pixels : (layer + 1) * pixels]
+            panels[f"layer {layer + 1}"] = render(part).over(background)
     return {name: panel.clamp(0, 1).nan_to_num() for name, panel in panels.items()}
 
 
@@ -201,27 +209,39 @@ def layer_figures(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, float]:
     if gaussians.count % size.numel():
         return {}  # no layers, but Gaussians that were fitted to a capture
     layers = gaussians.map(lambda tensor: tensor.view(len(tensor), -1, *size, *tensor.shape[2:]))  # by pixels
+
+    def mean_on_object(values: Float[Tensor, "batch height width"]) -> float:
+        return ((values * on_object).sum() / on_object.sum().clamp(min=1)).item()
+
     figures = {}
     for layer in range(layers.opacities.shape[1]):
-        behind = layers.means[:, layer, ..., 2] - layers.means[:, 0, ..., 2]
-        values = {"opacity": layers.opacities[:, layer]} | ({"behind": behind} if layer else {})
-        for name, value in values.items():
-            figures[f"layers/{name}_{layer + 1}"] = ((value * on_object).sum() / on_object.sum().clamp(min=1)).item()
+        figures[f"layers/opacity_{layer + 1}"] = mean_on_object(layers.opacities[:, layer])
+        if layer > 0:
+            behind = layers.means[:, layer, ..., 2] - layers.means[:, 0, ..., 2]
+            figures[f"layers/behind_{layer + 1}"] = mean_on_object(behind)
     return figures
 
 
 def gaussian_figures(gaussians: Gaussians) -> dict[str, float]:
     """Return percentiles of the opacities, of log10 of the scales, and of the depths in the reference's frame.
 
-    Keys are `gaussians/opacity_p10`, `gaussians/log10_scale_p50` and so on; depths are in scene units.
+    Keys are `gaussians/opacity_p10`, `gaussians/log10_scale_p50` and so on. Depths are in scene units.
     """
-    parts = {"opacity": gaussians.opacities, "log10_scale": gaussians.scales.log10(), "depth": gaussians.means[..., 2]}
-    values = {name: tensor.float().flatten().cpu().numpy() for name, tensor in parts.items()}
-    return {f"gaussians/{name}_p{p}": float(np.percentile(x, p)) for name, x in values.items() for p in (10, 50, 90)}
+    tensors = {
+        "opacity": gaussians.opacities,
+        "log10_scale": gaussians.scales.log10(),
+        "depth": gaussians.means[..., 2],
+    }
+    figures = {}
+    for name, tensor in tensors.items():
+        values = tensor.float().flatten().cpu().numpy()
+        for percentile in (10, 50, 90):
+            figures[f"gaussians/{name}_p{percentile}"] = float(np.percentile(values, percentile))
+    return figures
 
 
 class Samples(DrawsFixedScenes):
-    """Callback that draws samples of each scene from its reference and target views; see `DrawsFixedScenes`.
+    """Callback that draws samples of each scene from its reference and target views (`DrawsFixedScenes`).
 
     `folder/step_000500.png` has rows for each scene: true images (the input first), each sample, and the depth of the
     first sample. All loggers get metrics of the target views: `samples/diversity` (of two samples or more),
@@ -244,15 +264,18 @@ class Samples(DrawsFixedScenes):
 
     def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> tuple[Image.Image, dict[str, float]]:
         drawings = []
-        for scene in (stack([scene]).to(module.device) for scene in scenes):
-            views = scene.all_views()
+        for scene in scenes:
+            batch = stack([scene]).to(module.device)
+            views = batch.all_views()
             with trainer.precision_plugin.forward_context():
-                gaussians = module.draw(scene, [0], self.samples)
+                gaussians = module.draw(batch, [0], self.samples)
             rendering = module.render_from(gaussians, views.cameras[0])
             images = rendering.over(module.background).clamp(0, 1)
             drawings.append(SceneDrawings(views.images[0], images, rendering.expected_depth()[:1]))
         scores = [drawing.scores() for drawing in drawings]
-        means = {f"samples/{name}": sum(values[name] for values in scores) / len(scores) for name in scores[0]}
+        means = {}
+        for name in scores[0]:
+            means[f"samples/{name}"] = sum(values[name] for values in scores) / len(scores)
         return samples_sheet(drawings), means
 
 
@@ -271,15 +294,25 @@ class SceneDrawings:
             "psnr": psnr(images.flatten(0, 1), true.expand_as(images).flatten(0, 1)).mean().item(),
             "psnr_of_mean": psnr(images.mean(0), true).mean().item(),
         }
-        return scores | {"diversity": diversity(images)} if len(images) > 1 else scores
+        if len(images) > 1:
+            scores["diversity"] = diversity(images)
+        return scores
 
 
 def samples_sheet(drawings: list[SceneDrawings]) -> Image.Image:
-    """Draw a sheet with a column for each view; views that a scene lacks stay white."""
+    """Draw a sheet with a column for each view, which stays white where a scene lacks it."""
     rows: Sheet = []
-    for scene in drawings:
-        labelled = {"true": scene.true, **{f"sample {n}": images for n, images in enumerate(scene.samples, 1)}}
-        for name, images in (labelled | {"depth of 1": color_depth(scene.depth[0])[0]}).items():
-            first, *others = images.nan_to_num()  # values that are not finite are black
-            rows.append([SheetCell(first, name), *map(SheetCell, others)])
-    return image_sheet(["input's view", *(f"target {i + 1}" for i in range(max(map(len, rows)) - 1))], rows)
+    for drawing in drawings:
+        rows.append(_row("true", drawing.true))
+        for number, images in enumerate(drawing.samples, start=1):
+            rows.append(_row(f"sample {number}", images))
+        depth, _ = color_depth(drawing.depth[0])
+        rows.append(_row("depth of 1", depth))
+    targets = max(map(len, rows)) - 1
+    headings = ["input's view"] + [f"target {i + 1}" for i in range(targets)]
+    return image_sheet(headings, rows)
+
+
+def _row(label: str, images: Float[Tensor, "view 3 height width"]) -> list[SheetCell | None]:
+    """Return a sheet's row of images, in which values that are not finite are black."""
+    return strip(images.nan_to_num(), label)

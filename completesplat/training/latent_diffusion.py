@@ -1,8 +1,10 @@
 """Stage 2: latent diffusion over the frozen autoreconstructor's latents (paper, Section 3.3)."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
@@ -14,12 +16,13 @@ from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.diffusion.guidance import Latents
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.evaluation.scorer import Scorer
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
+from completesplat.quantities import Natural, Positive, Share
 from completesplat.scene import Batch, SceneBatch
-from completesplat.settings.schema import Natural, Positive, Share
+from completesplat.scene_model import Sampling
 from completesplat.training.encoding import check_cache
-from completesplat.training.scoring import Scorer
 from completesplat.training.stage import Compile, Stage, prepare_network
 from completesplat.weights.checkpoint_reading import load_part
 
@@ -54,28 +57,31 @@ class DiffusionScorer(Scorer):
         return self.completesplat.up
 
     def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int, batch: int | None = None) -> Gaussians:
-        """See `Scorer`; the samples of an image depend on no other image."""
-        return self.reconstruct(scenes, seeds, samples=samples, batch=batch)
+        """Draw samples as `Scorer.draw` does. The samples of an image depend on no other image."""
+        return self.sample(scenes, Sampling(samples=samples, seed=seeds, batch=batch))
 
-    def reconstruct(self, scenes: SceneBatch, seed: int | Sequence[int], **settings: Any) -> Gaussians:
-        """Draw one sample for each reference image, or several by `settings` of `CompleteSplat.generate`."""
-        return self.completesplat.generate(
-            scenes.reference.images,
-            scenes.reference.cameras,
-            scenes.depth_range,
+    def reconstruct(self, scenes: SceneBatch, seed: int) -> Gaussians:
+        """Draw one sample for each reference image."""
+        return self.sample(scenes, Sampling(seed=seed))
+
+    def sample(self, scenes: SceneBatch, sampling: Sampling) -> Gaussians:
+        """Draw samples for each reference image, with the weights and fits of this scorer."""
+        sampling = replace(
+            sampling,
             skip_weight=self.skip_weight,
             guidance_weight=self.guidance_weight,
             color_fits=self.color_fits,
-            visible=scenes.visible,
-            seed=seed,
-            **settings,
+        )
+        reference = scenes.reference
+        return self.completesplat.generate(
+            reference.images, reference.cameras, scenes.depth_range, sampling, scenes.visible
         )
 
 
 class LatentDiffusion(DiffusionScorer, Stage):
     """Train the denoiser and a learned conditioning to predict the noise in latents (paper, Eqs. 2 and 3).
 
-    Batches are scenes, or scenes that were encoded beforehand; both train the same.
+    Batches are scenes, or scenes that were encoded beforehand. Both train the same.
 
     Args:
         completesplat: the whole generator, its autoreconstructor still without weights.
@@ -92,11 +98,6 @@ class LatentDiffusion(DiffusionScorer, Stage):
     Raises:
         WeightsError: a checkpoint is unusable, or both are given.
     """
-
-    start_weights: ClassVar = {
-        "autoreconstructor_checkpoint": "RUN/checkpoints/last.ckpt of stage 1",
-        "checkpoint": "RUN/checkpoints/last.ckpt",
-    }
 
     def __init__(
         self,
@@ -178,15 +179,14 @@ class LatentDiffusion(DiffusionScorer, Stage):
     def _measure_latents(self, loader: Iterable[Batch], cache: LatentCache | None) -> None:
         """Measure mean and standard deviation of each latent channel, with which the denoiser's are standardised.
 
-        The paper does not state how it scales latents; the values are stored with the weights. A cache has exact ones.
+        The paper does not state how it scales latents. The values are stored with the weights. A cache has exact ones.
         """
         drawn = []
-        for _, batch in zip(range(self.scale_batches), loader, strict=False):
+        for batch in islice(loader, self.scale_batches):
             latent, condition = self.inputs(batch.to(self.device))
             if latent.shape[-2:] != condition.shape[-2:]:
-                sizes = ["x".join(map(str, images.shape[-2:])) for images in (latent, condition)]
                 raise CompleteSplatError(
-                    f"latents are {sizes[0]} and the conditioning's features {sizes[1]} in size: "
+                    f"latents are {_size(latent)} and the conditioning's features {_size(condition)} in size: "
                     "conditioning.channels and autoreconstructor.encoder.channels must have as many levels"
                 )
             drawn.append(latent.cpu().double())
@@ -195,11 +195,13 @@ class LatentDiffusion(DiffusionScorer, Stage):
         std = latents.std((0, 2, 3), correction=0)
         if not (std > 0).all():
             raise CompleteSplatError("the latents do not vary: no training images, or an encoder that ignores them")
-        moments = (mean.tolist(), std.tolist()) if cache is None else (cache.mean, cache.std)
-        self.completesplat.set_latent_moments(*moments)
-        logs = {f"latents/{n}_{i}": x for n, xs in zip(("mean", "std"), moments, strict=True) for i, x in enumerate(xs)}
+        means = mean.tolist() if cache is None else cache.mean
+        stds = std.tolist() if cache is None else cache.std
+        self.completesplat.set_latent_moments(means, stds)
+        figures = {f"latents/mean_{channel}": value for channel, value in enumerate(means)}
+        figures.update({f"latents/std_{channel}": value for channel, value in enumerate(stds)})
         for logger in self.trainer.loggers:
-            logger.log_metrics(logs, step=self.trainer.global_step)
+            logger.log_metrics(figures, step=self.trainer.global_step)
 
     def inputs(self, batch: Batch) -> tuple[Latents, Float[Tensor, "batch features _ _"]]:
         """Return a draw of the scaled latents, and phi_ref.
@@ -216,13 +218,16 @@ class LatentDiffusion(DiffusionScorer, Stage):
 
     def training_step(self, batch: Batch, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat
-        latent, conditioning = (x.repeat_interleave(self.noise_draws, 0) for x in self.inputs(batch))
+        latent, conditioning = self.inputs(batch)
+        latent = latent.repeat_interleave(self.noise_draws, 0)
+        conditioning = conditioning.repeat_interleave(self.noise_draws, 0)
         conditioned = torch.rand(len(latent), device=self.device) >= self.unconditional_probability
         conditioning = conditioning * conditioned[:, None, None, None]
         noise = torch.randn(latent.shape, device=self.device)  # `randn_like` would depend on the memory layout
         timestep = parts.sampler.draw_timesteps(len(latent), self.device)
         noisy = parts.sampler.add_noise(latent, noise, timestep)
-        noisy, conditioning = (x.contiguous(memory_format=self.memory_format) for x in (noisy, conditioning))
+        noisy = noisy.contiguous(memory_format=self.memory_format)
+        conditioning = conditioning.contiguous(memory_format=self.memory_format)
         predicted = parts.denoiser(noisy, timestep, conditioning)
         errors: Tensor = (predicted - target(parts.sampler.scheduler, latent, noise, timestep)).square().mean((1, 2, 3))
         self.log_loss(errors.detach(), timestep)
@@ -234,12 +239,17 @@ class LatentDiffusion(DiffusionScorer, Stage):
         interval = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
         if interval and (self.global_step + 1) % interval == 0 and self.logged_step != self.global_step:
             self.logged_step = self.global_step  # of accumulated batches, the first is logged
-            ranks = zip(*gather_values((errors.cpu(), timestep.cpu())), strict=True)
-            errors, timestep = (torch.cat(parts) for parts in ranks)
+            errors = torch.cat(gather_values(errors.cpu()))
+            timestep = torch.cat(gather_values(timestep.cpu()))
             values = losses_by_timestep(errors, timestep, self.completesplat.sampler.training_timesteps)
             # Lightning would repeat the loss of a quarter in the rows of later steps that have no sample in it.
             for logger in self.loggers:
                 logger.log_metrics(values, step=self.global_step)
+
+
+def _size(images: Float[Tensor, "batch channel height width"]) -> str:
+    height, width = images.shape[-2:]
+    return f"{height}x{width}"
 
 
 def losses_by_timestep(errors: Float[Tensor, " n"], timestep: Int64[Tensor, " n"], timesteps: int) -> dict[str, float]:

@@ -19,7 +19,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.files import write_text, writing
 
 START_SECONDS = 6
-"""How long W&B's server may take to start a run; training is delayed by no more than this."""
+"""Longest time that W&B's server may take to start a run, which delays training."""
 AXIS = "trainer/global_step"
 
 logger = logging.getLogger(__name__)
@@ -50,11 +50,11 @@ class MetricsFile(ExperimentWriter):
     def __init__(self, log_dir: str) -> None:
         super().__init__(log_dir)
         self.path = Path(self.metrics_file_path)
-        self.begun = False
+        self.has_header = False  # written by this process
         self.goes_on_from: int | None = None
 
     def _check_log_dir_exists(self) -> None:
-        """Keep the old file until it is replaced; Lightning would delete it here."""
+        """Keep the old file, which Lightning would delete here, until it is replaced."""
 
     def save(self) -> None:
         """Write the rows that are not written yet.
@@ -66,7 +66,7 @@ class MetricsFile(ExperimentWriter):
             return
         new = set().union(*self.metrics) - set(self.metrics_keys)
         text = io.StringIO(newline="")
-        if new or not self.begun:
+        if new or not self.has_header:
             old = self._rows_to_keep()
             self.metrics_keys = sorted(new.union(self.metrics_keys, *old))
             writer = csv.DictWriter(text, self.metrics_keys)
@@ -78,7 +78,7 @@ class MetricsFile(ExperimentWriter):
             with writing(self.path), self.path.open("a", newline="") as file:
                 file.write(text.getvalue())
         self.metrics = []
-        self.begun = True
+        self.has_header = True
 
     def _rows_to_keep(self) -> list[dict[str, str]]:
         if not self.path.is_file():
@@ -86,9 +86,12 @@ class MetricsFile(ExperimentWriter):
         with self.path.open(newline="") as file:
             # The last line of a killed process may be incomplete.
             rows = list(csv.DictReader(line for line in file if line.endswith("\n")))
+        if self.has_header:
+            return rows
         first = min(row["step"] for row in self.metrics)
-        first = first if self.goes_on_from is None else min(first, self.goes_on_from)
-        return [row for row in rows if self.begun or int(row["step"]) < first]
+        if self.goes_on_from is not None:
+            first = min(first, self.goes_on_from)
+        return [row for row in rows if int(row["step"]) < first]
 
 
 class WandbRun(WandbLogger):
@@ -113,10 +116,15 @@ class WandbRun(WandbLogger):
         self.folder = Path(save_dir).absolute()
         # Hydra's file in a sweep's folder, which may hold its jobs in further folders.
         sweeps = (parent.name for parent in self.folder.parents if (parent / "multirun.yaml").is_file())
-        group = group or next(sweeps, None)
         try:
-            options: dict[str, Any] = {"mode": mode, "group": group, "job_type": job_type}
-            super().__init__(name=name or self.folder.name, save_dir=save_dir, project=project, **options)
+            super().__init__(
+                name=name or self.folder.name,
+                save_dir=save_dir,
+                project=project,
+                mode=mode,
+                group=group or next(sweeps, None),
+                job_type=job_type,
+            )
         except ModuleNotFoundError as error:
             raise CompleteSplatError("logger=wandb needs wandb: pip install wandb, or leave it out") from error
         self._wandb_init.pop("anonymous", None)  # W&B would warn that Lightning gives it
@@ -127,7 +135,8 @@ class WandbRun(WandbLogger):
     def experiment(self) -> Any:
         """Return W&B's run, which begins at the first access."""
         if self._experiment is None:
-            run = self._experiment = self._begin()
+            run = self._begin()
+            self._experiment = run
             write_text(self.folder / "wandb_id", f"{run.id}\n")  # a sweep's agent sets another one (WANDB_RUN_ID)
             run.define_metric(AXIS)
             run.define_metric("*", step_metric=AXIS, step_sync=True)
@@ -137,15 +146,18 @@ class WandbRun(WandbLogger):
         import wandb
 
         path = self.folder / "wandb_id"
-        known = path.read_text().strip() if path.is_file() else ""
-        settings = {"id": known or secrets.token_hex(4), "settings": wandb.Settings(init_timeout=START_SECONDS)}
+        stored_id = path.read_text().strip() if path.is_file() else ""
+        options = dict(self._wandb_init)
+        options["id"] = stored_id or secrets.token_hex(4)
+        options["settings"] = wandb.Settings(init_timeout=START_SECONDS)
         try:
-            return wandb.init(**self._wandb_init | settings)
+            return wandb.init(**options)
         except wandb.Error as error:
             reason = str(error).partition("\n")[0]
             logger.warning("W&B: %s; the run is kept offline, `wandb sync` uploads it later", reason)
         wandb.teardown()  # its process still holds the run's id
-        return wandb.init(**self._wandb_init | settings | {"mode": "offline"})
+        options["mode"] = "offline"
+        return wandb.init(**options)
 
     @rank_zero_only
     def log_hyperparams(self, params: object) -> None:
@@ -155,8 +167,11 @@ class WandbRun(WandbLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, object], step: int | None = None) -> None:
+        row = dict(metrics)
+        if step is not None:
+            row[AXIS] = step
         with self._dispensable():
-            self.experiment.log({**metrics, **({} if step is None else {AXIS: step})})
+            self.experiment.log(row)
 
     @rank_zero_only
     def finish(self, exit_code: int) -> None:
@@ -174,6 +189,7 @@ class WandbRun(WandbLogger):
 
     @contextmanager
     def _dispensable(self) -> Iterator[None]:
+        """Log a warning, once, if W&B's process has ended, and go on without it."""
         try:
             yield
         except ConnectionError as error:
@@ -188,7 +204,7 @@ def wandb_runs(loggers: Iterable[Logger], config: DictConfig | ListConfig) -> It
 
     Their exit code is 1 after an error.
     """
-    runs = [each for each in loggers if isinstance(each, WandbRun)]
+    runs = [run for run in loggers if isinstance(run, WandbRun)]
     exit_code = 1
     try:
         for run in runs:

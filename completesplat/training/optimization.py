@@ -9,30 +9,34 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from completesplat.settings.schema import Natural, Range, Share
+from completesplat.quantities import Natural, NonNegative, Range, Share
 
 
 def muon(
     parameters: Iterable[Tensor],
-    lr: Annotated[float, Range(0)],
-    adam_lr: Annotated[float, Range(0)],
+    lr: NonNegative,
+    adam_lr: NonNegative,
     adam_betas: tuple[Share, Share] = (0.9, 0.99),
 ) -> Optimizer:
-    """Build Muon (Jordan 2024; library pytorch_optimizer) for matrices and kernels, with Adam for biases and norms.
+    """Build Muon (Jordan 2024) for matrices and kernels, with Adam for biases and norms.
 
     A convolution's kernel is treated as the matrix [out in*height*width]. An update has about the same length in all
     directions, so Muon needs fewer steps than Adam but, on a CPU, a third more time for each.
 
     Args:
-        lr: learning rate of matrices and kernels; the size of their gradients makes no difference.
+        lr: learning rate of matrices and kernels. The size of their gradients makes no difference.
         adam_lr, adam_betas: learning rate and betas of biases and norms.
     """
     from pytorch_optimizer import Muon  # imports a hundred other modules
 
     tensors = list(parameters)
-    matrices = {"params": [p for p in tensors if p.ndim > 1], "lr": lr, "use_muon": True}
-    others = {"params": [p for p in tensors if p.ndim < 2], "lr": adam_lr, "betas": adam_betas, "use_muon": False}
-    groups = [group for group in (matrices, others) if group["params"]]
+    matrices = [tensor for tensor in tensors if tensor.ndim > 1]
+    vectors = [tensor for tensor in tensors if tensor.ndim < 2]
+    groups: list[dict[str, Any]] = []
+    if matrices:
+        groups.append({"params": matrices, "lr": lr, "use_muon": True})
+    if vectors:
+        groups.append({"params": vectors, "lr": adam_lr, "betas": adam_betas, "use_muon": False})
     optimizer: Optimizer = Muon(groups)
     if tensors[0].device.type == "cpu":
         optimizer._orthogonalize = _orthogonal  # type: ignore[attr-defined]
@@ -53,10 +57,10 @@ def _orthogonal(group: Mapping[str, Any], updates: Sequence[Tensor]) -> list[Ten
 
 
 class Schedule(LambdaLR):
-    """Learning-rate schedule that takes only its step from a checkpoint; rates and end are those of the config."""
+    """Learning-rate schedule that takes only its step from a checkpoint, and its rates and end from the config."""
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go to the checkpoint's step; call this after the optimizer's state is loaded, whose rates it replaces."""
+        """Go to the checkpoint's step, after the optimizer's state is loaded, whose rates this replaces."""
         super().load_state_dict(state_dict | {"base_lrs": self.base_lrs})
         self._last_lr = [rate * at(self.last_epoch) for rate, at in zip(self.base_lrs, self.lr_lambdas, strict=True)]
         for group, rate in zip(self.optimizer.param_groups, self._last_lr, strict=True):
@@ -71,14 +75,17 @@ def exponential(
 ) -> LambdaLR:
     """Build linear warm-up, then exponential decay to `final_ratio` at the end (Marigold, `src/util/lr_scheduler.py`).
 
-    The paper follows Marigold without giving numbers; warm-up and ratio are Marigold's.
+    The paper follows Marigold without giving numbers. Warm-up and ratio are Marigold's.
     """
     return _after_warmup(optimizer, lambda x: math.exp(math.log(final_ratio) * x), steps, warmup_steps)
 
 
 def cosine(optimizer: Optimizer, steps: float, warmup_steps: Natural = 100, final_ratio: Share = 0.01) -> LambdaLR:
     """Build linear warm-up, then half a cosine down to `final_ratio` at the end."""
-    half_a_cosine = lambda x: final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * x))  # noqa: E731
+
+    def half_a_cosine(x: float) -> float:
+        return final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * x))
+
     return _after_warmup(optimizer, half_a_cosine, steps, warmup_steps)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -19,17 +19,18 @@ from completesplat.baselines.preoptimized import SparseVAE, project_to_splatter_
 from completesplat.data.loading.distributed import gather_values, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.errors import CompleteSplatError
-from completesplat.export.prediction import Shot, write_fitted_scene
+from completesplat.evaluation.scorer import Renders, Scorer
+from completesplat.export.fitted_scene import FittedViews, write_fitted_scene
+from completesplat.export.placed_scene import PlacedScene
 from completesplat.files import counted, make_folder, safe_name, write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.losses import WeightedSum
+from completesplat.quantities import NonNegative
 from completesplat.scene import SceneBatch, Views
-from completesplat.settings.schema import Range
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import stack
-from completesplat.training.scoring import Renders, Scorer
 from completesplat.training.stage import Stage
 
 logger = logging.getLogger(__name__)
@@ -46,7 +47,7 @@ class PerScene(Scorer):
 
     upper_bound = True
     fitted_to = "each scene's test views, the ones that it is scored on"
-    without_effect: tuple[str, ...] = ("optimizer", "schedule", "trainer.max_", "trainer.val_check")
+    unused_settings: tuple[str, ...] = ("optimizer", "schedule", "trainer.max_", "trainer.val_check")
 
     def __init__(
         self, loss: WeightedSum, fitting: FittingSettings, scenes_folder: str | None = None, **others: Any
@@ -66,24 +67,32 @@ class PerScene(Scorer):
             make_folder(self.scenes_folder)
             make_folder(folder)
             title = f"{name}: fitted to these views"
-            write_fitted_scene(folder, name, title, Shot(gaussians[0], cameras[0]), images[0], truth.images, seed)
+            scene = PlacedScene(gaussians[0], cameras[0])
+            write_fitted_scene(folder, name, title, scene, FittedViews(images[0], truth.images), seed)
         except CompleteSplatError as error:
             logger.warning("%s: %s", folder, error)
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Fit each scene to its reference and all its targets."""
         views = scenes.all_views()
-        settings = (self.background, self.loss, self.fitting)
         generator = torch.Generator().manual_seed(seed)
         with torch.autocast(self.device.type, enabled=False):
-            return fit_gaussians(views, scenes.depth_range, self.rasterizer, *settings, generator)
+            return fit_gaussians(
+                views,
+                scenes.depth_range,
+                self.rasterizer,
+                self.background,
+                self.loss,
+                self.fitting,
+                generator,
+            )
 
 
 class Preoptimized(PerScene):
     """Fitted Gaussians, as many as a Splatter Image of the reference view has room for.
 
     Like `PerScene`, it has seen the views that it is scored on. The results of a test have the share of pixels without
-    any Gaussian as `empty_pixels`, a mean over scenes; the paper reports 80 %.
+    any Gaussian as `empty_pixels`, a mean over scenes. The paper reports 80 %.
     """
 
     def __init__(self, parameterization: Parameterization, **fitting_and_rendering: Any) -> None:
@@ -100,7 +109,8 @@ class Preoptimized(PerScene):
         gaussians = self.fitted(scenes, seed)
         cameras = scenes.reference.cameras
         image, empty = project_to_splatter_image(gaussians, cameras, scenes.depth_range, self.parameterization)
-        self._empty |= dict(zip(scenes.names, empty.float().mean(dim=(1, 2)).tolist(), strict=True))
+        shares = empty.float().mean(dim=(1, 2)).tolist()
+        self._empty.update(zip(scenes.names, shares, strict=True))
         return image
 
     def fitted(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
@@ -114,7 +124,9 @@ class Preoptimized(PerScene):
     def test_results(self) -> dict[str, dict[str, Any]]:
         """Return the results of `Scorer` and `empty_pixels`, the mean over the scenes of all processes."""
         results = super().test_results()
-        empty = {name: share for shares in gather_values(self._empty) for name, share in shares.items()}
+        empty: dict[str, float] = {}
+        for shares in gather_values(self._empty):
+            empty.update(shares)
         results["model"]["empty_pixels"] = sum(empty.values()) / max(len(empty), 1)
         return results
 
@@ -125,9 +137,9 @@ class FittedScenes:
     One sequence at a time is in memory (16 bytes a pixel, and Gaussians). A file takes 56 bytes for each Gaussian.
 
     Args:
-        folder: folder of the files, which several processes may share; scenes in it are not fitted again.
+        folder: folder of the files, which several processes may share. Scenes in it are not fitted again.
         fit: a batch of one scene -> its Gaussians, in the reference camera's frame.
-        settings: text of all settings that the fit depends on; another text means other files.
+        settings: text of all settings that the fit depends on. Another text means other files.
     """
 
     def __init__(
@@ -135,12 +147,18 @@ class FittedScenes:
     ) -> None:
         make_folder(folder)
         self.folder = folder
-        self.stores = {name: store for store in stores for name in store.names}
+        self.stores: dict[str, SceneStore] = {}
+        for store in stores:
+            self.stores.update(dict.fromkeys(store.names, store))
         self.fit = fit
         self.settings = settings
 
     def complete(self, names: Sequence[str], progress: bool) -> None:
-        """Fit missing scenes; raise DataError if a sequence cannot be read."""
+        """Fit the scenes that have no file.
+
+        Raises:
+            DataError: a sequence cannot be read.
+        """
         missing = [name for name in names if not self._path(name).is_file()]
         for name in track(missing, "fitting Gaussians to scenes", disable=not progress):
             self._fitted(name)
@@ -154,16 +172,18 @@ class FittedScenes:
         return self._fitted(name).transform(to_frame.float())
 
     def _fitted(self, name: str) -> Gaussians:
-        """Return a sequence's Gaussians in the frame of its first camera; fit them if there is no file of them."""
-        if not (path := self._path(name)).is_file():
+        """Return a sequence's Gaussians in the frame of its first camera, fitted now if there is no file of them."""
+        path = self._path(name)
+        if not path.is_file():
             store = self.stores[name]
             sequence = store.source.read(name)
-            gaussians = self.fit(stack([store.scene(sequence, 0, range(1, len(sequence.frames)))]))[0]
+            scene = store.scene(sequence, 0, range(1, len(sequence.frames)))
+            gaussians = self.fit(stack([scene]))[0]
             write_bytes(path, save({key: value.cpu().contiguous() for key, value in vars(gaussians).items()}))
         return Gaussians(**load_file(path))
 
     def _path(self, name: str) -> Path:
-        """Return the file of a sequence; it is named by a hash because sequence names may have slashes."""
+        """Return the file of a sequence, which is named by a hash because sequence names may have slashes."""
         key = hashlib.sha256(f"{name}\n{self.settings}".encode()).hexdigest()[:24]
         return self.folder / f"{key}.safetensors"
 
@@ -186,15 +206,15 @@ class PreoptimizedVAE(Preoptimized, Stage):
         **preoptimized: see `Preoptimized`.
     """
 
-    without_effect = ()
+    unused_settings = ()
 
     def __init__(
         self,
         vae: SparseVAE,
         folder: str,
         normalization_batches: int,
-        opacity_weight: Annotated[float, Range(0)],
-        kl_weight: Annotated[float, Range(0)],
+        opacity_weight: NonNegative,
+        kl_weight: NonNegative,
         **preoptimized: Any,
     ) -> None:
         super().__init__(parameterization=vae.reconstructor.parameterization, **preoptimized)
@@ -211,7 +231,7 @@ class PreoptimizedVAE(Preoptimized, Stage):
         if data.latent_cache is not None:
             raise CompleteSplatError("data.latent_cache is for model=latent_diffusion: set it to null")
         terms = {name: term["weight"] for name, term in self.loss.terms.items()}
-        images = data.image_size, data.background, data.mask_threshold, data.packed_settings()
+        images = (data.image_size, data.background, data.mask_threshold, data.packed_settings())
         settings = f"{self.fitting} {terms} {self.background} {images} {data.source('train').fingerprint()}"
         stores = [data.store("val"), data.store("train")]
         self._stored = FittedScenes(self.folder, stores, super().fitted, settings)
@@ -225,12 +245,14 @@ class PreoptimizedVAE(Preoptimized, Stage):
         self._stored = None
 
     def fitted(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
-        """Return stored Gaussians of whole sequences during training; otherwise fit Gaussians to the scenes' views."""
+        """Return Gaussians of whole sequences from files in training, else Gaussians fitted to the scenes' views."""
         if self._stored is None:
             gaussians = super().fitted(scenes, seed)
             return replace(gaussians, quaternions=normalize_quaternion(gaussians.quaternions))
-        frames = zip(scenes.names, scenes.reference_frame.tolist(), strict=True)
-        return stack([self._stored.seen_from(name, frame) for name, frame in frames]).to(self.device)
+        parts = []
+        for name, frame in zip(scenes.names, scenes.reference_frame.tolist(), strict=True):
+            parts.append(self._stored.seen_from(name, frame))
+        return stack(parts).to(self.device)
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
         truth = self.splatter_image(scenes)
@@ -239,11 +261,12 @@ class PreoptimizedVAE(Preoptimized, Stage):
         with torch.autocast(self.device.type, enabled=False):
             errors = self.vae.errors(reconstruction.splatter_image, truth)
             kl = reconstruction.posterior.kl().mean() / truth.raw[0].numel()
-            opacity = errors.pop("opacity")
-            values = torch.stack(list(errors.values())).mean()
-            total: Tensor = values + self.opacity_weight * opacity + self.kl_weight * kl
-        logged = {f"train/{name}": value.detach() for name, value in (errors | {"opacity": opacity, "kl": kl}).items()}
-        self.log_step({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
+            values = torch.stack([error for name, error in errors.items() if name != "opacity"]).mean()
+            total: Tensor = values + self.opacity_weight * errors["opacity"] + self.kl_weight * kl
+        figures = {"train/loss": total.detach(), "train/kl": kl.detach()}
+        for name, error in errors.items():
+            figures[f"train/{name}"] = error.detach()
+        self.log_step(figures, batch_size=len(scenes.names))
         return total
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:

@@ -4,7 +4,7 @@ import logging
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,17 +14,17 @@ from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.baselines.autodecoder import AutoDecoder, Codes, optimize_codes
 from completesplat.baselines.splatter_image.model import PublishedSplatterImage, write_trained
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
+from completesplat.evaluation.scorer import Scorer
 from completesplat.gaussians import Gaussians
 from completesplat.generator import DeterministicModel
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch, Views
-from completesplat.scene_model import camera_tensors
 from completesplat.splatter_image import SplatterImage
-from completesplat.training.scoring import Scorer
 from completesplat.training.stage import Compile, Stage, prepare_network
 from completesplat.weights import CAMERA
 from completesplat.weights.checkpoint_reading import load_part
+from completesplat.weights.opening import camera_tensors
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ class ReconstructionScorer(Scorer):
         return self.model(scenes.reference.images)
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
-        """Return Gaussians from the posterior's mode; nothing is drawn, so the seed has no effect."""
+        """Return Gaussians from the posterior's mode. Nothing is drawn, so the seed has no effect."""
         reconstruction: Reconstruction = self(scenes)
         return reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
 
@@ -63,12 +63,10 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         loss: weighted terms by name.
         checkpoint: checkpoint of an earlier stage, whose weights this one starts from.
         masked: the model sees only the visible part of the reference image (`data.box_masks`) and learns to complete
-            it; renders are compared with whole images. The paper leaves this as future work.
+            it. Renders are compared with whole images. The paper leaves this as future work.
         channels_last, compile: see `prepare_network`.
         **rendering_and_optimization: see `Stage`.
     """
-
-    start_weights: ClassVar = {"checkpoint": "RUN/checkpoints/last.ckpt"}
 
     def __init__(
         self,
@@ -94,9 +92,10 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         return torch.tensor(self.camera["up"]) if self.camera else super().up
 
     def save_weights(self, folder: Path) -> None:
-        """Write the network with the typical camera; published weights in the format of their authors.
+        """Write the network with the typical camera.
 
-        A network that weights may not name is left out, with a warning.
+        Published weights are written in the format of their authors. A network that weights may not name is left out,
+        with a warning.
         """
         if isinstance(self.model, PublishedSplatterImage):
             return write_trained(folder, self.model.file, self.model.state_dict())
@@ -106,7 +105,8 @@ class ReconstructionModule(ReconstructionScorer, Stage):
             model = DeterministicModel(self.config["model"]["model"], self.data.image_size)
             model.load_state_dict(trained | camera_tensors(self.camera))
         except WeightsError as error:
-            return logger.warning("no weights are written to %s: %s", folder, error)
+            logger.warning("no weights are written to %s: %s", folder, error)
+            return
         model.architecture["training"] = self.data.training_facts()
         model.save_pretrained(folder)
 
@@ -136,7 +136,7 @@ class ReconstructionModule(ReconstructionScorer, Stage):
 
     @property
     def sees_views(self) -> bool:
-        """Whether the model's posterior sees other views than the reference; baselines have none."""
+        """Whether the model has a posterior that sees other views than the reference."""
         return getattr(self.model, "sees_views", False)
 
     def latent_figures(self, scenes: SceneBatch) -> dict[str, float]:
@@ -157,10 +157,13 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         Args:
             others: number of targets that the posterior sees besides the reference image.
         """
-        images = scenes.reference.images * scenes.visible if self.masked else scenes.reference.images
+        images = scenes.reference.images
+        if self.masked:
+            images = images * scenes.visible
         images = images.contiguous(memory_format=self.memory_format)
-        seen = (scenes.all_views()[:, : 1 + others], scenes.depth_range) if others else ()
-        return self.model(images, *seen)
+        if others == 0:
+            return self.model(images)
+        return self.model(images, scenes.all_views()[:, : 1 + others], scenes.depth_range)
 
     def draw_others(self, targets: int) -> int:
         """Draw how many of the targets a posterior that sees views gets: mostly many, never all."""
@@ -181,7 +184,7 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         return total
 
     def validation_step(self, scenes: SceneBatch, index: int) -> None:
-        """Score the reference image alone; if the posterior sees views, also with every other target encoded.
+        """Score the reference image alone, and if the posterior sees views, also with every other target encoded.
 
         `val/psnr_posterior` scores the targets between, which the posterior has not seen: the best that stage 2 could
         reach. `val/posterior_gain` is its gain over the reference image alone for these targets.
@@ -189,12 +192,12 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         super().validation_step(scenes, index)
         if not self.sees_views or scenes.targets.images.shape[1] < 2:
             return
-        seen = replace(scenes, targets=scenes.targets[:, ::2])
-        others = replace(scenes, targets=scenes.targets[:, 1::2])
-        splatter_image = self(seen, seen.targets.images.shape[1]).splatter_image
+        encoded = replace(scenes, targets=scenes.targets[:, ::2])
+        between = replace(scenes, targets=scenes.targets[:, 1::2])
+        splatter_image = self(encoded, encoded.targets.images.shape[1]).splatter_image
         gaussians = splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
-        values = self.novel_psnr(gaussians, others)
-        gain = values - self.novel_psnr(self.reconstruct(scenes), others)
+        values = self.novel_psnr(gaussians, between)
+        gain = values - self.novel_psnr(self.reconstruct(scenes), between)
         figures = {"val/psnr_posterior": values.mean(), "val/posterior_gain": gain.mean()}
         self.log_dict(figures, prog_bar=True, batch_size=len(values))
 
@@ -202,10 +205,10 @@ class ReconstructionModule(ReconstructionScorer, Stage):
 class ReconstructorOnly(ReconstructionModule):
     """Reconstructor whose image codes are optimised (supplement, "Reconstructor-only without the Encoder").
 
-    Codes and reconstructor are trained jointly; a test image gets a new code for the fixed reconstructor.
+    Codes and reconstructor are trained jointly. A test image gets a new code for the fixed reconstructor.
 
     Args:
-        loss: weighted terms by name; training uses all views, the test the reference alone.
+        loss: weighted terms by name. Training uses all views, the test the reference alone.
         code_steps, code_rate: steps and learning rate of a new code's optimisation (800 and 0.005 in DeepSDF).
     """
 
@@ -237,10 +240,12 @@ class ReconstructorOnly(ReconstructionModule):
         """Write no weights, because a new photo has no code."""
 
     def forward(self, scenes: SceneBatch, others: int = 0) -> Reconstruction:
-        """Reconstruct training images from their codes; in evaluation, reconstruct any image from a new code."""
-        if not self.training:
-            return Reconstruction(self.model(self.infer_codes(scenes, seed=0)), None)
-        return Reconstruction(self.model(self.model.codes_of(scenes.names, scenes.reference_frame)), None)
+        """Reconstruct training images from their codes, and in evaluation any image from a new code."""
+        if self.training:
+            codes = self.model.codes_of(scenes.names, scenes.reference_frame)
+        else:
+            codes = self.infer_codes(scenes, seed=0)
+        return Reconstruction(self.model(codes), None)
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Return Gaussians of new codes that are optimised for the reference view from seeded initial values."""

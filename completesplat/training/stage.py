@@ -19,21 +19,25 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from completesplat.data.loading.distributed import mean_of_processes
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.evaluation.scorer import Scorer
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
+from completesplat.quantities import Share
 from completesplat.rasterizers import Rasterizer
-from completesplat.run_configs import check_names, without_training
 from completesplat.scene import Batch, SceneBatch
-from completesplat.settings.schema import Share
-from completesplat.training.scoring import Scorer
-from completesplat.weights.checkpoint_reading import load_part, read_checkpoint
+from completesplat.weights.checkpoint_reading import load_tensors, read_checkpoint
+from completesplat.weights.runs import CONFIG, config_of_checkpoint, without_training
 
 # "cudagraphs" also records a call's operations on a GPU, to start them at once.
 Compile = Literal[False, True, "cudagraphs"]
 
 
 def prepare_network(network: nn.Module, channels_last: bool, compile: Compile) -> torch.memory_format:
-    """Order convolution weights in NHWC, or compile on the first call; return the order that images should have."""
+    """Order convolution weights in NHWC, or let the network be compiled on its first call.
+
+    Returns:
+        The order that images should have.
+    """
     if channels_last:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if compile:
@@ -72,7 +76,9 @@ class Stage(Scorer):
     @lr.setter
     def lr(self, rate: float) -> None:
         self._lr = rate
-        for config in [] if self._trainer is None else self._trainer.lr_scheduler_configs:  # of a run that has begun
+        if self._trainer is None:  # no run has begun
+            return
+        for config in self._trainer.lr_scheduler_configs:
             config.scheduler.base_lrs = [rate] * len(config.scheduler.base_lrs)
 
     def latent_figures(self, scenes: SceneBatch) -> dict[str, float]:
@@ -92,17 +98,15 @@ class Stage(Scorer):
             trust: the checkpoint names your own modules, and you trust its author; not needed below the working folder.
 
         Raises:
-            WeightsError: the checkpoint is damaged, missing, of another class, has no config, or `check_names` fails.
+            WeightsError: the checkpoint is missing, damaged or of another class, or `config_of_checkpoint` refuses it.
         """
         path = Path(checkpoint_path)
-        config = read_checkpoint(path).get("hyper_parameters")
-        if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
-            raise WeightsError(f"{path}: has no config; train with `fit`, or with what completesplat.instantiate gives")
-        config = check_names(config, path, path.resolve().parent.parent, trust)
+        contents = read_checkpoint(path)
+        config = config_of_checkpoint(path, contents, trust)
         module = instantiate(without_training(OmegaConf.create(config)).model, _convert_="all")
         if not isinstance(module, cls):
             raise WeightsError(f"{path}: holds a {type(module).__name__}, which is no {cls.__name__}")
-        load_part(module, path, prefix="")
+        load_tensors(module, contents["state_dict"], path)
         module.config = config
         return module if map_location is None else module.to(map_location)
 
@@ -114,7 +118,7 @@ class Stage(Scorer):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the config, which `load_from_checkpoint` reads."""
         if self.config is not None:
-            checkpoint["hyper_parameters"] = dict(self.config)
+            checkpoint[CONFIG] = dict(self.config)
 
     def refuse_average(self) -> None:
         """Raise CompleteSplatError if weights are averaged, for a model whose number of weights changes in a run."""
@@ -140,7 +144,8 @@ class Stage(Scorer):
 
     def on_train_batch_start(self, batch: Batch, index: int) -> None:
         """Note the number of scenes of this batch, whose gradient may be added to those of earlier ones."""
-        self.accumulated = self.accumulated if index % self.trainer.accumulate_grad_batches else []
+        if index % self.trainer.accumulate_grad_batches == 0:
+            self.accumulated = []
         self.accumulated.append(len(batch.names))
 
     def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
@@ -160,12 +165,13 @@ class Stage(Scorer):
     ) -> None:
         """Clip as Lightning does, but with the norm that `BadSteps` has computed, if it has.
 
-        Fused optimizers in bfloat16, too, which Lightning refuses without loss scaling.
+        Gradients of fused optimizers in bfloat16 are clipped too, which Lightning refuses without loss scaling.
         """
         norm = self.gradient_norm
         self.gradient_norm = None
         if norm is not None and gradient_clip_val and gradient_clip_algorithm in (None, "norm"):
-            return torch.nn.utils.clip_grads_with_norm_(self.parameters(), gradient_clip_val, norm)
+            torch.nn.utils.clip_grads_with_norm_(self.parameters(), gradient_clip_val, norm)
+            return
         precision = self.trainer.precision_plugin
         scaled = getattr(precision, "scaler", None) is not None
         clip = precision.clip_gradients if scaled else partial(Precision.clip_gradients, precision)
@@ -174,7 +180,8 @@ class Stage(Scorer):
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Build the optimizer, and a schedule that spans the run, whether its length is given in steps or epochs."""
         optimizer = self.optimizer([p for p in self.parameters() if p.requires_grad])
-        for group in optimizer.param_groups:
-            group["lr"] = group["lr"] if self.lr is None else self.lr
+        if self.lr is not None:
+            for group in optimizer.param_groups:
+                group["lr"] = self.lr
         schedule = self.schedule(optimizer, self.trainer.estimated_stepping_batches)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

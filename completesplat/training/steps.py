@@ -22,7 +22,7 @@ MAXIMAL_NORM = 1.0  # of gradients, as in conf/trainer
 
 
 class Training:
-    """Optimizer steps of either stage as in a run, without its logging; `module` is on its device.
+    """Optimizer steps of either stage as in a run, without its logging.
 
     Args:
         precision: Lightning's name; "bf16-mixed" computes the networks in bfloat16.
@@ -88,13 +88,13 @@ def synthetic_batch(size: int, batch: int, targets: int) -> SceneBatch:
 
 
 def peak_megabytes(work: Callable[[], object], device: torch.device) -> float | None:
-    """Return the memory in MB that `work` adds to the process, or to the GPU; None if the system does not tell."""
+    """Return the memory in MB that `work` adds to the process, or to the GPU, or None if the system does not tell."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
         before = torch.cuda.memory_allocated()
         work()
         return (torch.cuda.max_memory_allocated() - before) / MEBIBYTE
-    from completesplat.rasterizers.kernels.drawing import release  # imports numba
+    from completesplat.rasterizers.kernels.runtime import release  # imports numba
 
     # Return memory that the process still holds after freeing it, because reusing it would not be counted.
     release()

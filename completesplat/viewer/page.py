@@ -14,16 +14,17 @@ import numpy as np
 import torch
 import viser
 
-from completesplat.data.images.files import open_image, refused_as_bad
 from completesplat.errors import CompleteSplatError
+from completesplat.export.description import is_described
 from completesplat.export.formats import FORMATS, suffix, write_format
 from completesplat.export.images import to_pixels
-from completesplat.export.prediction import PHOTO_FILE, is_described
+from completesplat.export.prediction import PHOTO_FILE
 from completesplat.export.splat_transform import PageView
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.files import SPLATS, printable, write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit
+from completesplat.photo.files import open_image, refused_as_bad
 from completesplat.rasterizers import Rasterizer
 from completesplat.viewer import panel
 from completesplat.viewer.access import GuardedServer, show_status, stop_server, with_head
@@ -32,8 +33,8 @@ from completesplat.viewer.splat_view import SplatView
 
 Task = Callable[[], None]
 
-THUMBNAIL = 96
-MOST_THUMBNAILS = 24  # px
+THUMBNAIL = 96  # px
+MOST_THUMBNAILS = 24
 SHOWN = "shown"  # kind of all jobs that show other samples
 
 log = logging.getLogger(__name__)
@@ -43,7 +44,7 @@ class Worker:
     """A thread that does one job after another, so that the page answers meanwhile.
 
     Only the newest waiting job of each kind is done, because a moving slider submits more jobs than can be computed.
-    `failed` is called with every exception that a job raises; the thread goes on.
+    `failed` is called with every exception that a job raises, and the thread goes on.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
@@ -62,11 +63,17 @@ class Worker:
                 self._jobs[kind] = self._pool.submit(self._do, job)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until no job is left, at most `timeout` seconds for one; return whether none is left."""
-        while left := [job for job in list(self._jobs.values()) if not job.done()]:
-            if futures.wait(left, timeout).not_done:
+        """Wait until no job is left, and return whether none is left.
+
+        Args:
+            timeout: longest time to wait for a job, in seconds.
+        """
+        while True:
+            unfinished = [job for job in list(self._jobs.values()) if not job.done()]
+            if not unfinished:
+                return True
+            if futures.wait(unfinished, timeout).not_done:
                 return False
-        return True
 
     def close(self) -> None:
         """Drop the waiting jobs, and wait for the current one: torch aborts a process that ends while it computes."""
@@ -85,7 +92,7 @@ class Worker:
 
 
 class Saver:
-    """Writer of numbered files in a folder; nothing is overwritten.
+    """Writer of numbered files in a folder, which overwrites nothing.
 
     `make_rasterizer` is called for the first rendering. Videos have `frames` frames and a grey background.
     """
@@ -100,13 +107,19 @@ class Saver:
         self.rasterizer = cache(make_rasterizer)
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
-        """Write samples in a format, as videos, or the page (`html`); raise CompleteSplatError if there are none."""
+        """Write samples in a format, as videos, or the page (`html`).
+
+        Raises:
+            CompleteSplatError: there are no samples.
+        """
         if not samples:
             raise CompleteSplatError("there is nothing to save yet: draw samples first")
         self.folder.mkdir(parents=True, exist_ok=True)
         if kind == "html":
             return [write_viewer_page(self.view.server, self._next("page", ".html"))]
-        return [self._video(sample) if kind == panel.VIDEO else self._scene(kind, sample) for sample in samples]
+        if kind == panel.VIDEO:
+            return [self._video(sample) for sample in samples]
+        return [self._scene(kind, sample) for sample in samples]
 
     def thumbnail(self, sample: Sample, size: int) -> panel.Pixels:
         """Render a sample from behind, where samples differ, with `size` px on the longer side."""
@@ -114,7 +127,8 @@ class Saver:
         camera = orbit(sample.reference, sample.pivot(), up, 2)[1]
         scene = sample.for_viewers()
         factor = size / max(camera.image_size)
-        height, width = (max(1, round(side * factor)) for side in camera.image_size)
+        height = max(1, round(camera.image_size[0] * factor))
+        width = max(1, round(camera.image_size[1] * factor))
         intrinsics = camera.intrinsics * camera.intrinsics.new_tensor([[factor], [factor], [1.0]])
         small = Cameras(camera.world_to_camera, intrinsics, (height, width))
         views, _ = render_views(self.rasterizer(), scene, small[None], self.background)
@@ -133,15 +147,24 @@ class Saver:
     def _video(self, sample: Sample) -> Path:
         path = self._next("orbit", ".mp4")
         up = sample.reference.intrinsics.new_tensor(self.view.up.tolist())
-        seen = sample.gaussians, sample.reference, sample.pivot()
-        frames, _ = orbit_views(self.rasterizer(), *seen, self.frames, self.background, up)
+        frames, _ = orbit_views(
+            self.rasterizer(),
+            sample.gaussians,
+            sample.reference,
+            sample.pivot(),
+            self.frames,
+            self.background,
+            up,
+        )
         write_video(path, frames)
         return path
 
     def _next(self, stem: str, suffix: str) -> Path:
         taken = {path.name.partition(".")[0] for path in self.folder.glob(f"{stem}_*")}
-        names = (f"{stem}_{i:02}{suffix}" for i in range(10**6))
-        return self.folder / next(name for name in names if name.partition(".")[0] not in taken)
+        number = 0
+        while f"{stem}_{number:02}{suffix}".partition(".")[0] in taken:
+            number += 1
+        return self.folder / f"{stem}_{number:02}{suffix}"
 
 
 class Page:
@@ -156,27 +179,28 @@ class Page:
         self.saver = saver
         self.scenes = scenes
         self.complete: Callable[[Path, str, viser.ClientHandle | None], None] | None = None
-        self.told: Exception | None = None
+        self.last_error: Exception | None = None
         self.worker = Worker(self.tell)
-        self.opening = panel.add_opening(server.gui, [*scenes])
-        self.opening.upload.on_upload(self._upload)
-        self.opening.chosen.on_update(self._choose)
+        self.file_controls = panel.add_file_controls(server.gui, [*scenes])
+        self.file_controls.upload.on_upload(self._upload)
+        self.file_controls.chosen.on_update(self._choose)
         self.photo = server.gui.add_html("", order=0.4)
-        self.looking = panel.add_looking(server.gui)
-        self._connect_looking()
-        self.saving = panel.add_saving(server.gui, FORMATS)
-        self.saving.save.on_click(self._save)
+        self.view_controls = panel.add_view_controls(server.gui)
+        self._connect_view_controls()
+        self.save_controls = panel.add_save_controls(server.gui, FORMATS)
+        self.save_controls.save.on_click(self._save)
         self._thumbnails: list[panel.Pixels] = []
         self.show(view.samples)
 
     def show(self, samples: Sequence[Sample], status: str = "") -> None:
         """Show samples in all browsers, and their thumbnails when all of them are finished."""
         self.view.show(samples)
-        options = (*(f"sample {i + 1}" for i in range(max(1, len(samples)))), panel.SIDE_BY_SIDE)
-        if self.looking.chosen.options != options:
-            self.looking.chosen.options = options
+        numbers = range(1, max(1, len(samples)) + 1)
+        options = (*(f"sample {number}" for number in numbers), panel.SIDE_BY_SIDE)
+        if self.view_controls.chosen.options != options:
+            self.view_controls.chosen.options = options
         layers = max((sample.layers for sample in samples), default=0)
-        for i, box in enumerate(self.looking.layers):
+        for i, box in enumerate(self.view_controls.layers):
             box.visible = i < layers
         show_status(self.server, status)
         if all(sample.finished for sample in samples):
@@ -191,7 +215,11 @@ class Page:
         self.show_photo(path)
 
     def show_photo(self, scene: Path) -> None:
-        """Show a prediction's photo, if its folder has one, in the panel; raise BadImage for a damaged one."""
+        """Show a prediction's photo, if its folder has one, in the panel.
+
+        Raises:
+            BadImage: it is damaged.
+        """
         folder = scene if scene.is_dir() else scene.parent
         file = folder / PHOTO_FILE
         self.photo.content = ""
@@ -201,14 +229,14 @@ class Page:
                 self.photo.content = panel.preview_of(pixels, "photo")
 
     def _choose(self, event: viser.GuiEvent[Any]) -> None:
-        name = self.opening.chosen.value
+        name = self.file_controls.chosen.value
         if name in self.scenes:
-            self.opening.chosen.options = (*self.scenes,)
+            self.file_controls.chosen.options = tuple(self.scenes)
             self.submit(SHOWN, event.client, partial(self.open, self.scenes[name], name))
 
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
         """Show an uploaded scene, or complete an uploaded image, when the scene that is being drawn is finished."""
-        file = self.opening.upload.value
+        file = self.file_controls.upload.value
         name = printable(file.name)
         content = file.content
         file.content = b""  # which the button would keep until the next upload
@@ -233,88 +261,90 @@ class Page:
 
     def _let_choose_another(self, name: str) -> None:
         """Name an uploaded scene in the choice, so that each of `scenes` can be chosen next."""
-        chosen = self.opening.chosen
+        chosen = self.file_controls.chosen
         uploaded = f"loaded: {name}"
         chosen.options = (uploaded, *self.scenes)
         chosen.visible = bool(self.scenes)
         chosen.value = uploaded
 
     def _draw_thumbnails(self, samples: Sequence[Sample]) -> None:
-        """Render thumbnails in the worker's thread; a single sample needs none."""
+        """Render thumbnails, in the worker's thread, unless there is a single sample."""
         first = samples[:MOST_THUMBNAILS] if len(samples) > 1 else []
         self._thumbnails = [self.saver.thumbnail(sample, THUMBNAIL) for sample in first]
         self._mark_thumbnail()
 
     def _mark_thumbnail(self) -> None:
         row = panel.thumbnail_row(self._thumbnails, self.view.chosen) if self._thumbnails else ""
-        if self.looking.thumbnails.content != row:
-            self.looking.thumbnails.content = row
+        if self.view_controls.thumbnails.content != row:
+            self.view_controls.thumbnails.content = row
 
     def submit(self, kind: Hashable, client: viser.ClientHandle | None, job: Task) -> None:
         """Let the worker do a job (`Worker.submit`) whose errors go to one browser (None: to all)."""
 
-        def answered() -> None:
+        def job_with_errors_told() -> None:
             try:
                 job()
             except Exception as error:
                 self.tell(error, client)
 
-        self.worker.submit(kind, answered)
+        self.worker.submit(kind, job_with_errors_told)
 
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
-        """Show an error in one browser or in all, and keep it; log it as well if it is a fault of the program."""
+        """Show an error in one browser or in all, and keep it. A fault of the program is logged as well."""
         show_status(self.server, "")  # what was waited for
-        self.told = error
+        self.last_error = error
         text = str(error)
         if not isinstance(error, CompleteSplatError):
             text = f"{type(error).__name__}: {text}"
             log.error("the viewer goes on after %s", text, exc_info=error)
-        for browser in list(self.server.get_clients().values()) if client is None else [client]:
+        browsers = list(self.server.get_clients().values()) if client is None else [client]
+        for browser in browsers:
             browser.add_notification("Not possible", text, color="red")
 
     def close(self) -> None:
         self.worker.close()
         stop_server(self.server)
 
-    def _connect_looking(self) -> None:
-        looking = self.looking
+    def _connect_view_controls(self) -> None:
+        controls = self.view_controls
         view = self.view
 
         def changed(_: viser.GuiEvent[Any]) -> None:
-            index = looking.chosen.options.index(looking.chosen.value)
-            last = len(looking.chosen.options) - 1
+            index = controls.chosen.options.index(controls.chosen.value)
+            last = len(controls.chosen.options) - 1
             view.chosen = None if index == last else index
-            view.hidden_layers = {i for i, layer in enumerate(looking.layers) if not layer.value}
-            view.depth = looking.depth.value
-            view.cameras = {name for name, box in looking.cameras.items() if box.value}
+            view.hidden_layers = {i for i, layer in enumerate(controls.layers) if not layer.value}
+            view.depth = controls.depth.value
+            view.cameras = {name for name, box in controls.cameras.items() if box.value}
             view.refresh()
             self._mark_thumbnail()
 
         def pressed(index: int, _: viser.CommandEvent) -> None:
-            if index < len(looking.chosen.options) - 1:  # key 0, which is -1, chooses all
-                looking.chosen.value = looking.chosen.options[index]
+            if index < len(controls.chosen.options) - 1:  # key 0, which is -1, chooses all
+                controls.chosen.value = controls.chosen.options[index]
 
-        for digit, command in looking.keys.items():
+        for digit, command in controls.keys.items():
             command.on_trigger(partial(pressed, int(digit) - 1))
-        looking.chosen.on_update(changed)
-        for box in (*looking.layers, looking.depth, *looking.cameras.values()):
+        controls.chosen.on_update(changed)
+        for box in (*controls.layers, controls.depth, *controls.cameras.values()):
             box.on_update(changed)
-        looking.front.on_click(lambda event: view.look_from_the_front(event.client))
+        controls.front.on_click(lambda event: view.look_from_the_front(event.client))
 
     def _save(self, event: viser.GuiEvent[Any]) -> None:
         client = event.client
-        kind = self.saving.kind.value
-        shown = list(self.view.visible)
+        kind = self.save_controls.kind.value
+        samples = list(self.view.visible)
         if client is None:
             return
 
         def save() -> None:
             show_status(self.server, f"saving {kind}")
-            files = self.saver.save(kind, shown)
+            files = self.saver.save(kind, samples)
             show_status(self.server, "")
             for file in files:
                 client.send_file_download(file.name, file.read_bytes())
-            client.add_notification("Saved", f"{', '.join(file.name for file in files)} in {self.saver.folder}")
+            names = ", ".join(file.name for file in files)
+            client.add_notification("Saved", f"{names} in {self.saver.folder}")
 
         self.submit(object(), client, save)  # each click counts
 

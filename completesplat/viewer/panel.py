@@ -13,10 +13,10 @@ from diffusers import DDIMScheduler
 from jaxtyping import UInt8
 from PIL import Image
 
-from completesplat.data.images.files import image_bytes
 from completesplat.diffusion.sampling import Sampler
 from completesplat.files import SPLATS
 from completesplat.generator import CompleteSplat
+from completesplat.photo.saving import image_bytes
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.sample import MOST_LAYERS
 
@@ -29,7 +29,7 @@ CUT_OUT = (
     "of the next images: only the object, on the weights' background (needs completesplat[background] or [grabcut])"
 )
 FILES = f"an image to complete, or a scene ({', '.join(SPLATS)}); or drop the file anywhere on the page"
-KEYS = 9  # keys 1 to 9 choose a sample; 0 shows all
+KEYS = 9  # keys 1 to 9 choose a sample, 0 shows all
 VIDEO = "video"
 # Simulates a press of the number's key, which the page hears everywhere, because viser's HTML has no callbacks.
 CHOOSE = "this.dispatchEvent(new KeyboardEvent('keydown',{{key:'{0}',code:'Digit{0}',bubbles:true}}))"
@@ -37,10 +37,13 @@ CHOOSE = "this.dispatchEvent(new KeyboardEvent('keydown',{{key:'{0}',code:'Digit
 Pixels = UInt8[np.ndarray, "_ _ 3"]
 
 
-def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> SimpleNamespace:
-    """Add the folders `Photograph` and `Completion`, and return viser's handles; `start` holds the initial values.
+def add_completion_controls(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> SimpleNamespace:
+    """Add the folders `Photograph` and `Completion`, and return viser's handles.
 
     The controls of drawing are hidden if the model draws no samples.
+
+    Args:
+        start: initial values.
     """
     draws = model.draws_samples
     most_steps = 2
@@ -75,20 +78,22 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
         )
 
 
-def add_opening(gui: viser.GuiApi, scenes: Sequence[str]) -> SimpleNamespace:
-    """Add what loads files, and return handles of `upload` and of `chosen`, which chooses one of several scenes."""
+def add_file_controls(gui: viser.GuiApi, scenes: Sequence[str]) -> SimpleNamespace:
+    """Add controls that load files, and return handles of `upload` and of `chosen`, which chooses one of the scenes."""
     return SimpleNamespace(
         chosen=gui.add_dropdown("Scene", scenes or [""], visible=len(scenes) > 1, order=0.2),
         upload=gui.add_upload_button("Load a file", mime_type=f"image/*,{','.join(SPLATS)}", hint=FILES, order=0.3),
     )
 
 
-def add_looking(gui: viser.GuiApi) -> SimpleNamespace:
-    """Add the folder `View`; return handles of the `chosen` sample, of `layers` by number, and of `cameras` by name.
+def add_view_controls(gui: viser.GuiApi) -> SimpleNamespace:
+    """Add the folder `View`, and return its handles.
 
-    The handles also include `thumbnails` above all folders, filled by `thumbnail_row`, and `keys`, commands by digit.
+    They are the `chosen` sample, `layers` by number, `cameras` by name, `thumbnails` above all folders, which
+    `thumbnail_row` fills, and `keys`, commands by digit.
     """
-    commands = {str(i): f"Show sample {i}" for i in range(1, KEYS + 1)} | {"0": "Show all samples side by side"}
+    commands = {str(i): f"Show sample {i}" for i in range(1, KEYS + 1)}
+    commands["0"] = "Show all samples side by side"
     key: Any = gui.add_command
     thumbnails = gui.add_html("", order=0.5)
     with gui.add_folder("View", order=3):
@@ -103,15 +108,15 @@ def add_looking(gui: viser.GuiApi) -> SimpleNamespace:
         )
 
 
-def add_saving(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
-    """Add the folder `Save`; return handles of the file's `kind` (a format or a video) and of the button `save`."""
+def add_save_controls(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
+    """Add the folder `Save`, and return handles of the file's `kind` (a format or a video) and of the button `save`."""
     with gui.add_folder("Save", order=4):
         kind = gui.add_dropdown("Format", (*formats, VIDEO), hint="spz and sog need Node.js, mesh completesplat[mesh]")
         return SimpleNamespace(kind=kind, save=gui.add_button("Save", hint="what is shown, with all layers"))
 
 
 def thumbnail_row(images: Sequence[Pixels], chosen: int | None) -> str:
-    """Return HTML with numbered images of samples; a click on one of the first nine chooses it."""
+    """Return HTML with numbered images of samples. A click on one of the first nine chooses it."""
     cells = []
     for i, image in enumerate(images):
         line = "#228be6" if i == chosen else "transparent"
@@ -132,11 +137,12 @@ def preview_of(image: Pixels, label: str) -> str:
 
 def _source(image: Pixels) -> str:
     """Return an image as a data URL, because viser's own images disappear when the panel is moved."""
-    return f"data:image/png;base64,{base64.b64encode(image_bytes(Image.fromarray(image), 'PNG')).decode()}"
+    content = image_bytes(Image.fromarray(image), "PNG")
+    return f"data:image/png;base64,{base64.b64encode(content).decode()}"
 
 
 def possible_steps(sampler: Sampler) -> list[int]:
-    """Return the sampler's default steps and all others up to 100; those of DDIM divide the number of noise levels."""
+    """Return the sampler's default steps and all others up to 100. Those of DDIM divide the number of noise levels."""
     levels = sampler.training_timesteps
     steps = set(range(1, min(MOST_STEPS, levels) + 1))
     if isinstance(sampler.scheduler, DDIMScheduler):

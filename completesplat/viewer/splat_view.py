@@ -56,7 +56,7 @@ class Arrangement:
         return float(np.linalg.norm(self.look_at - self.position))
 
     def shift(self, index: int) -> Float[np.ndarray, "3"]:
-        """Return a sample's offset; the middle of the row is where the first sample was."""
+        """Return a sample's offset from its place in the world, which is the middle of the row."""
         return self.right * self.spacing * (index - (len(self.pivots) - 1) / 2)
 
     def fov_in(self, aspect: float) -> float:
@@ -64,7 +64,7 @@ class Arrangement:
         return 2 * math.atan(math.tan(self.fov / 2) * max(1.0, self.aspect / aspect))
 
     def beside(self, index: int, part: Gaussians) -> Gaussians:
-        """Return the Gaussians that reach at most half-way to a neighbour; all of them for a single sample."""
+        """Return the Gaussians that reach at most half-way to a neighbour, and all of them for a single sample."""
         if len(self.pivots) == 1:
             return part
         reach = (part.means - self.pivots[index].to(part.means)).norm(dim=-1) + 2 * part.scales.amax(-1)
@@ -122,9 +122,10 @@ class SplatView:
     @property
     def visible(self) -> list[Sample]:
         """The samples on the page: the chosen one (or the first, if its number does not exist), or all."""
-        samples = self.samples
-        chosen = self.chosen
-        return samples if chosen is None or not samples else [samples[chosen if chosen < len(samples) else 0]]
+        if self.chosen is None or not self.samples:
+            return self.samples
+        index = self.chosen if self.chosen < len(self.samples) else 0
+        return [self.samples[index]]
 
     def set_up(self, up: Sequence[float]) -> None:
         """Set the direction up, and make the next drawing be seen from the front, because it shows another scene."""
@@ -140,7 +141,7 @@ class SplatView:
             self.refresh()
 
     def refresh(self) -> None:
-        """Draw the state of the attributes; move the cameras of browsers only if the arrangement has changed."""
+        """Draw the state of the attributes, and move the cameras of browsers only if the arrangement has changed."""
         with self._lock, self.server.atomic():
             samples = self.visible
             if not samples:
@@ -162,7 +163,8 @@ class SplatView:
             start.position = view.position
             start.look_at = view.look_at
             start.fov = view.fov
-            for browser in list(self.server.get_clients().values()) if client is None else [client]:
+            browsers = list(self.server.get_clients().values()) if client is None else [client]
+            for browser in browsers:
                 camera = browser.camera
                 with browser.atomic():
                     camera.up_direction = self.up
@@ -172,7 +174,7 @@ class SplatView:
                         camera.fov = view.fov_in(camera.image_width / camera.image_height)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """Fit the view to a new browser's window, even a phone's; show a notice until it has drawn an image."""
+        """Fit the view to a new browser's window, even a phone's, and show a notice until it has drawn an image."""
         last_aspect: float | None = None
 
         def fit(camera: viser.CameraHandle) -> None:
@@ -195,24 +197,25 @@ class SplatView:
         scenes = [sample.for_viewers().seen_from(sample.reference.centers) for sample in samples]
         if self.depth:
             scenes = depth_colored(scenes, [sample.reference for sample in samples])
-        wanted = {}
+        earlier = self._splats
+        self._splats = {}
+        names = {f"/sample_{i}/layer_{layer}" for i, sample in enumerate(samples) for layer in range(sample.layers)}
+        for name in earlier.keys() - names:
+            earlier[name].remove()
         for i, (sample, scene) in enumerate(zip(samples, scenes, strict=True)):
             size = scene.count // sample.layers  # Gaussians are ordered by layer, row, column
             for layer in range(sample.layers):
-                gaussians = arrangement.beside(i, scene[layer * size : (layer + 1) * size])
-                wanted[f"/sample_{i}/layer_{layer}"] = gaussians, arrangement.shift(i), layer
-        for name in self._splats.keys() - wanted.keys():
-            self._splats.pop(name).remove()
-        for name, (gaussians, shift, layer) in wanted.items():
-            arrays, scale = to_splats(gaussians)
-            handle = self._splats.get(name)
-            if handle is None:
-                handle = self._splats[name] = self.server.scene.add_gaussian_splats(name, **arrays)
-            else:
-                handle.set_gaussians(**arrays)
-            handle.scale = scale
-            handle.position = shift
-            handle.visible = layer not in self.hidden_layers
+                name = f"/sample_{i}/layer_{layer}"
+                arrays, scale = to_splats(arrangement.beside(i, scene[layer * size : (layer + 1) * size]))
+                handle = earlier.get(name)
+                if handle is None:
+                    handle = self.server.scene.add_gaussian_splats(name, **arrays)
+                else:
+                    handle.set_gaussians(**arrays)
+                handle.scale = scale
+                handle.position = arrangement.shift(i)
+                handle.visible = layer not in self.hidden_layers
+                self._splats[name] = handle
 
     def _draw_cameras(self, samples: Sequence[Sample], arrangement: Arrangement) -> None:
         for frustum in self._frusta:
@@ -220,20 +223,31 @@ class SplatView:
         self._frusta = []
         for i, sample in enumerate(samples):
             reference = sample.reference
-            up = reference.intrinsics.new_tensor(self.up.tolist())
-            around = orbit(reference, arrangement.pivots[i], up, 12)
-            groups = {"reference": (reference[None], REFERENCE_COLOR), "orbit": (around, ORBIT_COLOR)}
-            look: Any = {"scale": 0.08 * arrangement.distance, "thickness": 1.5, "thickness_units": "screen"}
-            for name in self.cameras & groups.keys():
-                cameras, color = groups[name]
-                height, width = cameras.image_size
-                for j, (pose, intrinsics) in enumerate(zip(cameras.camera_to_world, cameras.intrinsics, strict=True)):
-                    place = f"/cameras/{i}/{name}/{j}"
-                    fov = 2 * math.atan(height / 2 / intrinsics[1, 1].item())
-                    frustum = self.server.scene.add_camera_frustum(place, fov, width / height, color=color, **look)
-                    frustum.wxyz = matrix_to_quaternion(pose[:3, :3]).cpu().numpy()
-                    frustum.position = pose[:3, 3].cpu().numpy() + arrangement.shift(i)
-                    self._frusta.append(frustum)
+            if "reference" in self.cameras:
+                self._add_frusta(f"/cameras/{i}/reference", reference[None], REFERENCE_COLOR, i, arrangement)
+            if "orbit" in self.cameras:
+                up = reference.intrinsics.new_tensor(self.up.tolist())
+                around = orbit(reference, arrangement.pivots[i], up, 12)
+                self._add_frusta(f"/cameras/{i}/orbit", around, ORBIT_COLOR, i, arrangement)
+
+    def _add_frusta(
+        self, name: str, cameras: Cameras, color: tuple[int, int, int], sample: int, arrangement: Arrangement
+    ) -> None:
+        """Draw the frusta of a sample's cameras at the sample's place."""
+        height, width = cameras.image_size
+        for j, (pose, intrinsics) in enumerate(zip(cameras.camera_to_world, cameras.intrinsics, strict=True)):
+            frustum = self.server.scene.add_camera_frustum(
+                f"{name}/{j}",
+                fov=2 * math.atan(height / 2 / intrinsics[1, 1].item()),
+                aspect=width / height,
+                scale=0.08 * arrangement.distance,
+                thickness=1.5,
+                thickness_units="screen",
+                color=color,
+            )
+            frustum.wxyz = matrix_to_quaternion(pose[:3, :3]).cpu().numpy()
+            frustum.position = pose[:3, 3].cpu().numpy() + arrangement.shift(sample)
+            self._frusta.append(frustum)
 
 
 def to_splats(gaussians: Gaussians) -> tuple[dict[str, Any], float]:
@@ -248,8 +262,13 @@ def to_splats(gaussians: Gaussians) -> tuple[dict[str, Any], float]:
     unit = replace(finite, means=finite.means / scale, scales=finite.scales / scale)
     colors = round_to_uint8(finite.colors * 255)
     opacities = round_to_uint8(finite.opacities[:, None] * 255)
-    arrays = {"centers": unit.means.float().numpy(), "covariances": unit.covariances().float().numpy()}
-    return arrays | {"rgbs": colors, "opacities": opacities}, scale
+    arrays = {
+        "centers": unit.means.float().numpy(),
+        "covariances": unit.covariances().float().numpy(),
+        "rgbs": colors,
+        "opacities": opacities,
+    }
+    return arrays, scale
 
 
 def depth_colored(scenes: Sequence[Gaussians], cameras: Sequence[Cameras]) -> list[Gaussians]:

@@ -58,7 +58,7 @@ def test_programs_are_found_on_the_path_or_come_with_how_to_get_them(tmp_path, m
     ("cuda", "mps", "device"), [(True, False, "cuda"), (False, True, "mps"), (False, False, "cpu")]
 )
 def test_the_device_that_is_used_is_named(cuda, mps, device, monkeypatch):
-    monkeypatch.setattr("completesplat.results.machine.machine", lambda: {"processor": "any"})
+    monkeypatch.setattr("completesplat.evaluation.provenance.machine", lambda: {"processor": "any"})
     monkeypatch.setattr("torch.cuda.is_available", lambda: device == "cuda")
     monkeypatch.setattr("torch.backends.mps.is_available", lambda: device == "mps")
     lines = findings(doctor.devices)

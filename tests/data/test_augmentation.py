@@ -11,10 +11,10 @@ from torch import Tensor
 
 from completesplat.data.loading.augmentation import (
     HUE,
+    Augmentation,
     BoxMasks,
     CameraJitter,
     ColorJitter,
-    augment,
     jittered,
     mirrored,
 )
@@ -64,9 +64,9 @@ def test_a_mirrored_scene_shows_mirrored_points_at_mirrored_pixels() -> None:
 def test_a_scene_depends_on_the_seed_only_and_not_on_earlier_draws() -> None:
     used = rng(5)
     used.random(100)
-    first, again = (augment(scene(), draw, STRONG, BoxMasks(1.0), horizontal_flip=True) for draw in (rng(5), used))
+    first, again = (Augmentation(STRONG, BoxMasks(1.0), horizontal_flip=True)(scene(), draw) for draw in (rng(5), used))
     assert same(first, again)
-    other = augment(scene(), rng(6), STRONG, BoxMasks(1.0), horizontal_flip=True)
+    other = Augmentation(STRONG, BoxMasks(1.0), horizontal_flip=True)(scene(), rng(6))
     assert not torch.equal(first.reference.images, other.reference.images)
     assert not torch.equal(first.visible, other.visible)
 
@@ -77,10 +77,10 @@ def was_mirrored(changed: SceneBatch) -> bool:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_no_part_depends_on_whether_the_others_are_switched_on(seed: int) -> None:
-    everything = augment(scene(), rng(seed), STRONG, BoxMasks(), horizontal_flip=True)
-    jitter = augment(scene(), rng(seed), STRONG, None, horizontal_flip=False)
-    boxes = augment(scene(), rng(seed), None, BoxMasks(), horizontal_flip=False)
-    flipped = augment(scene(), rng(seed), None, None, horizontal_flip=True)
+    everything = Augmentation(STRONG, BoxMasks(), horizontal_flip=True)(scene(), rng(seed))
+    jitter = Augmentation(STRONG, None, horizontal_flip=False)(scene(), rng(seed))
+    boxes = Augmentation(None, BoxMasks(), horizontal_flip=False)(scene(), rng(seed))
+    flipped = Augmentation(None, None, horizontal_flip=True)(scene(), rng(seed))
     assert same(replace(boxes, visible=scene().visible), scene())
     assert torch.equal(everything.visible, boxes.visible)
     assert was_mirrored(everything) == was_mirrored(flipped)
@@ -90,14 +90,14 @@ def test_no_part_depends_on_whether_the_others_are_switched_on(seed: int) -> Non
 
 def test_every_other_scene_is_mirrored() -> None:
     """The number among 100 draws lies within 4 standard deviations of its mean."""
-    count = sum(was_mirrored(augment(scene(), rng(seed), None, None, horizontal_flip=True)) for seed in range(100))
+    count = sum(was_mirrored(Augmentation(None, None, horizontal_flip=True)(scene(), rng(seed))) for seed in range(100))
     assert abs(count - 50) < 4 * (100 * 0.25) ** 0.5
 
 
 def test_reference_and_targets_get_the_same_jitter_and_the_rest_stays() -> None:
     before = scene()
     alike = replace(before, targets=replace(before.targets, images=before.reference.images.repeat(3, 1, 1, 1)))
-    after = augment(alike, rng(4), STRONG, None, horizontal_flip=False)
+    after = Augmentation(STRONG, None, horizontal_flip=False)(alike, rng(4))
     assert not torch.allclose(after.reference.images, before.reference.images, atol=1e-2)
     assert torch.equal(after.targets.images, after.reference.images.expand(3, -1, -1, -1))
     assert same(replace(after, reference=before.reference, targets=before.targets), before)

@@ -14,7 +14,7 @@ from PIL import Image
 from support import change_json, exif_turned, flip_bit, write_capture
 
 from completesplat.data.captures import transforms_json
-from completesplat.data.captures.capture import CapturedFrame
+from completesplat.data.captures.captured_frames import CapturedFrame
 from completesplat.data.captures.colmap import read_colmap
 from completesplat.data.captures.module import CaptureDataModule, members
 from completesplat.data.captures.transforms_json import read_photographs, read_transforms

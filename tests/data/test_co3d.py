@@ -9,11 +9,12 @@ from plyfile import PlyData
 from realestate10k_trees import epoch, equal, same
 from support import change_json
 
+from completesplat.data.co3d.category import Filters, SplitMembers, read_category
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.source import object_placement
-from completesplat.data.co3d.splits import Filters, SeededSplit, SplitMembers, read_category
 from completesplat.data.loading.scenes import SceneStore
-from completesplat.data.toy.writing import SUBSET
+from completesplat.data.splits import SeededSplit
+from completesplat.data.toy.data_sets import SUBSET
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import project
 from completesplat.scene import SceneBatch

@@ -10,8 +10,9 @@ import pytest
 from support import change_json
 
 from completesplat.commands.data import prepare
+from completesplat.data.co3d.category import Category, Filters, read_category
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.co3d.splits import Category, Filters, SeededSplit, read_category
+from completesplat.data.splits import SeededSplit
 from completesplat.errors import BadCamera, DataError, OutsidePath
 
 SPLITS = ("train", "val", "test")

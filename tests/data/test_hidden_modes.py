@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from completesplat.data.hidden_modes import DIFFERENCE
-from completesplat.data.packed.writing import prepare
-from completesplat.data.rendered.drawing import PAINTS
+from completesplat.data.loading.hidden_modes import DIFFERENCE
+from completesplat.data.packed.preparation import prepare
+from completesplat.data.rendered.random_scenes import PAINTS
 from completesplat.data.rendered.rendering import RenderedDataModule
+from completesplat.data.toy.data_sets import draw_category
 from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS, render_frame
 from completesplat.data.toy.raytracing import trace
-from completesplat.data.toy.writing import draw_category
 from completesplat.errors import BadAnnotation, CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
 

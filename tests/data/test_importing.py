@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from support import write_capture
 
 from completesplat.data.captures import importing
-from completesplat.data.captures.capture import CapturedFrame
+from completesplat.data.captures.captured_frames import CapturedFrame
 from completesplat.data.captures.importing import image_pairs, import_capture
 from completesplat.data.captures.module import read_capture
 from completesplat.errors import CompleteSplatError, DataError
@@ -125,7 +125,7 @@ def test_photos_become_upright_keep_their_focal_length_and_the_unusable_are_name
     assert "left out: 1 file of other formats: notes.txt" in caplog.text
     assert f"left out: {tmp_path / 'cut.jpg'}: cannot be decoded" in caplog.text
     full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
-    monkeypatch.setattr(importing.files, "save_image", full)
+    monkeypatch.setattr(importing.saving, "save_image", full)
     with pytest.raises(OSError, match="No space left"):
         importing._copy_photos(tmp_path, images)
 
@@ -213,7 +213,7 @@ def test_pycolmap_leaves_the_signal_that_ends_a_program_to_the_program():
     lines = [
         "import os, signal, sys",
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit(9))",
-        "from completesplat.data.captures.capture import import_pycolmap",
+        "from completesplat.data.captures.captured_frames import import_pycolmap",
         "import_pycolmap()",
         "os.kill(os.getpid(), signal.SIGTERM)",
     ]

@@ -10,6 +10,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from realestate10k_trees import epoch, equal, make_clip, module, same, write_tree
 
 from completesplat.data.loading.data_module import SceneDataModule
+from completesplat.data.loading.data_set import SceneDataSet
 from completesplat.data.loading.loader import EpochSampler, SceneLoader
 from completesplat.errors import BadCamera, BadImage, CompleteSplatError, DataError
 from completesplat.scene import SceneBatch
@@ -227,13 +228,15 @@ def test_too_many_are_an_error_that_names_the_share_and_the_last(tmp_path):
         list(module(one_bad, max_bad_fraction=0.0).test_dataloader())
 
 
-def test_nothing_that_can_be_read_and_an_unknown_policy_are_errors(tmp_path):
+def test_nothing_that_can_be_read_and_settings_that_make_no_sense_are_errors(tmp_path):
     data = module(make_tree(tmp_path, " ".join(KEYS)), max_bad_fraction=2.0)
     for loader in (data.train_dataloader(), data.test_dataloader()):
         with pytest.raises(DataError, match="items cannot be read"):
             list(loader)
     with pytest.raises(CompleteSplatError, match=r"data\.on_bad=ignore: choose one of skip, raise"):
-        check_value("data.on_bad", hints_of(SceneDataModule.__init__)["on_bad"], "ignore")
+        check_value("data.on_bad", hints_of(SceneDataSet.__init__)["on_bad"], "ignore")
+    with pytest.raises(CompleteSplatError, match=r"data\.targets=-1: must be at least 0"):
+        check_value("data.targets", hints_of(SceneDataModule.__init__)["targets"], -1)
 
 
 @pytest.mark.parametrize("limit", [1.0, 3])

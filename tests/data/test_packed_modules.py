@@ -11,7 +11,8 @@ from realestate10k_trees import equal, make_clip, write_tree
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.realestate10k.module import RE10KDataModule
-from completesplat.data.toy.writing import SUBSET
+from completesplat.data.tolerance import ErrorTolerance
+from completesplat.data.toy.data_sets import SUBSET
 from completesplat.errors import DataError
 
 
@@ -65,7 +66,7 @@ def test_packed_tours_give_the_same_batches(tours, tmp_path):
 def test_an_evaluation_index_uses_original_frame_numbers_even_if_frames_were_left_out(tours, tmp_path):
     root = write_tours(tmp_path / "broken")
     sorted((root / "test/test0").glob("*.jpg"), key=lambda path: int(path.stem))[2].write_bytes(b"")
-    store = prepared(clips(root), tmp_path / "store", policy=("skip", 0.5))
+    store = prepared(clips(root), tmp_path / "store", tolerance=ErrorTolerance("skip", 0.5))
     (tmp_path / "index.json").write_text(json.dumps({"test0": {"context": [0, 5], "target": [1, 3, 4]}}))
     chosen = {"evaluation_index": str(tmp_path / "index.json")}
     assert equal(*(list(clips(place, **chosen).test_dataloader()) for place in (tours, store)))

@@ -13,7 +13,7 @@ from support import flip_bit, serving
 
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.packed.source import PackedSource, local_root
-from completesplat.data.toy.writing import SUBSET
+from completesplat.data.toy.data_sets import SUBSET
 from completesplat.errors import ChangedFile, DataError, MissingFile
 
 pytestmark = pytest.mark.processes

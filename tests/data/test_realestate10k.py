@@ -121,11 +121,11 @@ def test_evaluation_goes_from_the_first_frame_to_those_that_follow(root):
 def test_a_model_sees_images_made_as_its_training_images_were_whatever_size_is_scored(root):
     small, large = module(root, image_size=8), module(root, image_size=HEIGHT)
     expected = list(module(root, image_size=HEIGHT).test_dataloader())
-    large.at_model_size = small
-    for batch, truth, seen in zip(large.test_dataloader(), expected, small.test_dataloader(), strict=True):
+    large.low_resolution = small
+    for batch, truth, model_input in zip(large.test_dataloader(), expected, small.test_dataloader(), strict=True):
         assert same(batch, truth)
-        assert same(batch.seen, seen)
-        assert same(batch[0].seen, seen[0])
+        assert same(batch.low_resolution, model_input)
+        assert same(batch[0].low_resolution, model_input[0])
 
 
 def test_the_evaluation_index_and_the_scene_list_decide(root, tmp_path, caplog):
@@ -178,7 +178,7 @@ def test_what_is_not_there_or_makes_no_sense_is_refused(tmp_path):
         module(tmp_path).setup("fit")
     with pytest.raises(DataError, match="no train sequences"):
         module(write_tree(tmp_path, "text", TRAIN[:1], TEST)).setup("fit")
-    for setting in ({"min_gap": 0}, {"min_gap": 5}, {"near": 0.0}, {"scale": -1.0}, {"targets": -1}):
+    for setting in ({"min_gap": 0}, {"min_gap": 5}, {"near": 0.0}, {"scale": -1.0}):
         with pytest.raises(CompleteSplatError, match="data"):
             module(tmp_path, **setting)
 
@@ -186,13 +186,13 @@ def test_what_is_not_there_or_makes_no_sense_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("index", "kind"), [('{"a": 1}', BadAnnotation), ("[]", BadAnnotation), ("{", UnreadableFile), (None, DataError)]
 )
-def test_a_folder_without_any_use_is_raised_under_either_policy(tmp_path, index, kind):
+def test_a_folder_without_any_use_is_raised_under_either_rule(tmp_path, index, kind):
     (tmp_path / "train").mkdir()
     if index is not None:
         (tmp_path / "train/index.json").write_text(index)
-    for policy in ("raise", "skip"):
+    for on_bad in ("raise", "skip"):
         with pytest.raises(kind, match=str(tmp_path / "train")):
-            module(tmp_path, on_bad=policy).setup("fit")
+            module(tmp_path, on_bad=on_bad).setup("fit")
 
 
 def test_annotations_that_cannot_be_used_are_raised_or_skipped_with_a_line(tmp_path, caplog):

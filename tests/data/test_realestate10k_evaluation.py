@@ -94,7 +94,7 @@ def test_a_list_of_keys_is_one_key_a_line(root, tmp_path):
 def test_views_that_clips_lack_are_refused_before_training_and_by_the_check(root, tmp_path):
     index = {f"test{i}": PAIR if i < 2 else {"context": [2], "target": [3, 8]} for i in range(4)}
     data = data_of(root, index, tmp_path)
-    found = check({"test": data.evaluated("test", data.source("test"))}, workers=1, progress=False)
+    found = check({"test": data.select_sequences("test", data.source("test"))}, workers=1, progress=False)
     assert (found.sequences, found.frames) == (2, 16)
     lacking = "test2, frame 8: the frame is in the evaluation index, not in the data"
     assert [str(error) for error in found.refused] == [lacking, lacking.replace("test2", "test3")]

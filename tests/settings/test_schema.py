@@ -6,7 +6,8 @@ from typing import Annotated, Any, Literal, TypedDict
 import pytest
 
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.schema import Entries, Natural, Positive, Range, check_settings
+from completesplat.quantities import Entries, Natural, Positive, Range
+from completesplat.settings.schema import check_settings
 
 
 class Part(TypedDict):

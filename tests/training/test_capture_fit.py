@@ -6,14 +6,14 @@ from PIL import Image
 from support import compose_config, interrupted_at, strict_json, write_capture
 
 from completesplat.commands.fit import refuse_without_effect
-from completesplat.data.captures.capture import CapturedFrame
+from completesplat.data.captures.captured_frames import CapturedFrame
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_transforms
 from completesplat.errors import CompleteSplatError
 from completesplat.export import prediction
 from completesplat.export.ply import read_ply
 from completesplat.export.reading import read_gaussians
-from completesplat.training.capture import CaptureFit
+from completesplat.training.capture_fit import CaptureFit
 
 FRAMES, STEPS = 9, 8
 FITTING = {"initial": 200, "most": 260, "refine_every": 2}
@@ -114,7 +114,7 @@ def test_settings_of_a_sweep_may_be_without_effect_in_one_of_its_jobs(tmp_path):
     (job / "run.json").write_text('{"overrides": ["optimizer.lr=1"]}')
     with pytest.raises(CompleteSplatError, match=r"optimizer\.lr=1: CaptureFit does nothing with it"):
         refuse_without_effect(config, job)
-    (tmp_path / "sweep/multirun.yaml").touch()
+    (job / "run.json").write_text('{"overrides": ["optimizer.lr=1"], "sweep": {"folder": "../..", "job": 0}}')
     refuse_without_effect(config, job)
 
 

@@ -195,7 +195,7 @@ def test_a_thumbnail_makes_its_sample_large_and_a_key_shows_all(tab, page):
     assert place(both, BALLS["red"][1])[1] < both.shape[1] / 2  # of the first sample, on the left
     tab.locator("canvas").first.press("1")
     changed(tab, both)
-    assert page.looking.chosen.value == "sample 1"
+    assert page.view_controls.chosen.value == "sample 1"
     page.show([first])
 
 

@@ -18,11 +18,11 @@ from viewer_scenes import SETTINGS, balls_sample
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import with_screen_space_dilation
+from completesplat.export.description import write_scene_json
 from completesplat.export.formats import write_splat
 from completesplat.export.images import to_pixels
 from completesplat.export.mesh import Mesh
 from completesplat.export.ply import read_ply, write_ply
-from completesplat.export.prediction import write_scene_json
 from completesplat.geometry.cameras import look_at
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -99,8 +99,8 @@ def png(width: int = 40, height: int = 40, mode: str = "RGB") -> bytes:
 
 def load(page: Page, name: str = "photo.png", content: bytes | None = None, browser: Browser | None = None) -> list:
     """Upload a file, and return the samples on the page when no job is left."""
-    page.opening.upload._impl.value = SimpleNamespace(name=name, content=content or png())
-    return press(page, page.opening.upload, browser)
+    page.file_controls.upload._impl.value = SimpleNamespace(name=name, content=content or png())
+    return press(page, page.file_controls.upload, browser)
 
 
 def nodes(page: Page) -> dict[str, object]:
@@ -111,15 +111,15 @@ def test_layers_are_switched_and_samples_chosen_and_placed(page):
     page.show([balls_sample(layers=4), balls_sample(layers=2)])
     first, second = ({f"/sample_{i}/layer_{j}": 600 // of for j in range(of)} for i, of in enumerate((4, 2)))
     assert {name: len(node.centers) for name, node in nodes(page).items()} == dict.fromkeys(list(first), 150)
-    page.looking.chosen.value = SIDE_BY_SIDE
+    page.view_controls.chosen.value = SIDE_BY_SIDE
     assert nodes(page).keys() == (first | second).keys()
-    page.looking.layers[1].value = False
+    page.view_controls.layers[1].value = False
     hidden = {name for name, node in nodes(page).items() if not node.visible}
     assert hidden == {"/sample_0/layer_1", "/sample_1/layer_1"}
-    page.looking.layers[1].value = True
+    page.view_controls.layers[1].value = True
     assert all(node.visible for node in nodes(page).values())
     assert len({tuple(node.position) for node in nodes(page).values()}) == 2
-    page.looking.chosen.value = "sample 2"
+    page.view_controls.chosen.value = "sample 2"
     assert {name: len(node.centers) for name, node in nodes(page).items()} == dict.fromkeys(list(first)[:2], 300)
     assert {tuple(node.position) for node in nodes(page).values()} == {(0.0, 0.0, 0.0)}
 
@@ -127,15 +127,15 @@ def test_layers_are_switched_and_samples_chosen_and_placed(page):
 def test_keys_and_thumbnails_choose_a_sample(page):
     page.show([balls_sample()] * 3)
     finish(page)
-    thumbnails = page.looking.thumbnails
+    thumbnails = page.view_controls.thumbnails
     assert thumbnails.content.count("<img") == 3
     assert "key:'3'" in thumbnails.content
     first = thumbnails.content
     keys = ("2", 1, "sample 2"), ("4", 1, "sample 2"), ("9", 1, "sample 2"), ("0", None, SIDE_BY_SIDE)
     for digit, chosen, value in keys:
-        for callback in page.looking.keys[digit]._impl.trigger_cb:
-            callback(viser.CommandEvent(client=Browser(), client_id=0, target=page.looking.keys[digit]))
-        assert (page.view.chosen, page.looking.chosen.value) == (chosen, value)
+        for callback in page.view_controls.keys[digit]._impl.trigger_cb:
+            callback(viser.CommandEvent(client=Browser(), client_id=0, target=page.view_controls.keys[digit]))
+        assert (page.view.chosen, page.view_controls.chosen.value) == (chosen, value)
     assert len({tuple(node.position) for node in nodes(page).values()}) == 3
     assert thumbnails.content != first  # none is marked
     page.show([balls_sample()])
@@ -173,15 +173,15 @@ def test_the_photo_of_a_predictions_folder_is_in_the_panel_and_a_damaged_one_ref
 def test_depth_replaces_colours_and_frusta_stand_at_the_cameras(page):
     red = nodes(page)["/sample_0/layer_0"].rgbs.copy()
     for depth in (True, False):
-        page.looking.depth.value = depth
+        page.view_controls.depth.value = depth
         assert (nodes(page)["/sample_0/layer_0"].rgbs == red).all() == (not depth)
-    page.looking.cameras["orbit"].value = True
+    page.view_controls.cameras["orbit"].value = True
     frusta = page.view._frusta
     assert frusta[0].position == pytest.approx(np.zeros(3), abs=1e-5)  # the orbit starts at the reference camera
     middle = np.stack([f.position for f in frusta]).mean(axis=0)
     assert middle == pytest.approx(page.view.samples[0].pivot().numpy(), abs=1e-4)
     assert frusta[0].fov == pytest.approx(np.radians(50), abs=1e-5)
-    page.looking.cameras["orbit"].value = False
+    page.view_controls.cameras["orbit"].value = False
     assert page.view._frusta == []
 
 
@@ -201,7 +201,7 @@ def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(comple
         assert torch.equal(sample.gaussians.means, expected.means)
         assert torch.equal(sample.gaussians.scales, expected.scales)
     assert "photo.png" in completion.controls.preview.content
-    assert completion.page.looking.chosen.options == ("sample 1", "sample 2", "all, side by side")
+    assert completion.page.view_controls.chosen.options == ("sample 1", "sample 2", "all, side by side")
     assert [sample.finished for sample in seen] == [False, False, True]
     assert said[:2] == ["completesplat: reading photo.png", "completesplat: drawing from photo.png"]
     assert said[-1].startswith("completesplat: 2 drawn in ")
@@ -232,7 +232,7 @@ def test_an_uploaded_scene_is_shown_from_the_front_with_switches_for_its_layers(
     (sample,) = load(page, "some balls.SPLAT", (tmp_path / "a.splat").read_bytes())
     assert torch.equal(sample.gaussians.means, scene.means)
     assert page.view.up.tolist() == [0, -1, 0]
-    assert [box.visible for box in page.looking.layers] == [True] + [False] * 15
+    assert [box.visible for box in page.view_controls.layers] == [True] + [False] * 15
     assert load(completion.page)[0].settings["image"] == "photo.png"
     assert page.view.up.tolist() == completion.model.up.tolist()
 
@@ -242,7 +242,7 @@ def test_an_upload_is_dropped_when_it_is_read_or_refused_and_any_error_is_shown(
     load(page, browser=browser)
     without_weights = "photo.png: not .ply, .splat, .spz, .sog, .ksplat; images need completesplat view IMAGE"
     assert browser.messages == [without_weights]
-    assert page.opening.upload.value.content == b""
+    assert page.file_controls.upload.value.content == b""
     said = titles(page, monkeypatch)
     monkeypatch.setattr(page, "open", lambda *_: 1 / 0)
     load(page, "a.ply", b"ply", browser)
@@ -260,18 +260,18 @@ def test_one_of_several_scenes_is_chosen(server, tmp_path):
     scenes = {"a": tmp_path / "a", "b": tmp_path / "b"}
     made = Page(server, view, Saver(tmp_path, view, ReferenceRasterizer, 2, 0.5), scenes)
     made.saver.thumbnail = lambda *_: np.zeros((2, 2, 3), np.uint8)
-    assert (made.opening.chosen.visible, made.opening.chosen.options) == (True, ("a", "b"))
+    assert (made.file_controls.chosen.visible, made.file_controls.chosen.options) == (True, ("a", "b"))
     for name, count in (("b", 3), ("a", 2)):
-        made.opening.chosen.value = name
+        made.file_controls.chosen.value = name
         assert len(finish(made)) == count
     write_splat(tmp_path / "c.splat", balls_sample().gaussians)
     assert len(load(made, "c.splat", (tmp_path / "c.splat").read_bytes())) == 1
-    assert made.opening.chosen.value == "loaded: c.splat"
-    made.opening.chosen.value = "a"
-    assert (len(finish(made)), made.opening.chosen.options) == (2, ("a", "b"))
+    assert made.file_controls.chosen.value == "loaded: c.splat"
+    made.file_controls.chosen.value = "a"
+    assert (len(finish(made)), made.file_controls.chosen.options) == (2, ("a", "b"))
     browser = Browser()
     (tmp_path / "a/sample_01.ply").write_text("nothing")
-    press(made, made.opening.chosen, browser)
+    press(made, made.file_controls.chosen, browser)
     assert "sample_01.ply: not a .ply file" in browser.messages[0]
     made.worker.close()
 
@@ -309,7 +309,7 @@ def test_a_refusal_goes_to_its_browser_and_changes_nothing(completion, monkeypat
     press(completion.page, completion.controls.draw, browser)
     assert load(completion.page, "notes.txt", b"no image", browser) is before
     completion.page.show([])
-    press(completion.page, completion.page.saving.save, browser)
+    press(completion.page, completion.page.save_controls.save, browser)
     for message, start in zip(browser.messages, ("load an", "notes.txt: not an", "there is nothing"), strict=True):
         assert message.startswith(start)
     assert other.messages == []
@@ -328,7 +328,7 @@ def drawing(completion: Completion, monkeypatch: pytest.MonkeyPatch) -> threadin
 
 def test_the_page_answers_while_the_model_works(completion, monkeypatch):
     release = drawing(completion, monkeypatch)
-    completion.page.looking.layers[0].value = False
+    completion.page.view_controls.layers[0].value = False
     assert not nodes(completion.page)["/sample_0/layer_0"].visible
     assert completion.controls.progress.visible
     release.set()
@@ -368,7 +368,7 @@ def test_samples_stand_upright_after_a_scene_with_another_direction_up(completio
 def test_an_upload_is_opened_after_the_drawing_that_it_waits_for(completion, monkeypatch, tmp_path):
     release = drawing(completion, monkeypatch)
     write_ply(tmp_path / "a.ply", balls_sample().gaussians)
-    upload = completion.page.opening.upload
+    upload = completion.page.file_controls.upload
     upload._impl.value = SimpleNamespace(name="a.ply", content=(tmp_path / "a.ply").read_bytes())
     press(completion.page, upload, wait=False)
     release.set()
@@ -384,9 +384,9 @@ def test_files_are_written_and_sent_to_their_browser(page, kind, tmp_path, monke
     browser, converter = Browser(), fake_converter.install(tmp_path / "bin", "splat-transform")
     monkeypatch.setenv("PATH", str(converter.parent), prepend=os.pathsep)
     page.show([balls_sample(), balls_sample()])
-    page.looking.chosen.value = SIDE_BY_SIDE
-    page.saving.kind.value = kind
-    press(page, page.saving.save, browser)
+    page.view_controls.chosen.value = SIDE_BY_SIDE
+    page.save_controls.kind.value = kind
+    press(page, page.save_controls.save, browser)
     assert sorted(browser.files) == FILES[kind]
     assert browser.messages == [f"{', '.join(sorted(browser.files))} in {page.saver.folder}"]
     for file, content in browser.files.items():
@@ -395,11 +395,11 @@ def test_files_are_written_and_sent_to_their_browser(page, kind, tmp_path, monke
 
 def test_saving_again_overwrites_nothing_and_takes_the_chosen_sample(page):
     page.show([balls_sample(), balls_sample()])
-    page.looking.chosen.value = "sample 2"
+    page.view_controls.chosen.value = "sample 2"
     for _ in range(2):
-        press(page, page.saving.save)
-    page.saving.kind.value = "splat"
-    press(page, page.saving.save)
+        press(page, page.save_controls.save)
+    page.save_controls.kind.value = "splat"
+    press(page, page.save_controls.save)
     files = ["sample_00.ply", "sample_01.ply", "sample_02.splat"]
     assert sorted(path.name for path in page.saver.folder.iterdir()) == files
 
@@ -409,7 +409,7 @@ def test_each_click_saves_what_it_saw_for_its_browser(page):
     page.show([balls_sample(layers=4)])
     page.worker.submit("drawing", lambda: release.wait(LIMIT))
     for browser in browsers:
-        press(page, page.saving.save, browser, wait=False)
+        press(page, page.save_controls.save, browser, wait=False)
     other = replace(balls_sample(), gaussians=balls_sample().gaussians[:5])
     page.show([other])
     release.set()
@@ -423,7 +423,7 @@ def test_a_fault_in_saving_goes_to_its_browser(page, monkeypatch, caplog):
     monkeypatch.setattr(page.server, "get_clients", lambda: {0: browser, 1: other})
     monkeypatch.setattr(page.saver, "save", lambda *_: 1 / 0)
     with caplog.at_level(logging.CRITICAL):
-        press(page, page.saving.save, browser)
+        press(page, page.save_controls.save, browser)
     assert (browser.messages, other.messages) == (["ZeroDivisionError: division by zero"], [])
 
 

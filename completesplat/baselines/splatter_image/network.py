@@ -41,7 +41,7 @@ class ScaledConvolution(nn.Conv2d):
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions beside a shortcut, then optional attention with one head; each sum is scaled by sqrt(1/2)."""
+    """Two convolutions beside a shortcut, then optional attention with one head. Each sum is scaled by sqrt(1/2)."""
 
     def __init__(self, inputs: int, outputs: int, scale: str = "", attends: bool = False) -> None:
         super().__init__()
@@ -77,8 +77,8 @@ class SongUNet(nn.Module):
 
     Args:
         size: side of the images in pixels, a multiple of 8; levels are named after their sizes.
-        width: channels of the first level; all others have twice as many.
-        blocks: residual blocks per level on the way down; the way up has one more.
+        width: channels of the first level. All others have twice as many.
+        blocks: residual blocks per level on the way down. The way up has one more.
         attention: sizes of levels with attention: in every block on the way down, in the last on the way up.
     """
 

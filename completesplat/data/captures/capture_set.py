@@ -6,16 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from completesplat.data.captures.module import MODELS, TRANSFORMS, CaptureSource, read_captures
-from completesplat.data.co3d.splits import SeededSplit, split_by_seed
-from completesplat.data.loading.data_module import ObjectDataModule
+from completesplat.data.loading.object_data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
-from completesplat.data.sequences import SPLITS
+from completesplat.data.splits import SPLITS, SeededSplit, split_by_seed
 from completesplat.data.validation import field, read_json, require_file
 from completesplat.errors import BadAnnotation, MissingFile, SharedSequences, errors_at
-from completesplat.settings.schema import Natural, Share
+from completesplat.quantities import Natural, Share
 
 SPLITS_FILE = "splits.json"
-MARKS = {*TRANSFORMS, "keyframes", *(model.split("/")[0] for model in MODELS)}  # a folder with one is a capture
+MARKS = {"keyframes"}.union(TRANSFORMS, (model.split("/")[0] for model in MODELS))  # a folder with one is a capture
 
 
 def object_of(name: str) -> str:
@@ -56,7 +55,7 @@ def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
 
 
 class CaptureSetDataModule(ObjectDataModule):
-    """Scenes of many captures; all frames of a capture belong to the same split, as all captures of an object do.
+    """Scenes of many captures, where all frames of all captures of an object belong to the same split.
 
     The captures are the folders below `root`, at any depth, that hold one of `MARKS`. A capture's name
     is its path below `root`, and its object is the first folder of that path.
@@ -91,25 +90,30 @@ class CaptureSetDataModule(ObjectDataModule):
         return {"splits": self.splits, **self.seeded._asdict(), **self.framing._asdict()}
 
     def open(self, split: str) -> Mapping[str, CaptureSource]:
-        """Read the cameras of all captures; one that cannot be read is only refused, unless all are."""
+        """Read the cameras of all captures. One that cannot be read is only refused, unless all are."""
         if not self.root.is_dir():
             raise MissingFile("no such folder", str(self.root))
         folders = {folder.relative_to(self.root).as_posix(): folder for folder in _capture_folders(self.root)}
         captures, refused = read_captures(folders)
+        if refused and not captures:
+            raise refused[0]
         if not captures:
-            raise refused[0] if refused else MissingFile("no folders with transforms.json or sparse/0", str(self.root))
-        members = self._members(list(folders))
-        return {
-            name: CaptureSource({k: captures[k] for k in names if k in captures}, range, self.framing, refused)
-            for name, names in members.items()
-        }
+            raise MissingFile("no folders with transforms.json or sparse/0", str(self.root))
+        sources = {}
+        for part, names in self._members(list(folders)).items():
+            members = {name: captures[name] for name in names if name in captures}
+            sources[part] = CaptureSource(members, range, self.framing, refused)
+        return sources
 
     def _members(self, names: list[str]) -> dict[str, list[str]]:
         listed = self.root / SPLITS_FILE if self.splits is None else require_file(Path(self.splits))
         if listed.is_file():
             return read_splits(listed, names)
         objects = split_by_seed({object_of(name): [0] for name in names}, self.seeded)
-        return {split: [name for name in names if (object_of(name), 0) in objects[split]] for split in SPLITS}
+        members = {}
+        for split in SPLITS:
+            members[split] = [name for name in names if (object_of(name), 0) in objects[split]]
+        return members
 
 
 def _capture_folders(root: Path) -> list[Path]:

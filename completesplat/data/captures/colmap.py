@@ -11,7 +11,14 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fit_lens, in_order, warn_of_missing
+from completesplat.data.captures.captured_frames import (
+    Capture,
+    CapturedFrame,
+    Lens,
+    fit_lens,
+    in_order,
+    warn_of_missing,
+)
 from completesplat.data.validation import finite_array, path_below, read_text, require_file
 from completesplat.errors import BadAnnotation, BadCamera, DataError, MissingFile, UnreadableFile, errors_at
 from completesplat.geometry.rotations import quaternion_to_matrix
@@ -55,10 +62,12 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
 
 
 def is_model(folder: Path) -> bool:
+    """Return whether a folder holds a model."""
     return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
 
 
 def image_count(model: Path) -> int:
+    """Return the number of images of a model, 0 if it cannot be read."""
     suffix, read = _form(model)
     with suppress(DataError):
         return len(_parsed(len, read, model / f"images.{suffix}"))
@@ -67,11 +76,16 @@ def image_count(model: Path) -> int:
 
 def _form(model: Path) -> tuple[str, Callable[[Path], Iterator[Row]]]:
     """Return the suffix that most of the model's files have, and its reader."""
-    suffix = max(READERS, key=lambda suffix: sum((model / f"{name}.{suffix}").is_file() for name in PARTS))
+
+    def files(suffix: str) -> int:
+        return sum((model / f"{name}.{suffix}").is_file() for name in PARTS)
+
+    suffix = max(READERS, key=files)
     return suffix, READERS[suffix]
 
 
 def _parsed(parse: Callable[[Row], T], read: Callable[[Path], Iterator[Row]], path: Path) -> list[T]:
+    """Read and parse all rows of a file, or refuse a damaged one."""
     try:
         with errors_at(path):
             return [parse(row) for row in read(path)]
@@ -80,7 +94,7 @@ def _parsed(parse: Callable[[Row], T], read: Callable[[Path], Iterator[Row]], pa
 
 
 def _camera_of(row: Row) -> tuple[int, Lens]:
-    """Return a camera's number and lens; the parameters have the order of colmap.github.io/cameras.html."""
+    """Return a camera's number and lens. The parameters have the order of colmap.github.io/cameras.html."""
     number, kind, width, height, *rest = row
     size = (int(height), int(width))
     parameters = tuple(map(float, rest))
@@ -95,7 +109,7 @@ def _camera_of(row: Row) -> tuple[int, Lens]:
 
 
 def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | None) -> CapturedFrame:
-    """Return an image with its camera; a row has number, pose (qw, qx, qy, qz, tx, ty, tz), camera and name."""
+    """Return an image with its camera. A row has number, pose (qw, qx, qy, qz, tx, ty, tz), camera and name."""
     number = int(row[0])
     camera = int(row[8])
     name = str(row[9])
@@ -114,7 +128,8 @@ def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | 
 
 
 def _find_mask(masks: Path, name: str) -> Path:
-    appended, replaced = (path_below(masks, file) for file in (f"{name}.png", str(Path(name).with_suffix(".png"))))
+    appended = path_below(masks, f"{name}.png")
+    replaced = path_below(masks, str(Path(name).with_suffix(".png")))
     # `Path.is_file` raises if a name is too long.
     if not (isfile(appended) or isfile(replaced)):
         raise MissingFile(f"no such file, nor {replaced.name}", str(appended))
@@ -122,7 +137,7 @@ def _find_mask(masks: Path, name: str) -> Path:
 
 
 def _text_rows(path: Path) -> Iterator[Row]:
-    """Yield the entries of a text file; those of images have a second line for their features, which may be empty."""
+    """Yield the entries of a text file. Those of images have a second line for their features, which may be empty."""
     lines = map(str.strip, read_text(path).split("\n"))
     for line in lines:
         if line and not line.startswith("#"):
@@ -146,7 +161,10 @@ def _binary_rows(path: Path) -> Iterator[Row]:
     for _ in range(take("Q")[0]):
         if path.stem == "cameras":
             number, model, width, height = take("IiQQ")
-            kind, count = list(MODELS.items())[model] if 0 <= model < len(MODELS) else (model, 0)
+            kind = model
+            count = 0
+            if 0 <= model < len(MODELS):
+                kind, count = list(MODELS.items())[model]
             yield number, kind, width, height, *take(f"{count}d")
         elif path.stem == "images":
             numbers = take("I7dI")

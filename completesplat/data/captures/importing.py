@@ -13,15 +13,15 @@ from typing import Literal, Unpack
 from PIL import ImageOps
 from rich.progress import Progress, track
 
-from completesplat.data.captures.capture import FEWEST_FRAMES, import_pycolmap
+from completesplat.data.captures.captured_frames import FEWEST_FRAMES, import_pycolmap
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.turntable import TurntableSettings, import_turntables
-from completesplat.data.images import files
 from completesplat.data.sequences import first_names
 from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import DataError, refused_to
 from completesplat.files import atomic_folder, by_numbers, counted, folder_names
-from completesplat.settings.schema import Positive
+from completesplat.photo import files, saving
+from completesplat.quantities import Positive
 
 logger = logging.getLogger(__name__)
 leave_out = partial(logger.warning, "left out: %s")
@@ -39,7 +39,7 @@ def import_capture(
     out: Path,
     **turntable: Unpack[TurntableSettings],
 ) -> str:
-    """Check the cameras of captures, which COLMAP or a turntable gives first if asked to; return the next command."""
+    """Check the cameras of captures, which COLMAP or a turntable may give first, and return the next command."""
     if cameras == "turntable":
         import_turntables(Path(folder), out, turntable)
         return f"go on with: completesplat data show data=turntable {shlex.quote(f'data.root={out}')}"
@@ -68,7 +68,8 @@ def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> 
     if capture.exists():
         raise DataError("exists already: import it without cameras=colmap, or choose another out=DIR", str(capture))
     with atomic_folder(capture) as unfinished:
-        (images := unfinished / "images").mkdir()
+        images = unfinished / "images"
+        images.mkdir()
         if video:
             _split_video(source, images, frames)
         else:
@@ -82,8 +83,10 @@ def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> 
         if len(posed) < FEWEST_FRAMES:
             advice = "take more of one still, textured scene, each overlapping the one before"
             raise DataError(f"{result}; a capture needs {FEWEST_FRAMES}: {advice}", str(source))
-        lost = ", ".join(name for name in names if name not in posed)
-        logger.info("%s%s", result, lost and f", and leaves out: {lost}")
+        lost = [name for name in names if name not in posed]
+        if lost:
+            result = f"{result}, and leaves out: {', '.join(lost)}"
+        logger.info(result)
     return capture
 
 
@@ -110,21 +113,22 @@ def _copy_photos(folder: Path, images: Path) -> None:
                 upright = upright.convert("RGB")
             lossy = image.format in ("JPEG", "MPO", "HEIF", "WEBP") and upright.mode in ("L", "RGB")
             suffix = ".jpg" if lossy else ".png"
-            files.save_image(upright, place / f"{stem}{suffix}", **options)
+            saving.save_image(upright, place / f"{stem}{suffix}", **options)
 
 
 def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
-    """Return the photos in a folder or, if there are none, in the folders below it; name files of other formats."""
+    """Return the photos in a folder or, if there are none, in the folders below it, and name files of other formats."""
     folders = [folder]
     below = sorted(folder.glob("[!.]*/"))
     photos = files.image_files(folder, formats)
     if not photos:
         photos = [photo for path in below for photo in files.image_files(path, formats)]
         folders = below if photos else [folder, *below]
-    there = {path for searched in folders for path in searched.glob("[!.]*") if path.is_file()}
-    if others := sorted({path.name for path in there.difference(photos)}):
+    present = {path for searched in folders for path in searched.glob("[!.]*") if path.is_file()}
+    unread = sorted({path.name for path in present.difference(photos)})
+    if unread:
         advice = "" if "HEIF" in formats else files.NEEDS_HEIC
-        logger.warning("left out: %s of other formats: %s%s", counted(len(others), "file"), first_names(others), advice)
+        logger.warning("left out: %s of other formats: %s%s", counted(len(unread), "file"), first_names(unread), advice)
     return photos
 
 
@@ -151,7 +155,10 @@ def image_pairs(images: int, sequential: bool) -> list[tuple[int, int]]:
 
 
 def _find_cameras(folder: Path, names: list[str], sequential: bool, max_image_size: int) -> set[str]:
-    """Write COLMAP's largest model as `folder`/sparse/0; return its images. Those of a folder and size share a lens."""
+    """Write COLMAP's largest model as `folder`/sparse/0 and return its images.
+
+    The images of a folder share a lens if all have the same size.
+    """
     pycolmap = import_pycolmap()
     images = folder / "images"
     database = folder / "db"
@@ -179,8 +186,15 @@ def _find_cameras(folder: Path, names: list[str], sequential: bool, max_image_si
     (folder / "sparse/0").mkdir(parents=True)
     with Progress() as progress:
         bar = progress.add_task("poses", total=len(names))
-        advance = (lambda: progress.advance(bar, 2)), (lambda: progress.advance(bar))
-        models = pycolmap.incremental_mapping(database, images, folder / "sparse", mapping, "", *advance)
+        models = pycolmap.incremental_mapping(
+            database,
+            images,
+            folder / "sparse",
+            mapping,
+            "",
+            lambda: progress.advance(bar, 2),  # the first pair of images has a pose
+            lambda: progress.advance(bar),
+        )
     model = max(models.values(), key=pycolmap.Reconstruction.num_reg_images, default=pycolmap.Reconstruction())
     model.write_binary(folder / "sparse/0")
     database.unlink()

@@ -12,15 +12,16 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 
-from completesplat.data.captures.capture import Capture, CapturedFrame
+from completesplat.data.captures.captured_frames import Capture, CapturedFrame
 from completesplat.data.captures.colmap import image_count, is_model, read_colmap
 from completesplat.data.captures.transforms_json import read_polycam, read_transforms
-from completesplat.data.loading.data_module import ObjectDataModule
+from completesplat.data.loading.object_data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.placement import ObjectFraming, from_cameras, from_points, placed_sequence, upright_axes
-from completesplat.data.sequences import SPLITS, MaskedImage, PosedSequence, SequenceSource
+from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
+from completesplat.data.splits import SPLITS
 from completesplat.errors import DataError, MissingFile, errors_at, refused_to
-from completesplat.settings.schema import Range
+from completesplat.quantities import Range
 
 logger = logging.getLogger(__name__)
 
@@ -67,11 +68,15 @@ def read_capture(folder: Path) -> Capture | None:
 
 def _largest_model(folder: Path) -> Path | None:
     """Return the largest model of the first of `MODELS` whose images are there, else of the first that has models."""
-    groups = [[path for path in sorted(folder.glob(pattern)) if is_model(path)] for pattern in MODELS]
-    groups = [models for models in groups if models]
+    groups = []
+    for pattern in MODELS:
+        models = [path for path in sorted(folder.glob(pattern)) if is_model(path)]
+        if models:
+            groups.append(models)
     if not groups:
         return None
-    models = next((models for models in groups if _images(models[0], folder).is_dir()), groups[0])
+    with_images = [models for models in groups if _images(models[0], folder).is_dir()]
+    models = with_images[0] if with_images else groups[0]
     if len(models) == 1:
         return models[0]
     model = max(models, key=image_count)
@@ -80,7 +85,7 @@ def _largest_model(folder: Path) -> Path | None:
 
 
 def read_captures(folders: Mapping[str, Path]) -> tuple[dict[str, Capture], list[DataError]]:
-    """Read the captures in some of the folders, by name; return also the errors of those that cannot be read."""
+    """Read the captures in some of the folders, by name, and return also the errors of those that cannot be read."""
     captures = dict[str, Capture]()
     refused = list[DataError]()
     for name, folder in folders.items():
@@ -98,7 +103,7 @@ def _images(model: Path, folder: Path) -> Path:
 
 
 class CaptureSource(SequenceSource):
-    """The same part of the frames of each capture; see `SequenceSource`.
+    """The same part of the frames of each capture.
 
     Args:
         captures: captures by name.
@@ -116,11 +121,14 @@ class CaptureSource(SequenceSource):
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the files of cameras and points, not of the images."""
-        files = [path for name in self.names for path in self._captures[name].files]
-        return hashlib.sha256(b"".join(hashlib.sha256(path.read_bytes()).digest() for path in files)).hexdigest()
+        digest = hashlib.sha256()
+        for name in self.names:
+            for path in self._captures[name].files:
+                digest.update(hashlib.sha256(path.read_bytes()).digest())
+        return digest.hexdigest()
 
     def read(self, name: str) -> PosedSequence:
-        """Return one capture; its cameras are computed at the first call."""
+        """Return one capture, whose cameras are computed at the first call."""
         if name not in self._sequences:
             with errors_at(self._captures[name].files[0], name):
                 self._sequences[name] = self._make(name)
@@ -147,7 +155,8 @@ class CaptureSource(SequenceSource):
                 distance = np.linalg.norm(points - np.median(points, axis=0), axis=-1)
                 distance /= np.median(distance)
             placement = from_points(points[distance <= FARTHEST], upright_axes(cameras), "the point cloud")
-            if lost := int((~(distance <= FARTHEST_USED)).sum()):
+            lost = int((~(distance <= FARTHEST_USED)).sum())
+            if lost:
                 beyond = f"more than {FARTHEST_USED:,} scene radii away and are left out"
                 logger.warning("%s: %d of %d points are %s", name, lost, len(points), beyond)
             points = points[distance <= FARTHEST_USED]
@@ -179,7 +188,7 @@ class CaptureDataModule(ObjectDataModule):
     Args:
         root: folder or file of a capture (`read_capture`), a folder of such folders, or prepared captures.
         hold_out: one of every `hold_out` frames is for validation and test.
-        **settings: of `ObjectDataModule`; the reference of validation and test is the first held-out frame.
+        **settings: of `ObjectDataModule`. The reference of validation and test is the first held-out frame.
     """
 
     splits_share_sequences = True
@@ -199,20 +208,25 @@ class CaptureDataModule(ObjectDataModule):
         return {"hold_out": self.hold_out, **self.framing._asdict()}
 
     def open(self, split: str) -> Mapping[str, CaptureSource]:
-        """Read the cameras of all captures; the error of one capture is only raised if no other can be read."""
-        for left in (self.root.parent / f".{self.root.name}.unfinished", *self.root.glob(".*.unfinished")):
-            if left.is_dir():
-                logger.warning("%s: left by an import that was interrupted: start it again", left)
+        """Read the cameras of all captures. The error of one capture is only raised if none can be read."""
+        unfinished = [self.root.parent / f".{self.root.name}.unfinished", *self.root.glob(".*.unfinished")]
+        for folder in unfinished:
+            if folder.is_dir():
+                logger.warning("%s: left by an import that was interrupted: start it again", folder)
         if not self.root.exists():
             raise MissingFile("no such file or folder", str(self.root))
         captures, refused = read_captures({self.root.resolve().name or "capture": self.root})
         if not captures and not refused:
             folders = sorted(path for path in self.root.glob("[!.]*/") if path.is_dir())
             captures, refused = read_captures({folder.name: folder for folder in folders})
+        if refused and not captures:
+            raise refused[0]
         if not captures:
             command = shlex.join(["completesplat", "data", "import", str(self.root), "cameras=colmap"])
-            message = "no cameras there: neither transforms.json nor sparse/0, nor folders that have one; photos or a "
-            message += f"video get cameras by: {command}"
-            raise refused[0] if refused else MissingFile(message, str(self.root))
-        chosen = {part: partial(members, self.hold_out, part != "train") for part in SPLITS}
-        return {part: CaptureSource(captures, chosen[part], self.framing, refused) for part in SPLITS}
+            absent = "no cameras there: neither transforms.json nor sparse/0, nor folders that have one"
+            raise MissingFile(f"{absent}; photos or a video get cameras by: {command}", str(self.root))
+        sources = {}
+        for part in SPLITS:
+            chosen = partial(members, self.hold_out, part != "train")
+            sources[part] = CaptureSource(captures, chosen, self.framing, refused)
+        return sources

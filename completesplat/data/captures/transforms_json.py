@@ -12,10 +12,14 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, fit_lens, in_order, warn_of_missing
-from completesplat.data.images.exif import ORIENTATION, read_exif
-from completesplat.data.images.files import stored_size
-from completesplat.data.images.photograph import read_photograph
+from completesplat.data.captures.captured_frames import (
+    Capture,
+    CapturedFrame,
+    Lens,
+    fit_lens,
+    in_order,
+    warn_of_missing,
+)
 from completesplat.data.validation import (
     field,
     finite_array,
@@ -27,22 +31,37 @@ from completesplat.data.validation import (
 )
 from completesplat.errors import BadAnnotation, BadCamera, CompleteSplatError, TooFewFrames, errors_at
 from completesplat.geometry.cameras import Cameras, crop_resize
+from completesplat.photo.exif import ORIENTATION, read_exif
+from completesplat.photo.files import stored_size
+from completesplat.photo.reading import Framing, read_square
 from completesplat.scene import Views
 from completesplat.tensors import stack
 
 # OpenCV's distortion coefficients, and those of each camera model. There is no `k4`, on which programs disagree.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
-RADIAL = {"SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2")}
-USED = {"SIMPLE_PINHOLE": (), "PINHOLE": (), **RADIAL, "OPENCV": COEFFICIENTS}
+USED: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": COEFFICIENTS,
+}
 OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
 FEWEST_CAMERAS = 2
 SAME_FOCAL = 1e-3
-POLYCAM = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
+POLYCAM = {
+    "fl_x": "fx",
+    "fl_y": "fy",
+    "cx": "cx",
+    "cy": "cy",
+    "w": "width",
+    "h": "height",
+}
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # NeRF (synthetic) leaves the suffix out.
 
 
 def read_transforms(path: Path) -> Capture:
-    """Read `transforms.json`; values of a frame override those of the file.
+    """Read `transforms.json`, where values of a frame override those of the file.
 
     `transform_matrix` is camera-to-world with OpenGL's axes (+x right, +y up, +z backward; nerfstudio, "Data
     conventions"). Intrinsics are `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, or NeRF's `camera_angle_x`. By default the size
@@ -84,13 +103,15 @@ def read_polycam(keyframes: Path) -> Capture:
         with errors_at(file):
             rows = [[field(camera, f"t_{row}{column}", float) for column in range(4)] for row in range(3)]
         values = {name: camera.get(key) for name, key in POLYCAM.items()}
-        entries.append({**values, "file_path": f"{kind}images/{file.stem}", "transform_matrix": [*rows, [0, 0, 0, 1]]})
+        values["file_path"] = f"{kind}images/{file.stem}"
+        values["transform_matrix"] = [*rows, [0, 0, 0, 1]]
+        entries.append(values)
     frames = _read_frames(keyframes / f"{kind}cameras", {"frames": entries})
     return Capture(tuple(files), in_order(frames), None)
 
 
 def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
-    """Read photos and their cameras in `transforms.json`; undistort, crop and resize them as `read_photograph` does.
+    """Read photos and their cameras in `transforms.json`. Undistort, crop and resize them as `read_square` does.
 
     Returns:
         Views [view ...] in the order of the photos, in the world of the first camera and the file's units.
@@ -107,9 +128,9 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
         if frame is None:
             raise CompleteSplatError(f"{image}: {path} has no frame with this image")
         undistorted, _ = frame.read()
-        if ORIENTATION in read_exif(undistorted):  # `read_photograph` would turn it
+        if ORIENTATION in read_exif(undistorted):  # `read_square` would turn it
             undistorted = Image.fromarray(np.array(undistorted))
-        squares.append(read_photograph(undistorted, size).image)
+        squares.append(read_square(undistorted, Framing(size)).image)
         camera = frame.camera()
         height, width = camera.image_size
         side = min(camera.image_size)
@@ -138,7 +159,8 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
                 if not {"w", "h"} <= values.keys():
                     if "fl_x" in values:
                         raise BadAnnotation("fl_x is in pixels, but w and h are missing")
-                    values |= {"w": size, "h": size}
+                    values["w"] = size
+                    values["h"] = size
                 lens = _read_lens(values, path)
                 pose = torch.from_numpy(_read_pose(entry.get("transform_matrix")))
                 if any(lens.distortion) or not math.isclose(*lens.focal, rel_tol=SAME_FOCAL):
@@ -169,8 +191,9 @@ def _read_frames(path: Path, content: Any) -> list[CapturedFrame]:
                 if suffix is None:
                     missing.append(name)
                     continue
-                masked = entry.get("mask_path") is not None
-                mask = require_file(path_below(root, field(entry, "mask_path", str))) if masked else None
+                mask = None
+                if entry.get("mask_path") is not None:
+                    mask = require_file(path_below(root, field(entry, "mask_path", str)))
                 values = {**content, **entry}
                 pose = _read_pose(entry.get("transform_matrix"))
                 frame = CapturedFrame(number, image, mask, _read_lens(values, image), pose)
@@ -196,15 +219,21 @@ def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
 
 def _read_lens(values: Mapping[str, object], image: Path) -> Lens:
     model = values.get("camera_model", "OPENCV")
-    others = [key for key in OTHER_LENSES if values.get(key)]
-    if not isinstance(model, str) or model not in USED or others:
-        raise BadCamera(f"camera model {others[0] if others else model} is not supported; there are: {', '.join(USED)}")
+    unsupported = [key for key in OTHER_LENSES if values.get(key)]
+    if not isinstance(model, str) or model not in USED or unsupported:
+        name = unsupported[0] if unsupported else model
+        raise BadCamera(f"camera model {name} is not supported; there are: {', '.join(USED)}")
 
     def number(key: str, default: float | None = None) -> float:
-        return default if default is not None and key not in values else float(finite_array(values.get(key), (), key))
+        if default is not None and key not in values:
+            return default
+        return float(finite_array(values.get(key), (), key))
 
-    stored = None if {"w", "h"} <= values.keys() else stored_size(image, str(image))
-    height, width = stored or (int(number("h")), int(number("w")))  # instant-ngp writes floats.
+    if {"w", "h"} <= values.keys():
+        height = int(number("h"))  # instant-ngp writes floats.
+        width = int(number("w"))
+    else:
+        height, width = stored_size(image, str(image))
     if "fl_x" in values:
         fx = number("fl_x")
     elif "camera_angle_x" in values:

@@ -21,14 +21,14 @@ from rich.progress import track
 
 from completesplat.data.captures.capture_set import SPLITS_FILE, read_splits
 from completesplat.data.captures.turn_checks import Turn, examine, write_sheet
-from completesplat.data.images import files
-from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.photograph import without_background
 from completesplat.data.validation import field, read_json
 from completesplat.errors import BadAnnotation, BadImage, DataError, ImageError, MissingFile, TooFewFrames, refused_to
 from completesplat.files import counted, writing
 from completesplat.geometry.cameras import Cameras, invert_rigid, look_at, mirror
-from completesplat.settings.schema import Range
+from completesplat.photo import files, saving
+from completesplat.photo.background import without_background
+from completesplat.photo.crop import Square, cut_square
+from completesplat.quantities import Range
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ Photo = tuple[Image.Image, Image.Image]
 
 
 class TurntableSettings(TypedDict):
-    """Settings of `import_turntables`; `conf/data_task/import.yaml` explains them."""
+    """Settings of `import_turntables`, which `conf/data_task/import.yaml` explains."""
 
     photos_of_a_turn: Annotated[int, Range(FEWEST_PHOTOS)] | str | None
     elevation: Annotated[float, Range(-85, 85)]
@@ -82,7 +82,11 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
             if splits:
                 usable = {split: [name for name in names if name in turns] for split, names in splits.items()}
                 (unfinished / SPLITS_FILE).write_text(json.dumps(usable, indent=1) + "\n")
-            for name in (*turns, *([SPLITS_FILE] if splits else []), SHEET):
+            written = list(turns)
+            if splits:
+                written.append(SPLITS_FILE)
+            written.append(SHEET)
+            for name in written:
                 (out / name).parent.mkdir(parents=True, exist_ok=True)
                 (unfinished / name).rename(out / name)
     finally:
@@ -90,7 +94,7 @@ def import_turntables(folder: Path, out: Path, settings: TurntableSettings) -> N
 
 
 def _write_turns(folders: Mapping[str, Path], out: Path, settings: TurntableSettings) -> dict[str, Turn]:
-    """Write images and masks of all turns that can be used, and return their findings; name the others."""
+    """Write images and masks of all turns that can be used, return their findings, and name those that cannot."""
     count = settings["photos_of_a_turn"]
     counts = read_json(Path(count)) if isinstance(count, str) else dict.fromkeys(folders, count)
     turns = dict[str, Turn]()
@@ -109,7 +113,7 @@ def _write_turns(folders: Mapping[str, Path], out: Path, settings: TurntableSett
 
 
 def _write_cameras(turns: Mapping[str, Turn], folder: Path, direction: int | None) -> None:
-    """Report on the turns, and write the cameras of each; an unclear turn goes as most do."""
+    """Report on the turns, and write the cameras of each. An unclear turn goes as most do."""
     most = 1 if _report(turns) >= 0 else -1
     for name, turn in turns.items():
         moves_right = (direction or turn.flow or most) == -1
@@ -156,13 +160,14 @@ def _write_turn(folder: Path, count: int | None, out: Path, settings: TurntableS
     cameras = _on_circle(angles, settings["elevation"], 2 * focal / height, focal, photos[0][0].width)
     whole = Square(0, 0, photos[0][0].width)
     size = min(128, photos[0][0].width)
-    images, masks = (torch.stack([cut_square(x, whole, size) / 255 for x in xs]) for xs in zip(*photos, strict=True))
+    images = torch.stack([cut_square(image, whole, size) / 255 for image, _ in photos])
+    masks = torch.stack([cut_square(mask, whole, size) / 255 for _, mask in photos])
     turn = examine(images, masks, angles, cameras)
     for kind in ("images", "masks"):
         (out / kind).mkdir(parents=True)
     for position, (image, mask) in zip(positions, photos, strict=True):
-        files.save_image(image, out / f"images/{position:05d}.jpg", quality=95, subsampling=0)
-        files.save_image(mask, out / f"masks/{position:05d}.png")
+        saving.save_image(image, out / f"images/{position:05d}.jpg", quality=95, subsampling=0)
+        saving.save_image(mask, out / f"masks/{position:05d}.png")
     return turn
 
 
@@ -183,9 +188,11 @@ def _numbered(paths: Sequence[Path], count: int) -> dict[int, Path]:
     """Return photos by the last number in their names, modulo the photos of a turn."""
     places: dict[int, Path] = {}
     for path in paths:
-        if not (numbers := re.findall(r"[0-9]+", path.stem)):
+        numbers = re.findall(r"[0-9]+", path.stem)
+        if not numbers:
             raise BadAnnotation("no number in this name, but photos_of_a_turn needs positions", str(path))
-        if (first := places.setdefault(int(numbers[-1]) % count, path)) != path:
+        first = places.setdefault(int(numbers[-1]) % count, path)
+        if first != path:
             raise BadAnnotation(f"the same position in the turn of {count} photos as {first.name}", str(path))
     return places
 
@@ -204,9 +211,12 @@ def _read_photo(path: Path, background: str | None) -> Photo:
             image = without_background(image) if background == "remove" else _without_white(image)
         mask = image.getchannel("A")
         share = np.mean(np.asarray(mask) > 127)
-        if not 0 < share <= FULL:
-            fault = "fills the photo; another background (white, remove) may find the object" if share else "is empty"
-            raise ImageError(f"background={'null' if background is None else background}: its mask {fault}")
+        setting = "null" if background is None else background
+        if share == 0:
+            raise ImageError(f"background={setting}: its mask is empty")
+        if share > FULL:
+            advice = "another background (white, remove) may find the object"
+            raise ImageError(f"background={setting}: its mask fills the photo; {advice}")
         return files.over_grey(image, 1.0), mask
 
 
@@ -234,7 +244,7 @@ def _along_rows(
 
 
 def _squared(photos: Sequence[Photo], height: str | None) -> tuple[list[Photo], float]:
-    """Cut the photos to squares of one size around the axis; return also the object's height in pixels."""
+    """Cut the photos to squares of one size around the axis, and return also the object's height in pixels."""
     masks = [mask.point(lambda value: 255 * (value > 127)) for _, mask in photos]
     boxes = np.array([mask.getbbox() for mask in masks], dtype=np.float64)
     heights = boxes[:, 3] - boxes[:, 1]
@@ -266,13 +276,22 @@ def _write_transforms(folder: Path, cameras: Cameras) -> None:
     ]
     focal = float(cameras.intrinsics[0, 0, 0])
     height, width = cameras.image_size
-    lens = {"camera_model": "PINHOLE", "fl_x": focal, "fl_y": focal, "w": width, "h": height}
-    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}, indent=1) + "\n")
+    content = {
+        "camera_model": "PINHOLE",
+        "fl_x": focal,
+        "fl_y": focal,
+        "w": width,
+        "h": height,
+        "frames": frames,
+    }
+    (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n")
 
 
 def _report(turns: Mapping[str, Turn]) -> int:
-    """Log a summary of all turns and the names of odd ones; return how many more turns flow left than right."""
-    left, right, unclear = ([name for name, turn in turns.items() if turn.flow == flow] for flow in (1, -1, 0))
+    """Log a summary of all turns and the names of odd ones, and return how many more turns flow left than right."""
+    left = [name for name, turn in turns.items() if turn.flow == 1]
+    right = [name for name, turn in turns.items() if turn.flow == -1]
+    unclear = [name for name, turn in turns.items() if turn.flow == 0]
     ends, neighbours, opposite = np.median([turn.differences for turn in turns.values()], axis=0)
     overlap = np.median([turn.overlap for turn in turns.values()])
     logger.info(
@@ -281,11 +300,15 @@ def _report(turns: Mapping[str, Turn]) -> int:
         f"ones by {opposite:.1f}; the masks overlap by {overlap:.3f} with their visual hull (medians)"
     )
     low = [name for name, turn in turns.items() if turn.overlap < LOW_OVERLAP]
-    for names, what in (
-        (min(right, left, key=len), f"flow goes {'left' if len(left) < len(right) else 'right'}, unlike in most"),
-        (unclear, "flow is unclear, the direction of most is taken"),
-        (low, f"the masks overlap by less than {LOW_OVERLAP} with their visual hull"),
-    ):
-        if names:
-            logger.warning("%s: %s", what, ", ".join(names))
+    if len(left) < len(right):
+        _warn_of("flow goes left, unlike in most", left)
+    else:
+        _warn_of("flow goes right, unlike in most", right)
+    _warn_of("flow is unclear, the direction of most is taken", unclear)
+    _warn_of(f"the masks overlap by less than {LOW_OVERLAP} with their visual hull", low)
     return len(left) - len(right)
+
+
+def _warn_of(fault: str, turns: Sequence[str]) -> None:
+    if turns:
+        logger.warning("%s: %s", fault, ", ".join(turns))

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from completesplat.data.images.files import MOST_PIXELS
 from completesplat.data.validation import field, finite_array, path_below, read_json, require_rotation
 from completesplat.errors import BadAnnotation, BadCamera, Refuse, errors_at, refused_to
 from completesplat.geometry.cameras import Cameras
+from completesplat.photo.files import MOST_PIXELS
 
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up), and back.
 FLIP = np.diag([-1.0, -1.0, 1.0])
@@ -28,7 +28,7 @@ class DepthMap(NamedTuple):
 
 
 class CO3DFrame(NamedTuple):
-    """One image with its mask; `camera` is in float64 and in the sequence's own units."""
+    """One image with its mask. `camera` is in float64 and in the sequence's own units."""
 
     number: int
     image: Path
@@ -42,7 +42,7 @@ Frames = dict[str, dict[int, CO3DFrame]]
 
 
 class CO3DVideo(NamedTuple):
-    """Annotation of a whole sequence; a quality is None if it is missing or NaN."""
+    """Annotation of a whole sequence, where a quality is None if it is missing or NaN."""
 
     point_cloud: Path | None
     point_cloud_quality: float | None
@@ -50,7 +50,7 @@ class CO3DVideo(NamedTuple):
 
 
 def read_videos(root: Path, path: Path, refuse: Refuse) -> dict[str, CO3DVideo]:
-    """Read the sequences in `sequence_annotations.jgz` by name; errors of single entries are passed to `refuse`.
+    """Read the sequences in `sequence_annotations.jgz` by name, and pass the errors of single entries to `refuse`.
 
     Raises:
         DataError: the file is missing, unreadable or not a list.
@@ -79,7 +79,7 @@ def _optional_number(entry: JsonObject, key: str) -> float | None:
 
 
 def read_frames(root: Path, path: Path, wanted: Callable[[str, int], bool], refuse: Refuse) -> Frames:
-    """Read those frames in `frame_annotations.jgz` that are `wanted`, by sequence and number; see `read_videos`."""
+    """Read those frames in `frame_annotations.jgz` that are `wanted`, by sequence and number, as `read_videos` does."""
     frames: Frames = {}
     for name, entry in _entries(path, refuse):
         with refused_to(refuse, path, name):
@@ -93,7 +93,7 @@ def read_frames(root: Path, path: Path, wanted: Callable[[str, int], bool], refu
 
 
 def _entries(path: Path, refuse: Refuse) -> Iterator[tuple[str, JsonObject]]:
-    """Yield the names of sequences and the entries of a file; pass the errors of entries without a name to `refuse`."""
+    """Yield the names of sequences and the entries of a file. Errors of entries without a name go to `refuse`."""
     # CO3D was written by Python's `json`, which writes NaN; every number is checked before use.
     content = read_json(path, allow_nan=True)
     if type(content) is not list:
@@ -108,6 +108,7 @@ def _entries(path: Path, refuse: Refuse) -> Iterator[tuple[str, JsonObject]]:
 
 
 def _frame(root: Path, number: int, entry: JsonObject) -> CO3DFrame:
+    """Return the frame of an annotation."""
     image = field(entry, "image", dict)
     mask = field(entry, "mask", dict)
     depth = None
@@ -116,7 +117,8 @@ def _frame(root: Path, number: int, entry: JsonObject) -> CO3DFrame:
         expected = f"two positive integers of at most {MOST_PIXELS:,}"
         raise BadAnnotation(f"the image's size must be {expected}, not {str(size)[:80]}")
     camera = camera_from_viewpoint(field(entry, "viewpoint", dict), size)
-    image_path, mask_path = (path_below(root, field(part, "path", str)) for part in (image, mask))
+    image_path = path_below(root, field(image, "path", str))
+    mask_path = path_below(root, field(mask, "path", str))
     if entry.get("depth") is not None:
         stored = field(entry, "depth", dict)
         # Some writers write whole numbers as integers.
@@ -161,7 +163,7 @@ def camera_from_viewpoint(viewpoint: JsonObject, image_size: Sequence[int]) -> C
 def viewpoint(
     rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"], focal: list[float], center: list[float]
 ) -> dict[str, object]:
-    """Invert `camera_from_viewpoint`; `focal` and `center` are in units of half the image's sides."""
+    """Invert `camera_from_viewpoint`, with `focal` and `center` in units of half the image's sides."""
     return {
         "R": (FLIP @ rotation).T.tolist(),
         "T": (FLIP @ translation).tolist(),

@@ -2,15 +2,20 @@
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
+from completesplat.data.co3d.category import Filters, read_category
+from completesplat.data.co3d.category_writers import in_mode
 from completesplat.data.co3d.source import CO3DSource
-from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
-from completesplat.data.hidden_modes import HiddenModeScenes
-from completesplat.data.loading.data_module import ObjectDataModule
+from completesplat.data.loading.hidden_modes import HiddenModeScenes
+from completesplat.data.loading.object_data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
+from completesplat.data.splits import SeededSplit
 from completesplat.errors import DataError, MissingFile
-from completesplat.settings.schema import Natural, Positive, Range, Share
+from completesplat.quantities import Natural, Positive, Range, Share
 
 
 class CO3DDataModule(ObjectDataModule):
@@ -77,8 +82,14 @@ class CO3DDataModule(ObjectDataModule):
         return f"of the set list; where it validates nothing, {val:g} of training validates, by seed {seed}"
 
     def packed_settings(self) -> dict[str, Scalar]:
-        chosen = {name: getattr(self, name) for name in ("category", "subset", "allow_shared_sequences")}
-        return chosen | self.seeded._asdict() | self.filters._asdict() | self.framing._asdict()
+        settings: dict[str, Scalar] = {
+            "category": self.category,
+            "subset": self.subset,
+            "allow_shared_sequences": self.allow_shared_sequences,
+        }
+        for part in (self.seeded, self.filters, self.framing):
+            settings.update(part._asdict())
+        return settings
 
     def open(self, split: str) -> Mapping[str, CO3DSource]:
         """Open all splits at once, because they share the annotations. Sequences without images are left out.
@@ -86,19 +97,20 @@ class CO3DDataModule(ObjectDataModule):
         Raises:
             DataError: more sequences have no images than the policy allows; else as `read_category`.
         """
-        which = self.root, self.category, self.subset
-        splits, files, refused = read_category(*which, self.seeded, self.filters, self.allow_shared_sequences)
+        splits, files, refused = read_category(
+            self.root, self.category, self.subset, self.seeded, self.filters, self.allow_shared_sequences
+        )
         first = {name: frames[0].image for split in splits.values() for name, frames in split.frames.items()}
         absent = {name for name, image in first.items() if not os.path.isdir(image.parent)}
-        on_bad, most = self.policy
-        if absent and (on_bad == "raise" or len(absent) > most * len(first)):
+        most = 0.0 if self.tolerance.on_bad == "raise" else self.tolerance.max_bad_fraction
+        if len(absent) > most * len(first):
             counted = f"{len(absent)} of {len(first)} sequences have no images, as after a partial download"
             raise DataError(f"{counted}; data.max_bad_fraction=1 uses the others", str(self.root / self.category))
         splits = {split: members.without(absent, "not downloaded") for split, members in splits.items()}
         return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}
 
     def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
-        """Return the test scenes with the modes that were written beside their images; see `HiddenModeScenes`."""
+        """Return the test scenes with the modes that were written beside their images."""
         if not self.chances:
             return super().hidden_modes(views, spread_views)
         store = self.store("test")
@@ -107,4 +119,10 @@ class CO3DDataModule(ObjectDataModule):
         if not any((folder / name / first).is_dir() for name in store.names):
             advice = "data toy writes those of test scenes, data render all with hidden=modes; prepared data have none"
             raise MissingFile(f"no test scene has images in each mode, such as {first}: {advice}", str(folder))
-        return HiddenModeScenes(store, lambda name: folder / name / self.record, self.chances, views, spread_views)
+        source = store.source
+        assert isinstance(source, CO3DSource)
+        modes = {mode: replace(store, source=source.with_images(partial(in_mode, mode=mode))) for mode in self.chances}
+        return HiddenModeScenes(store, modes, partial(self._record_of, folder), self.chances, views, spread_views)
+
+    def _record_of(self, folder: Path, name: str) -> Path:
+        return folder / name / self.record

@@ -12,9 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.data.co3d.annotations import CO3DFrame
-from completesplat.data.co3d.splits import SplitMembers
-from completesplat.data.images.crop import Square
-from completesplat.data.images.files import decode_image, read_depth
+from completesplat.data.co3d.category import SplitMembers
+from completesplat.data.co3d.depth_maps import read_depth
 from completesplat.data.placement import (
     Axes,
     ObjectFraming,
@@ -29,13 +28,15 @@ from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSou
 from completesplat.data.validation import read_points
 from completesplat.errors import BadImage, DataError, errors_at
 from completesplat.geometry.cameras import pixel_centers, unproject
+from completesplat.photo.crop import Square
+from completesplat.photo.files import decode_image
 
 DEPTH_MAPS = 8
 FOREGROUND = 128  # smallest mask value, of 255
 
 
 def square_depth(frame: CO3DFrame, square: Square, size: int, factor: float) -> Float[Tensor, "1 size size"]:
-    """Return depth along the optical axis at the pixel centres of the square image; 0 where it is unknown.
+    """Return depth along the optical axis at the pixel centres of the square image, 0 where it is unknown.
 
     Sampling is nearest-neighbour, because a mean across an edge is the depth of no surface. The depth map may differ in
     size from its image. `factor` converts the sequence's units to the common scale.
@@ -86,7 +87,7 @@ def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
 
 
 def _foreground(frame: CO3DFrame) -> np.ndarray:
-    """Return the world points [n 3] of a depth map's foreground; the map may be smaller than the image."""
+    """Return the world points [n 3] of a depth map's foreground. The map may be smaller than the image."""
     assert frame.depth is not None
     depth = read_depth(frame.depth.path, frame.depth.scale_adjustment)[0]
     mask = decode_image(frame.mask, str(frame.mask), "L", frame.camera.image_size)
@@ -98,7 +99,7 @@ def _foreground(frame: CO3DFrame) -> np.ndarray:
 
 
 class CO3DSource(SequenceSource):
-    """Sequences of one split; see `SequenceSource`."""
+    """Sequences of one split of a category."""
 
     def __init__(
         self, members: SplitMembers, framing: ObjectFraming, files: Sequence[Path], refused: list[DataError]
@@ -110,18 +111,21 @@ class CO3DSource(SequenceSource):
         self._sequences: dict[str, PosedSequence] = {}
 
     def with_images(self, path_of: Callable[[Path], Path]) -> "CO3DSource":
-        frames = {
-            name: [frame._replace(image=path_of(frame.image)) for frame in frames]
-            for name, frames in self._members.frames.items()
-        }
+        """Return the same sequences with images at other paths."""
+        frames = {}
+        for name, stored in self._members.frames.items():
+            frames[name] = [frame._replace(image=path_of(frame.image)) for frame in stored]
         return CO3DSource(self._members._replace(frames=frames), self.framing, self._files, self.refused)
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the annotations, not of the images."""
-        return hashlib.sha256(b"".join(hashlib.sha256(f.read_bytes()).digest() for f in self._files)).hexdigest()
+        digest = hashlib.sha256()
+        for path in self._files:
+            digest.update(hashlib.sha256(path.read_bytes()).digest())
+        return digest.hexdigest()
 
     def read(self, name: str) -> PosedSequence:
-        """Return one sequence; its cameras are computed at the first call."""
+        """Return one sequence, whose cameras are computed at the first call."""
         if name not in self._sequences:
             with errors_at(sequence=name):
                 self._sequences[name] = self._make(name)
@@ -149,9 +153,10 @@ def _read(name: str, frames: list[CO3DFrame], framing: ObjectFraming, index: int
         image = decode_image(frame.image, str(frame.image), "RGB", image_size)
         mask = decode_image(frame.mask, str(frame.mask), "L", image_size)
         # CO3D's loader leaves out empty masks, too (`json_index_dataset.py`, `remove_empty_masks`).
-        for path, part, fault in ((frame.image, image, "is black everywhere"), (frame.mask, mask, "shows no object")):
-            if part.getbbox() is None:
-                raise BadImage(fault, str(path))
+        if image.getbbox() is None:
+            raise BadImage("is black everywhere", str(frame.image))
+        if mask.getbbox() is None:
+            raise BadImage("shows no object", str(frame.mask))
         return framing.cut(frame.camera, image, mask)
 
 

@@ -1,8 +1,8 @@
 """Random augmentation of training scenes: colours of all views, the reference's camera, flips, boxes over its image."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -12,15 +12,20 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import mirror, pixel_centers
+from completesplat.quantities import Entries, Positive, Range, Share
 from completesplat.rasterizers.kernels.compilation import helper, kernel
 from completesplat.scene import SceneBatch, Views
-from completesplat.settings.schema import Entries, Positive, Range, Share, check_value, hints_of
+from completesplat.settings.schema import check_value, hints_of
 
 Images = Float[Tensor, "view 3 height width"]
 Plane = Float32[ndarray, " pixel"]
 BRIGHTNESS, CONTRAST, SATURATION, HUE = range(4)
 GREY_WEIGHTS = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float32)[:, None, None]  # ITU-R BT.601
-ZERO, ONE, TWO, FOUR, SIX = (np.float32(number) for number in (0, 1, 2, 4, 6))
+ZERO = np.float32(0)
+ONE = np.float32(1)
+TWO = np.float32(2)
+FOUR = np.float32(4)
+SIX = np.float32(6)
 
 
 def _check(name: str, settings: object) -> None:
@@ -38,7 +43,7 @@ class ColorJitter:
     Args:
         brightness, contrast, saturation: the factor is drawn from [max(0, 1 - strength), 1 + strength]. It multiplies
             the colours, their distance from the mean grey level, or their distance from the pixel's own grey.
-        hue: the angle is drawn from [-strength, strength] turns; the strength is at most 0.5.
+        hue: the angle is drawn from [-strength, strength] turns. The strength is at most 0.5.
 
     Raises:
         CompleteSplatError: a strength is negative or not finite, or the hue is above 0.5.
@@ -53,7 +58,7 @@ class ColorJitter:
         _check("data.color_jitter", self)
 
     def __call__(self, images: Images, rng: np.random.Generator) -> Images:
-        """Change images (sRGB, clamped to 0 to 1) at random; any strengths use equally many random numbers."""
+        """Change images (sRGB, clamped to 0 to 1) at random. Any strengths use equally many random numbers."""
         strengths = (self.brightness, self.contrast, self.saturation, self.hue)
         factors = [rng.uniform(max(0.0, 1 - strength), 1 + strength) for strength in strengths[:HUE]]
         factors.append(6 * rng.uniform(-self.hue, self.hue) % 6)
@@ -139,7 +144,8 @@ class BoxMasks:
         if rng.random() >= self.probability:
             return visible
         for _ in range(rng.integers(self.boxes[0], self.boxes[1], endpoint=True)):
-            (top, bottom), (left, right) = (self._interval(size, rng) for size in (height, width))
+            top, bottom = self._interval(height, rng)
+            left, right = self._interval(width, rng)
             visible[:, top:bottom, left:right] = 0
         return visible
 
@@ -190,46 +196,82 @@ class CameraJitter:
         old = (torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1) @ to_old.mT)[..., :2]
         grid = old / torch.tensor([width, height]) * 2 - 1
         layers = torch.cat([scene.reference.images, scene.reference.masks, scene.visible])[None]
-        seen = torch.nn.functional.grid_sample(layers, grid[None], padding_mode="border", align_corners=False)[0]
+        resampled = torch.nn.functional.grid_sample(layers, grid[None], padding_mode="border", align_corners=False)[0]
         cameras = replace(scene.reference.cameras, intrinsics=after)
         binary = scene.reference.masks.eq(scene.reference.masks.round()).all()
-        reference = Views(seen[:3], cameras, seen[3:4].round() if binary else seen[3:4])
+        masks = resampled[3:4].round() if binary else resampled[3:4]
+        reference = Views(resampled[:3], cameras, masks)
         turned = scene.targets.cameras.world_to_camera @ turn.mT
         targets = replace(scene.targets, cameras=replace(scene.targets.cameras, world_to_camera=turned))
-        return replace(scene, reference=reference, targets=targets, visible=seen[4:])
+        return replace(scene, reference=reference, targets=targets, visible=resampled[4:])
 
 
-def augment(
-    scene: SceneBatch,
-    rng: np.random.Generator,
-    color_jitter: ColorJitter | None,
-    box_masks: BoxMasks | None,
-    horizontal_flip: bool,
-    camera_jitter: CameraJitter | None = None,
-) -> SceneBatch:
-    """Augment one scene (without batch axis): jitter colours and camera, flip with probability 0.5, hide boxes.
+@dataclass(frozen=True)
+class Augmentation:
+    """Random changes of a training scene: jitter of colours and camera, mirroring with probability 0.5, and boxes.
 
-    Jitter, flip, boxes and camera draw from four generators, spawned from `rng` in this order. So each is independent
-    of whether the others are on, and of what was drawn from `rng` before. Nothing is drawn from `rng` itself.
+    Each is off if it is None or false. The order of the fields is not that of the changes.
     """
-    jitter_rng, flip_rng, boxes_rng, camera_rng = rng.spawn(4)
-    if color_jitter is not None:
-        images = color_jitter(scene.all_views().images, jitter_rng)
-        reference = replace(scene.reference, images=images[0])
-        targets = replace(scene.targets, images=images[1:])
-        scene = replace(scene, reference=reference, targets=targets)
-    if horizontal_flip and flip_rng.random() < 0.5:
-        scene = mirrored(scene)
-    if camera_jitter is not None:
-        scene = camera_jitter(scene, camera_rng)
-    if box_masks is not None:
-        height, width = scene.reference.cameras.image_size
-        scene = replace(scene, visible=box_masks(height, width, boxes_rng).to(scene.visible))
-    return scene
+
+    color_jitter: ColorJitter | None = None
+    box_masks: BoxMasks | None = None
+    horizontal_flip: bool = False
+    camera_jitter: CameraJitter | None = None
+
+    @staticmethod
+    def of_settings(
+        color_jitter: Mapping[str, float] | None,
+        box_masks: Mapping[str, Any] | None,
+        camera_jitter: Mapping[str, Any] | None,
+        horizontal_flip: bool,
+    ) -> "Augmentation":
+        """Build the parts of an augmentation from their settings. None: the part is off.
+
+        Raises:
+            CompleteSplatError: a setting is unknown or out of its range.
+        """
+        try:
+            return Augmentation(
+                None if color_jitter is None else ColorJitter(**color_jitter),
+                None if box_masks is None else BoxMasks(**box_masks),
+                horizontal_flip,
+                None if camera_jitter is None else CameraJitter(**camera_jitter),
+            )
+        except TypeError as error:  # a name is misspelt
+            raise CompleteSplatError(f"data: {error}") from None
+
+    def active(self) -> list[str]:
+        """Return the names of the changes that are on."""
+        return [field.name for field in fields(self) if getattr(self, field.name)]
+
+    def changes_images(self) -> bool:
+        """Return whether a change other than boxes over the reference is on."""
+        return any(name != "box_masks" for name in self.active())
+
+    def __call__(self, scene: SceneBatch, rng: np.random.Generator) -> SceneBatch:
+        """Augment one scene (without batch axis).
+
+        Colours, flip, boxes and camera draw from four generators, spawned from `rng` in this order. So each is
+        independent of whether the others are on, and of what was drawn from `rng` before. Nothing is drawn from `rng`.
+        """
+        jitter_rng, flip_rng, boxes_rng, camera_rng = rng.spawn(4)
+        if self.color_jitter is not None:
+            images = self.color_jitter(scene.all_views().images, jitter_rng)
+            reference = replace(scene.reference, images=images[0])
+            targets = replace(scene.targets, images=images[1:])
+            scene = replace(scene, reference=reference, targets=targets)
+        if self.horizontal_flip and flip_rng.random() < 0.5:
+            scene = mirrored(scene)
+        if self.camera_jitter is not None:
+            scene = self.camera_jitter(scene, camera_rng)
+        if self.box_masks is not None:
+            height, width = scene.reference.cameras.image_size
+            scene = replace(scene, visible=self.box_masks(height, width, boxes_rng).to(scene.visible))
+        return scene
 
 
 def mirrored(scene: SceneBatch) -> SceneBatch:
-    """Mirror images, masks, depths and cameras left to right; the reference camera's frame remains the world frame."""
+    """Mirror images, masks, depths and cameras left to right. The reference camera's frame remains the world frame."""
 
     def flipped(views: Views) -> Views:
         depths = None if views.depths is None else views.depths.flip(-1)

@@ -19,7 +19,7 @@ def processes() -> tuple[int, int]:
 
 
 def gather_values(value: T) -> list[T]:
-    """Gather the values of all processes in rank order; every process must call this."""
+    """Gather the values of all processes in rank order. Every process must call this."""
     count = processes()[1]
     if count == 1:
         return [value]
@@ -29,7 +29,7 @@ def gather_values(value: T) -> list[T]:
 
 
 def mean_of_processes(values: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Average scalars on one device over all processes; every process must call this with the same names."""
+    """Average scalars on one device over all processes. Every process must call this with the same names."""
     count = processes()[1]
     if count == 1:
         return values

@@ -1,7 +1,7 @@
 """Latent cache on disk: an Arrow file as in a packed store, with one row for each sequence, used as a training set."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -12,11 +12,10 @@ import pyarrow as pa
 import torch
 from jaxtyping import Float, Shaped, UInt32
 
-from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import TrainingScenes
 from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, read_as
-from completesplat.data.packed.source import OpenShard
-from completesplat.data.packed.writing import UNFINISHED
+from completesplat.data.packed.preparation import UNFINISHED
+from completesplat.data.packed.shards import OpenShard, refused_as_damaged
 from completesplat.data.sequences import SequenceSource
 from completesplat.data.validation import require_file
 from completesplat.errors import (
@@ -25,7 +24,6 @@ from completesplat.errors import (
     CompleteSplatError,
     DataError,
     MissingFile,
-    UnreadableFile,
     errors_at,
 )
 from completesplat.files import atomic_path, write_text
@@ -93,8 +91,15 @@ def latent_schema(origin: Origin) -> pa.Schema:
     """Return the columns of a store. Each has one list for each sequence, of the values of all its stored frames."""
     encodings = pa.large_list(PRECISIONS[origin.precision])
     conditions = pa.large_list(pa.uint8()) if origin.conditioning is None else encodings
-    columns = dict(zip(ARRAYS, (encodings, encodings, conditions), strict=True))
-    return pa.schema({"name": pa.string(), **columns, CHECKSUMS: pa.large_list(pa.uint32())})
+    return pa.schema(
+        {
+            "name": pa.string(),
+            "mean": encodings,
+            "log_variance": encodings,
+            "condition": conditions,
+            CHECKSUMS: pa.large_list(pa.uint32()),
+        }
+    )
 
 
 def frame_checksums(rows: Rows) -> UInt32[np.ndarray, " frame"]:
@@ -107,7 +112,7 @@ def frame_checksums(rows: Rows) -> UInt32[np.ndarray, " frame"]:
 
 
 def moments(sums: Sums) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return mean and standard deviation of each channel; Var[h] = E[mean^2] + E[variance] - E[mean]^2."""
+    """Return mean and standard deviation of each channel, where Var[h] = E[mean^2] + E[variance] - E[mean]^2."""
     count, total, squares = sums
     mean = total / count
     return tuple(mean.tolist()), tuple(np.sqrt(squares / count - np.square(mean)).tolist())
@@ -138,16 +143,32 @@ def write_cache(
                 if len(waiting["mean"]) < count:
                     break
                 complete = {name: np.ascontiguousarray(values[:count]) for name, values in waiting.items()}
-                columns = [*(complete[array].reshape(-1) for array in ARRAYS), frame_checksums(complete)]
-                lists = [pa.LargeListArray.from_arrays(pa.array([0, len(x)], pa.int64()), pa.array(x)) for x in columns]
-                writer.write_batch(pa.RecordBatch.from_arrays([pa.array([sequence.name]), *lists], schema=schema))
+                writer.write_batch(_record_batch(sequence.name, complete, schema))
                 waiting = {name: values[count:] for name, values in waiting.items()}
                 written += 1
-    shapes = {name: rows.shape[1:] for name, rows in waiting.items()}
-    size = (folder / FILE).stat().st_size
-    manifest = LatentCacheManifest(__version__, origin, *moments(total), shapes, tuple(sequences), size)
+    mean, std = moments(total)
+    manifest = LatentCacheManifest(
+        version=__version__,
+        origin=origin,
+        mean=mean,
+        std=std,
+        shapes={name: rows.shape[1:] for name, rows in waiting.items()},
+        sequences=tuple(sequences),
+        bytes=(folder / FILE).stat().st_size,
+    )
     text = json.dumps({**HEADER, **asdict(manifest)}, indent=2, allow_nan=False) + "\n"
     write_text(folder / MANIFEST, text.replace(NO_SUM, sha256(text.encode()).hexdigest()))
+
+
+def _record_batch(name: str, rows: Rows, schema: pa.Schema) -> pa.RecordBatch:
+    """Return the row of a sequence with the values of all its stored frames."""
+    columns = [rows[array].reshape(-1) for array in ARRAYS]
+    columns.append(frame_checksums(rows))
+    arrays = [pa.array([name])]
+    for values in columns:
+        offsets = pa.array([0, len(values)], pa.int64())
+        arrays.append(pa.LargeListArray.from_arrays(offsets, pa.array(values)))
+    return pa.RecordBatch.from_arrays(arrays, schema=schema)
 
 
 class LatentCache:
@@ -177,11 +198,9 @@ class LatentCache:
         with errors_at(file=require_file(folder / FILE)):
             if (folder / FILE).stat().st_size != self.manifest.bytes:
                 raise ChangedFile(f"another size than it was written with: {ADVICE}")
-            try:
-                self._rows = OpenShard(folder / FILE)
-            except (pa.ArrowException, OSError, ValueError) as error:
-                raise UnreadableFile(f"damaged ({error}): {ADVICE}") from None
-            if not self._rows.schema.equals(latent_schema(self.origin)) or len(self._rows.places) != len(self._places):
+            self._rows = OpenShard(folder / FILE, f": {ADVICE}")
+            columns = latent_schema(self.origin)
+            if not self._rows.schema.equals(columns) or len(self._rows.places) != len(self._places):
                 raise ChangedFile(f"not what the manifest describes: {ADVICE}")
         self.holds_images = self.origin.conditioning is None  # rather than features
 
@@ -198,10 +217,11 @@ class LatentCache:
         rows = {column: np.array(array[place : place + 1]) for column, array in self.arrays(name).items()}
         if frame_checksums(rows) != rows[CHECKSUMS]:
             raise ChangedFile(f"its checksum is another: {ADVICE}", str(self.folder), name, frame)
-        mean, log_variance, condition = (torch.from_numpy(rows[array][0].astype(np.float32)) for array in ARRAYS)
-        if self.holds_images:
-            # The same division as for images that are read from the data set, for bitwise equal results.
-            condition = torch.from_numpy(np.divide(rows["condition"][0], 255, dtype=np.float32))
+        mean = torch.from_numpy(rows["mean"][0].astype(np.float32))
+        log_variance = torch.from_numpy(rows["log_variance"][0].astype(np.float32))
+        # An image is divided as one that is read from the data set, for bitwise equal results.
+        scale = 255 if self.holds_images else 1
+        condition = torch.from_numpy(np.divide(rows["condition"][0], scale, dtype=np.float32))
         return CachedScene(mean, log_variance, condition, torch.tensor(frame), name)
 
     def arrays(self, name: str) -> Rows:
@@ -211,23 +231,23 @@ class LatentCache:
             DataError: the row is damaged or of another sequence.
         """
         with errors_at(file=self.folder / FILE, sequence=name):
-            try:
+            count = len(self.sequences[name].stored)
+            shapes = {**self.manifest.shapes, CHECKSUMS: ()}
+            with refused_as_damaged(f": {ADVICE}"):
                 row = self._rows[self._places[name]]
-                row.validate(full=True)  # Without this check, damaged offsets could crash the process.
-                lists = {column: row.column(column)[0].values.to_numpy() for column in (*ARRAYS, CHECKSUMS)}
-                count = len(self.sequences[name].stored)
-                shapes = {**self.manifest.shapes, CHECKSUMS: ()}
-                arrays = {column: values.reshape(count, *shapes[column]) for column, values in lists.items()}
+                arrays = {}
+                for column in (*ARRAYS, CHECKSUMS):
+                    values = row.column(column)[0].values.to_numpy()
+                    arrays[column] = values.reshape(count, *shapes[column])
                 stored_name = row.column("name")[0].as_py()
-            except (pa.ArrowException, OSError, ValueError, LookupError, AttributeError) as error:
-                raise UnreadableFile(f"damaged ({error}): {ADVICE}") from None
             if stored_name != name:
                 raise ChangedFile(f"another sequence is in its place: {ADVICE}")
             return arrays
 
-    def must_belong_to(self, source: SequenceSource, settings: dict[str, Scalar]) -> None:
+    def must_belong_to(self, source: SequenceSource, settings: Mapping[str, Scalar]) -> None:
         """Refuse a store that was made with other settings or from another data set."""
-        if differing := differences(self.origin.settings, settings):
+        differing = differences(self.origin.settings, settings)
+        if differing:
             raise DataError(f"encoded with {differing}: set these as they were, or encode again", str(self.folder))
         if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
             raise DataError("made from other data than the training set now: encode it again", str(self.folder))
@@ -242,29 +262,29 @@ class CachedTrainingScenes(TrainingScenes):
     """Items of `TrainingScenes` without targets, with the same sequence and reference frame for (seed, epoch, index).
 
     If only some frames of a sequence were encoded, the nearest one (the earlier of two) replaces the reference frame.
-    `store` determines the order of items; its images are not read. Box masks hide parts of images as in `augment`.
+    `store` determines the order of items; its images are not read. Box masks hide parts of images as in `Augmentation`.
 
     Raises:
         CompleteSplatError: there are box masks, but the store holds features instead of images.
     """
 
     cache: LatentCache
-    box_masks: BoxMasks | None
 
     def __post_init__(self) -> None:
-        if self.box_masks is not None and not self.cache.holds_images:
+        if self.augmentation.box_masks is not None and not self.cache.holds_images:
             advice = "use data.latent_cache=null, or encode images"
             raise CompleteSplatError(f"data.box_masks cannot hide parts of encoded features: {advice}")
 
     def draw(self, name: str, epoch: int, rng: np.random.Generator) -> CachedScene:
         """Draw a random reference frame of the sequence `name` and return its encoding."""
         sequence = self.cache.sequences[name]
-        reference, _ = self.choose(sequence.frames, epoch, rng)
+        reference, _ = self.views(sequence.frames, epoch, rng)
         stored = np.array(sequence.stored)
         scene = self.cache.scene(name, int(stored[np.abs(stored - reference).argmin()]))
-        if self.box_masks is None:
+        box_masks = self.augmentation.box_masks
+        if box_masks is None:
             return scene
-        boxes_rng = rng.spawn(3)[2]  # the third, as in `augment`
+        boxes_rng = rng.spawn(3)[2]  # the third, as in `Augmentation`
         height, width = scene.condition.shape[-2:]
-        visible = self.box_masks(height, width, boxes_rng)
+        visible = box_masks(height, width, boxes_rng)
         return replace(scene, condition=scene.condition * visible)

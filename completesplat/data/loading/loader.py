@@ -12,6 +12,7 @@ from torch.utils.data.dataloader import _BaseDataLoaderIter
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.scenes import EvaluationScenes, TrainingScenes, collate
 from completesplat.data.loading.view_selection import item_generator
+from completesplat.data.tolerance import ErrorTolerance
 from completesplat.errors import DataError
 from completesplat.signals import leave_to_parent
 
@@ -19,7 +20,7 @@ logger = logging.getLogger(__name__)
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
-    """Sampler of (epoch, item), one group after the other; (seed, epoch) determines the order of groups and items.
+    """Sampler of (epoch, item), one group after the other. (seed, epoch) determines the order of groups and items.
 
     Lightning calls `set_epoch` before every epoch, also after a resume. Several processes get different items, all
     equally many (the last few items may be left out).
@@ -42,14 +43,16 @@ class EpochSampler(Sampler[tuple[int, int]]):
         epoch = 0 if isinstance(self, RepeatedEpoch) else self.epoch
         # The index after the last belongs to no item, so the order is independent of what the items draw.
         rng = item_generator(self.seed, epoch, sum(map(len, self.groups)))
-        order = [i for group in rng.permutation(len(self.groups)) for i in rng.permutation(self.groups[group])]
+        order: list[int] = []
+        for group in rng.permutation(len(self.groups)):
+            order.extend(rng.permutation(self.groups[group]))
         rank, count = processes()
         local = order[rank::count][: len(self)]
         return iter([(epoch, int(index)) for index in local[self.start :]])
 
 
 class RepeatedEpoch(EpochSampler, SequentialSampler):  # type: ignore[misc]
-    """Sampler of the first epoch's items in all epochs, for `trainer.overfit_batches`; Lightning asks for its base."""
+    """Sampler of the first epoch's items in all epochs, for `trainer.overfit_batches`. Lightning asks for its base."""
 
 
 class SceneLoader:
@@ -59,7 +62,7 @@ class SceneLoader:
 
     Args:
         sampler: order of a training epoch; None: the order of `scenes`.
-        on_bad, max_bad_fraction: see `SceneDataModule`; skipped items are reported at the end of the epoch.
+        tolerance: rule for items that cannot be read; skipped ones are reported at the end of the epoch.
     """
 
     def __init__(
@@ -68,15 +71,13 @@ class SceneLoader:
         batch_size: int,
         sampler: EpochSampler | None,
         workers: int,
-        on_bad: str = "skip",
-        max_bad_fraction: float = 0.1,
+        tolerance: ErrorTolerance,
     ) -> None:
         self.dataset = scenes
         self.batch_size = batch_size
         self._order = sampler
         self.batch_sampler = None  # Lightning asks for it wherever there is a sampler
-        self.on_bad = on_bad
-        self.max_bad_fraction = max_bad_fraction
+        self.tolerance = tolerance
         self.refused: list[DataError] = []
         self.refused_depths: list[DataError] = []
         self._batches = 0
@@ -103,7 +104,8 @@ class SceneLoader:
         return self._loader.sampler
 
     @property
-    def _items(self) -> int:  # number of this process's items in an epoch
+    def _items(self) -> int:
+        """Number of this process's items in an epoch."""
         return len(self.dataset if self._order is None else self._order)
 
     def __iter__(self) -> Iterator[Any]:
@@ -157,22 +159,24 @@ class SceneLoader:
         self._resume = dict(state)
 
     def account(self, refused: Sequence[DataError], empty: bool) -> None:
-        """Count items that cannot be read; raise DataError if they are too many, or nothing is left (`empty`)."""
-        if refused and self.on_bad == "raise":
-            raise refused[0]
+        """Count items that cannot be read. Raise DataError if they are too many, or nothing is left (`empty`)."""
+        for error in refused:
+            self.tolerance.check(error)
         self.refused += refused
-        too_many = len(self.refused) > (self.max_bad_fraction and max(1, self.max_bad_fraction * self._items))
-        # Training replaces unreadable items, so an empty batch is an error there; evaluation does not replace them.
+        too_many = self.tolerance.is_exceeded(len(self.refused), self._items)
+        # Training replaces unreadable items, so an empty batch is an error there. Evaluation does not replace them.
         nothing = empty and (self._order is not None or len(self.refused) == self._items)
-        if too_many or nothing:
-            limit = f"more than data.max_bad_fraction={self.max_bad_fraction:g} allows"
-            what = f"{len(self.refused)} of {self._items} items cannot be read"
-            advice = f"see `completesplat data check`; the last one: {self.refused[-1]}"
-            raise DataError(f"{what}, {limit if too_many else 'and nothing in their place'}; {advice}")
+        if not (too_many or nothing):
+            return
+        limit = "and nothing in their place"
+        if too_many:
+            limit = f"more than data.max_bad_fraction={self.tolerance.max_bad_fraction:g} allows"
+        advice = f"see `completesplat data check`; the last one: {self.refused[-1]}"
+        raise DataError(f"{len(self.refused)} of {self._items} items cannot be read, {limit}; {advice}")
 
     def _report(self) -> None:
         if self.refused:
-            kinds = ", ".join(f"{count} {kind}" for kind, count in Counter(e.kind for e in self.refused).most_common())
-            count = f"{len(self.refused)} of {self._items}"
-            first = self.refused[0]
-            logger.warning("skipped %s items (%s); the first: %s", count, kinds, first)
+            counts = Counter(error.kind for error in self.refused)
+            kinds = ", ".join(f"{count} {kind}" for kind, count in counts.most_common())
+            share = f"{len(self.refused)} of {self._items}"
+            logger.warning("skipped %s items (%s); the first: %s", share, kinds, self.refused[0])

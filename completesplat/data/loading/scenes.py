@@ -1,4 +1,4 @@
-"""Datasets of scenes made from sequences, with views in the reference's frame; read errors are returned, not raised."""
+"""Datasets of scenes made from sequences, with views in the reference's frame. Read errors are returned, not raised."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -11,10 +11,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from completesplat.data.loading.augmentation import Augmentation
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.view_selection import Choice, item_generator
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
-from completesplat.errors import DataError, errors_at
+from completesplat.errors import CompleteSplatError, DataError, TooFewFrames, refused_to
 from completesplat.scene import CachedScene, SceneBatch, Views
 from completesplat.tensors import stack
 
@@ -64,6 +65,7 @@ class SceneStore:
         return SceneBatch(loaded[0], loaded[1:], depth_range, torch.ones_like(masks[0]), frame, sequence.name)
 
     def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
+        """Return one image of a sequence."""
         return self._read(sequence, view).image
 
     def _read(self, sequence: PosedSequence, view: int) -> MaskedImage:
@@ -76,7 +78,8 @@ class SceneStore:
 
     def _masks(self, pairs: Sequence[MaskedImage]) -> Float[Tensor, "view 1 size size"]:
         everywhere = torch.full_like(pairs[0].image[:1], 255)
-        masks = _as_floats([everywhere if pair.mask is None else pair.mask for pair in pairs])
+        stored = [everywhere if pair.mask is None else pair.mask for pair in pairs]
+        masks = _as_floats(stored)
         return masks if self.mask_threshold is None else (masks >= self.mask_threshold).float()
 
     def _on_background(self, pair: MaskedImage) -> MaskedImage:
@@ -94,18 +97,20 @@ def _as_floats(images: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, 
 
 @dataclass(eq=False)
 class TrainingScenes(Dataset[LoadedScenes]):
-    """Dataset of scenes with random views; a key is (epoch, index), see `EpochSampler`.
+    """Dataset of scenes with random views. A key is (epoch, index), see `EpochSampler`.
 
     An item that cannot be read is replaced by another one. All random choices depend on (seed, epoch, index) only.
 
     Args:
         choose: (number of frames, epoch, random generator) -> views.
+        targets: number of targets of a scene, which can all be different in a usable sequence.
         references: number of items of each sequence in one epoch.
     """
 
     store: SceneStore
     choose: Callable[[int, int, np.random.Generator], Choice]
-    augment: Callable[[SceneBatch, np.random.Generator], SceneBatch]
+    targets: int
+    augmentation: Augmentation
     references: int
     seed: int
 
@@ -118,25 +123,50 @@ class TrainingScenes(Dataset[LoadedScenes]):
         refused: list[DataError] = []
         for _ in range(ATTEMPTS):
             name = self.store.names[index // self.references]
-            try:
-                with errors_at(sequence=name):
-                    return LoadedScenes(self.draw(name, epoch, rng), tuple(refused))
-            except DataError as error:
-                refused.append(error)
-                index = int(rng.integers(len(self)))
+            with refused_to(refused.append, sequence=name):
+                return LoadedScenes(self.draw(name, epoch, rng), tuple(refused))
+            index = int(rng.integers(len(self)))
         return LoadedScenes(None, tuple(refused))
 
     def draw(self, name: str, epoch: int, rng: np.random.Generator) -> SceneBatch | CachedScene:
         """Return a scene of random views of the sequence `name`."""
         sequence = self.store.source.read(name)
-        scene = self.store.scene(sequence, *self.choose(len(sequence.frames), epoch, rng))
-        return self.augment(scene, rng)
+        reference, targets = self.views(len(sequence.frames), epoch, rng)
+        return self.augmentation(self.store.scene(sequence, reference, targets), rng)
+
+    def views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
+        """Choose the views of a sequence.
+
+        Raises:
+            TooFewFrames: its targets cannot all be different.
+        """
+        if frames <= self.targets:
+            raise TooFewFrames(f"{frames} frames, data.targets={self.targets} needs {self.targets + 1}")
+        return self.choose(frames, epoch, rng)
 
     def groups(self) -> list[list[int]]:
-        """Return groups of item indices; the items of a group are best loaded one after the other."""
-        offsets = range(self.references)
-        groups = self.store.source.groups(self.store.names)
-        return [[name * self.references + i for name in group for i in offsets] for group in groups]
+        """Return groups of item indices. The items of a group are best loaded one after the other."""
+        groups = []
+        for sequences in self.store.source.groups(self.store.names):
+            firsts = [sequence * self.references for sequence in sequences]
+            groups.append([first + offset for first in firsts for offset in range(self.references)])
+        return groups
+
+    def check(self, batch_size: int) -> None:
+        """Raise CompleteSplatError if an epoch has fewer scenes than a batch, or no sequence has enough frames."""
+        names = self.store.names
+        if batch_size > len(self):
+            scenes = f"{len(self)} scenes (data.references_per_sequence of each of {len(names)} sequences)"
+            raise CompleteSplatError(f"data.batch_size={batch_size}: an epoch has {scenes}; lower it")
+        most = 0
+        for name in names:
+            with suppress(DataError):
+                most = max(most, len(self.store.source.read(name).frames))
+            if most > self.targets:
+                return
+        if most > 1:
+            message = f"a scene needs {self.targets + 1} frames, training sequences have at most {most} frames"
+            raise CompleteSplatError(f"data.targets={self.targets}: {message}")
 
 
 @dataclass(eq=False)
@@ -146,14 +176,14 @@ class EvaluationScenes(Dataset[LoadedScenes]):
     Args:
         choose: sequence -> views; it raises a DataError if the sequence lacks one of them.
         names: sequences to evaluate.
-        seen: store of the smaller images that the model sees; None: it sees the images of `store`.
+        low_resolution: store of the smaller images that the model takes; None: it takes the images of `store`.
         depths: also read the true depth if the data set has it.
     """
 
     store: SceneStore
     choose: Callable[[PosedSequence], Choice]
     names: Sequence[str]
-    seen: SceneStore | None = None
+    low_resolution: SceneStore | None = None
     depths: bool = False
 
     def __len__(self) -> int:
@@ -171,18 +201,20 @@ class EvaluationScenes(Dataset[LoadedScenes]):
 
     def __getitem__(self, index: int) -> LoadedScenes:
         name = self.names[index]
-        try:
+        refused: list[DataError] = []
+        refused_depths: list[DataError] = []
+        with refused_to(refused.append):
             sequence = self.store.source.read(name)
-            views = self.choose(sequence)
-            scene = self.store.scene(sequence, *views)
-            if self.seen is not None:
-                scene = replace(scene, seen=self.seen.scene(self.seen.source.read(name), *views))
-        except DataError as error:
-            return LoadedScenes(None, (error,))
-        try:
-            return LoadedScenes(with_true_depths(scene, sequence, *views) if self.depths else scene, ())
-        except DataError as error:
-            return LoadedScenes(scene, (), (error,))
+            reference, targets = self.choose(sequence)
+            scene = self.store.scene(sequence, reference, targets)
+            if self.low_resolution is not None:
+                smaller = self.low_resolution.source.read(name)
+                scene = replace(scene, low_resolution=self.low_resolution.scene(smaller, reference, targets))
+            if self.depths:
+                with refused_to(refused_depths.append):
+                    scene = with_true_depths(scene, sequence, reference, targets)
+            return LoadedScenes(scene, (), tuple(refused_depths))
+        return LoadedScenes(None, tuple(refused))
 
     def stackable(self) -> bool:
         """Return whether all scenes that can be read have the same number of targets."""
@@ -213,13 +245,11 @@ def _with_any_depths(scene: SceneBatch | CachedScene) -> SceneBatch | CachedScen
 
 
 def collate(items: Sequence[LoadedScenes]) -> LoadedScenes:
-    """Stack the scenes that could be read; if only some have depths, the depths of the others are 0 (unknown)."""
+    """Stack the scenes that could be read. If only some have depths, those of the remaining ones are 0 (unknown)."""
     scenes = [item.scenes for item in items if item.scenes is not None]
     unknown = [isinstance(scene, SceneBatch) and scene.reference.depths is None for scene in scenes]
     if any(unknown) and not all(unknown):
-        scenes = list(map(_with_any_depths, scenes))
-    return LoadedScenes(
-        stack(scenes) if scenes else None,
-        tuple(error for item in items for error in item.refused),
-        tuple(error for item in items for error in item.refused_depths),
-    )
+        scenes = [_with_any_depths(scene) for scene in scenes]
+    refused = tuple(error for item in items for error in item.refused)
+    refused_depths = tuple(error for item in items for error in item.refused_depths)
+    return LoadedScenes(stack(scenes) if scenes else None, refused, refused_depths)

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from completesplat.data.images.photograph import image_features
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras
+from completesplat.photo.features import image_features
 
 # A mean over all images of RealEstate10K's 66,033 training clips would take hours.
 SEQUENCES = 400
@@ -32,7 +32,7 @@ class TypicalCamera(NamedTuple):
 
 
 def typical_camera(sequences: Sequence[Cameras], depth_ranges: Sequence[Float[Tensor, "_ 2"]]) -> TypicalCamera:
-    """Average over all cameras of all sequences; each sequence is a batch [view] of cameras."""
+    """Average over all cameras of all sequences, each of which is a batch [view]."""
     focal = torch.cat([cameras.intrinsics[:, 0, 0] for cameras in sequences])
     width = sequences[0].image_size[1]
     near, far = torch.cat(list(depth_ranges)).mean(dim=0).tolist()
@@ -57,15 +57,19 @@ def world_up(cameras: Cameras) -> Float[Tensor, "3"]:
 
 
 def mean_camera(store: SceneStore) -> TypicalCamera:
-    """Return the typical camera of at most 8,192 frames from the first 400 sequences; at least one must be readable."""
-    chosen = list(excerpts(store))
-    if not chosen:
+    """Return the typical camera of at most 8,192 frames from the first 400 sequences, of which one must be readable."""
+    cameras = []
+    depth_ranges = []
+    for sequence, frames in excerpts(store):
+        cameras.append(sequence.cameras[frames])
+        depth_ranges.append(sequence.depth_ranges[frames])
+    if not cameras:
         raise DataError("no training sequence can be read")
-    return typical_camera([s.cameras[f] for s, f in chosen], [s.depth_ranges[f] for s, f in chosen])
+    return typical_camera(cameras, depth_ranges)
 
 
 def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]:
-    """Average the images of the same frames; return black if none can be read."""
+    """Average the images of the same frames. The mean is black if none can be read."""
     total = torch.zeros(3, size, size, dtype=torch.float64)
     count = 0
     for image in _images(store, IMAGES):
@@ -75,7 +79,7 @@ def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]
 
 
 def feature_moments(store: SceneStore) -> dict[str, list[float]]:
-    """Return mean and standard deviation of `image_features` over about 1,024 images; empty if none can be read."""
+    """Return mean and standard deviation of `image_features` over about 1,024 images, if some can be read."""
     rows = [image_features(image.double() / 255) for image in _images(store, FEATURE_IMAGES)]
     if not rows:
         return {}

@@ -29,7 +29,75 @@ class GrowingGap:
             raise CompleteSplatError("data.max_gap: needs 1 <= first <= last and 0 <= epochs")
 
     def at(self, epoch: int) -> int:
-        return round(self.first + (self.last - self.first) * min(epoch / max(self.epochs, 1), 1))
+        """Return the gap of an epoch."""
+        progress = min(epoch / max(self.epochs, 1), 1)
+        return round(self.first + (self.last - self.first) * progress)
+
+
+@dataclass(frozen=True)
+class ObjectViews:
+    """Views of a sequence that surrounds an object.
+
+    Args:
+        targets: number of targets of a training scene.
+        spread_targets: spread them around the reference (`draw_spread_views`); false: draw them at random.
+        test_targets: largest number of evenly spaced targets of a test scene; None: all other frames.
+        validation_targets: the same for validation; None: as for a test.
+    """
+
+    targets: int
+    spread_targets: bool
+    test_targets: int | None
+    validation_targets: int | None
+
+    def training(self, frames: int, rng: np.random.Generator) -> Choice:
+        """Draw reference and targets of a training scene."""
+        draw = draw_spread_views if self.spread_targets else training_views
+        return draw(frames, self.targets, rng)
+
+    def evaluation(self, frames: int, split: str) -> Choice:
+        """Return the first frame as reference and others as targets."""
+        targets = self.test_targets
+        if split == "val" and self.validation_targets is not None:
+            targets = self.validation_targets
+        return evaluation_views(frames, targets)
+
+    def described_targets(self) -> str:
+        """Return the targets of a test in words."""
+        return "its other frames" if self.test_targets is None else f"{self.test_targets} others"
+
+
+@dataclass(frozen=True)
+class ClipViews:
+    """Views of a video clip, near to its reference.
+
+    Args:
+        min_gap, max_gap: smallest and largest distance in frames from the reference to a training target.
+        evaluation_targets: number of evenly spaced targets of validation and test.
+        evaluation_gap: distance of the last of them from the reference.
+    """
+
+    min_gap: int
+    max_gap: GrowingGap
+    evaluation_targets: int
+    evaluation_gap: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.min_gap <= self.max_gap.first:
+            raise CompleteSplatError("data: needs 1 <= min_gap <= max_gap")
+
+    def training(self, frames: int, targets: int, epoch: int, rng: np.random.Generator) -> Choice:
+        """Draw reference and targets of a training scene."""
+        return nearby_views(frames, targets, self.min_gap, self.max_gap.at(epoch), rng)
+
+    def evaluation(self, frames: int) -> Choice:
+        """Return the first frame as reference, and targets after it."""
+        return evaluation_views_within(frames, self.evaluation_targets, self.evaluation_gap)
+
+    def described(self) -> str:
+        """Return the views of a test in words."""
+        targets = f"{self.evaluation_targets} targets, the last {self.evaluation_gap} frames away"
+        return f"reference: first frame; {targets}"
 
 
 def item_generator(seed: int, epoch: int, index: int) -> np.random.Generator:
@@ -56,17 +124,18 @@ def spread_around(frames: int, reference: int, count: int) -> list[int]:
 
 
 def draw_spread_views(frames: int, targets: int, rng: np.random.Generator) -> Choice:
-    """Draw a random reference; return it and `targets` frames all around it (`spread_around`) in random order."""
+    """Draw a random reference, and `targets` frames all around it (`spread_around`) in random order."""
     reference = int(rng.integers(frames))
     return reference, rng.permutation(spread_around(frames, reference, targets)).tolist()
 
 
 def evaluation_views(frames: int, targets: int | None) -> Choice:
     """Return the first frame as reference, and all others or at most `targets` evenly spaced ones as targets."""
-    others = np.arange(1, frames)
-    if targets is not None and targets < len(others):
-        others = others[np.round((np.arange(targets) + 0.5) * len(others) / targets - 0.5).astype(int)]
-    return 0, others.tolist()
+    candidates = np.arange(1, frames)
+    if targets is None or targets >= len(candidates):
+        return 0, candidates.tolist()
+    middles = (np.arange(targets) + 0.5) * len(candidates) / targets
+    return 0, candidates[np.round(middles - 0.5).astype(int)].tolist()
 
 
 def nearby_views(frames: int, targets: int, min_gap: int, max_gap: int, rng: np.random.Generator) -> Choice:
@@ -79,7 +148,8 @@ def nearby_views(frames: int, targets: int, min_gap: int, max_gap: int, rng: np.
     positions = np.arange(frames)
     reference = int(rng.choice(positions[np.maximum(positions, frames - 1 - positions) >= nearest]))
     gap = np.abs(positions - reference)
-    return reference, np.resize(rng.permutation(positions[(gap >= nearest) & (gap <= max_gap)]), targets).tolist()
+    neighbours = positions[(gap >= nearest) & (gap <= max_gap)]
+    return reference, np.resize(rng.permutation(neighbours), targets).tolist()
 
 
 def evaluation_views_within(frames: int, targets: int, gap: int) -> Choice:
@@ -87,4 +157,5 @@ def evaluation_views_within(frames: int, targets: int, gap: int) -> Choice:
 
     In a shorter sequence the last target is the last frame. Targets repeat if there are too few frames.
     """
-    return 0, np.ceil(min(gap, frames - 1) * np.arange(1, targets + 1) / targets).astype(int).tolist()
+    last = min(gap, frames - 1)
+    return 0, np.ceil(last * np.arange(1, targets + 1) / targets).astype(int).tolist()

@@ -1,4 +1,4 @@
-"""Manifest of a packed store (`manifest.json`, which is written last); the reader of any manifest."""
+"""Manifest of a packed store, `manifest.json`, which is written last."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,7 +9,8 @@ from completesplat.data.validation import field, parsed, read_json
 from completesplat.errors import BadAnnotation, DataError, UnreadableFile, errors_at
 
 MANIFEST = "manifest.json"
-HEADER = {"format": 2}
+FORMAT = 2
+HEADER = {"format": FORMAT}
 
 Scalar = str | int | float | bool | None
 T = TypeVar("T")
@@ -27,6 +28,7 @@ class Refusal:
 
     @staticmethod
     def of(error: DataError) -> "Refusal":
+        """Return the record of an error."""
         return Refusal(error.kind, error.reason, error.file, error.sequence, error.frame)
 
 
@@ -65,7 +67,7 @@ class Split:
 
 @dataclass(frozen=True)
 class PackedManifest:
-    """Manifest of a whole store; its images and cameras depend on `settings`."""
+    """Manifest of a whole store. Its images and cameras depend on `settings`."""
 
     codec: str
     settings: dict[str, Scalar]
@@ -78,7 +80,7 @@ def is_packed(root: Path) -> bool:
 
 
 def read_manifest(root: Path) -> PackedManifest:
-    """Read the manifest of a store; errors as in `read_as`."""
+    """Read the manifest of a store, with the errors of `read_as`."""
     return read_as(PackedManifest, root / MANIFEST, HEADER, "prepare the data again")
 
 
@@ -105,9 +107,10 @@ def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:
     """
     stored = read_manifest(root).settings
     wanted = dict(settings)
-    sizes = stored.get("image_size"), wanted.get("image_size")
-    if isinstance(sizes[0], int) and isinstance(sizes[1], int) and sizes[0] > sizes[1]:
-        wanted["image_size"] = sizes[0]  # larger images are reduced when they are read
+    stored_size = stored.get("image_size")
+    wanted_size = wanted.get("image_size")
+    if isinstance(stored_size, int) and isinstance(wanted_size, int) and stored_size > wanted_size:
+        wanted["image_size"] = stored_size  # larger images are reduced when they are read
     differing = differences(stored, wanted)
     if differing:
         advice = "set these as they were, or prepare the data again into another folder"

@@ -9,11 +9,11 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import pyarrow as pa
 from filelock import FileLock
 
 from completesplat.data.packed.manifest import MANIFEST, Shard, read_manifest
 from completesplat.data.packed.rows import SCHEMA, from_row
+from completesplat.data.packed.shards import OpenShard
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import path_below, require_file
 from completesplat.errors import BadAnnotation, ChangedFile, DataError, MissingFile, UnreadableFile, errors_at
@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 
 def local_root(root: str) -> Path:
-    """Return a local folder as it is; for an address, fetch the manifest into a folder below `COMPLETESPLAT_CACHE`.
+    """Return a local folder as it is. For an address, fetch the manifest into a folder below `COMPLETESPLAT_CACHE`.
 
     A store that was made again at the same address gets another folder, which depends on the manifest's digest.
 
@@ -45,15 +45,16 @@ def local_root(root: str) -> Path:
             if not (folder / MANIFEST).is_file():
                 raise
             logger.warning("%s; the manifest fetched before is used", error)
-        store = folder / _digest((folder / MANIFEST).read_bytes())
+        manifest = (folder / MANIFEST).read_bytes()
+        store = folder / _digest(manifest)
         store.mkdir(exist_ok=True)
-        for name, content in ((ADDRESS, root.encode()), (MANIFEST, (folder / MANIFEST).read_bytes())):
-            write_bytes(store / name, content)
+        write_bytes(store / ADDRESS, root.encode())
+        write_bytes(store / MANIFEST, manifest)
     return store
 
 
 def _fetch(address: str, shard: Shard, path: Path) -> None:
-    """Fetch a shard if its local file is missing; one process fetches it while the others wait.
+    """Fetch a shard if its local file is missing. One process fetches it, and all that need it wait.
 
     Raises:
         MissingFile: the shard cannot be fetched.
@@ -102,9 +103,10 @@ class PackedSource(SequenceSource):
         self.image_size = image_size
         self.shards = entry.shards
         self._fingerprint = entry.fingerprint
-        self._places = {
-            name: (number, row) for number, shard in enumerate(self.shards) for row, name in enumerate(shard.sequences)
-        }
+        self._places: dict[str, tuple[int, int]] = {}
+        for number, shard in enumerate(self.shards):
+            for row, name in enumerate(shard.sequences):
+                self._places[name] = (number, row)
         self._opened: dict[int, OpenShard] = {}
         address = root / ADDRESS
         # None: the store was made or copied here.
@@ -112,23 +114,22 @@ class PackedSource(SequenceSource):
         with errors_at(file=root / MANIFEST):
             for shard in self.shards:
                 path = path_below(root, shard.file)
-                absent = self.address is not None and not path.is_file()
-                if not absent and (size := require_file(path).stat().st_size) != shard.bytes:
+                if self.address is not None and not path.is_file():
+                    continue  # it is fetched when it is read
+                size = require_file(path).stat().st_size
+                if size != shard.bytes:
                     reason = f"{size:,} bytes, {shard.bytes:,} were written: prepare again into the same folder"
                     raise ChangedFile(reason, str(path))
 
     def read(self, name: str) -> PosedSequence:
-        """Read one sequence, unless its shard is damaged; its images are decoded one by one when they are read."""
+        """Read one sequence, unless its shard is damaged. Its images are decoded one by one when they are read."""
         number, row = self._places[name]
         path = self.root / self.shards[number].file
         with errors_at(file=path, sequence=name):
-            try:
-                table = self._shard(number, path)[row]
-            except (pa.ArrowException, OSError, ValueError) as error:
-                raise UnreadableFile(f"damaged, or not an Arrow file ({error})") from None
+            table = self._shard(number, path)[row]
         return from_row(table, str(path), name, self.image_size)
 
-    def _shard(self, number: int, path: Path) -> "OpenShard":
+    def _shard(self, number: int, path: Path) -> OpenShard:
         if number not in self._opened:
             shard = self.shards[number]
             if self.address is not None:
@@ -155,37 +156,17 @@ class PackedSource(SequenceSource):
         return self._fingerprint
 
     def verify(self) -> list[ChangedFile]:
-        """Read all shards of this split, of a store behind an address those fetched, and return those that changed."""
+        """Read all shards of this split that are on this machine, and return those that changed."""
         reason = "its checksum is no longer that of the manifest: remove it and prepare again into the same folder"
-        there = [shard for shard in self.shards if self.address is None or (self.root / shard.file).exists()]
-        paths = {require_file(self.root / shard.file): shard.sha256 for shard in there}
-        return [ChangedFile(reason, str(path)) for path, checksum in paths.items() if sha256_of(path) != checksum]
+        changed = []
+        for shard in self.shards:
+            path = self.root / shard.file
+            if self.address is not None and not path.exists():
+                continue
+            if sha256_of(require_file(path)) != shard.sha256:
+                changed.append(ChangedFile(reason, str(path)))
+        return changed
 
     def __getstate__(self) -> dict[str, object]:
         # Worker processes open the files themselves and share their memory pages.
         return {**self.__dict__, "_opened": {}}
-
-
-class OpenShard:
-    """Memory-mapped shard, whose rows are record batches that are parsed when they are read.
-
-    Arrow's description of a parsed batch takes 8 kB, or half a gigabyte in every process for all RealEstate10K clips.
-    """
-
-    def __init__(self, path: Path) -> None:
-        with pa.memory_map(str(path)) as file:
-            self._content = file.read_buffer()  # not a copy; the file itself need not stay open
-        stream = pa.BufferReader(self._content)
-        self.schema = pa.ipc.read_schema(stream)
-        self.places: list[int] = []
-        while (place := stream.tell()) < self._content.size:
-            try:
-                pa.ipc.read_message(stream)
-            except EOFError:  # the end-of-stream mark
-                break
-            self.places.append(place)
-
-    def __getitem__(self, row: int) -> pa.Table:
-        stream = pa.BufferReader(self._content)
-        stream.seek(self.places[row])
-        return pa.Table.from_batches([pa.ipc.read_record_batch(pa.ipc.read_message(stream), self.schema)])

@@ -10,16 +10,14 @@ import json
 import os
 from collections import Counter
 from collections.abc import Sequence
-from os.path import isfile
+from os.path import isdir, isfile
 from pathlib import Path
 from typing import NamedTuple, TypeGuard
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.files import decode_image, stored_size
 from completesplat.data.validation import LARGEST, ROTATION_TOLERANCE, path_below, read_json, read_text, require_file
 from completesplat.errors import (
     BadAnnotation,
@@ -33,6 +31,8 @@ from completesplat.errors import (
     refused_to,
 )
 from completesplat.geometry.cameras import Cameras
+from completesplat.photo.crop import Square, cut_square
+from completesplat.photo.files import decode_image, stored_size
 from completesplat.weights.checkpoint_reading import read_tensor_file
 
 CAMERA_NUMBERS = 18
@@ -62,11 +62,12 @@ class Clip(NamedTuple):
     def read(self, frame: int, square: Square, size: int) -> UInt8[Tensor, "3 {size} {size}"]:
         """Return the square part of a frame's image, resized to `size`."""
         stored = _stored(self.images[frame], self.source)
-        return cut_square(decode_image(*stored, "RGB", self.cameras.image_size), square, size)
+        image = decode_image(*stored, "RGB", self.cameras.image_size)
+        return cut_square(image, square, size)
 
 
 def make_clip(key: str, source: Path, timestamps: Sequence[int], rows: Float[Tensor, "_ 18"], images: Images) -> Clip:
-    """Convert stored rows and images to a clip; the first image determines the size.
+    """Convert stored rows and images to a clip, of which the first image determines the size.
 
     Raises:
         TooFewFrames: there are fewer than two frames.
@@ -84,16 +85,15 @@ def make_clip(key: str, source: Path, timestamps: Sequence[int], rows: Float[Ten
     rotation = world_to_camera[:, :, :3]
     deviation = (rotation @ rotation.mT - torch.eye(3, dtype=rows.dtype)).abs().amax(dim=(1, 2))
     rigid = (deviation <= ROTATION_TOLERANCE) & (torch.linalg.det(rotation) > 0)
-    for bad, kind, reason in (
-        (torch.tensor([count[time] > 1 for time in timestamps]), BadAnnotation, "another frame has its timestamp"),
-        (~(rows.abs() < LARGEST).all(dim=1), BadAnnotation, "camera with numbers that are not finite in float32"),
-        ((rows[:, :2] <= 0).any(dim=1), BadCamera, "focal length is not positive"),
-        ((rows[:, 4:6] != 0).any(dim=1), BadCamera, "lens distortion is not supported"),
-        (~rigid, BadCamera, "pose is not a rotation and translation"),
-    ):
-        if bad.any():
-            raise kind(reason, frame=int(bad.nonzero()[0]))
-    intrinsics, pose = (torch.eye(n, dtype=rows.dtype).repeat(len(rows), 1, 1) for n in (3, 4))
+    repeated = torch.tensor([count[time] > 1 for time in timestamps])
+    infinite = ~(rows.abs() < LARGEST).all(dim=1)
+    _refuse_frames(repeated, BadAnnotation, "another frame has its timestamp")
+    _refuse_frames(infinite, BadAnnotation, "camera with numbers that are not finite in float32")
+    _refuse_frames((rows[:, :2] <= 0).any(dim=1), BadCamera, "focal length is not positive")
+    _refuse_frames((rows[:, 4:6] != 0).any(dim=1), BadCamera, "lens distortion is not supported")
+    _refuse_frames(~rigid, BadCamera, "pose is not a rotation and translation")
+    intrinsics = torch.eye(3, dtype=rows.dtype).repeat(len(rows), 1, 1)
+    pose = torch.eye(4, dtype=rows.dtype).repeat(len(rows), 1, 1)
     sides = rows.new_tensor(size[::-1])
     intrinsics[:, [0, 1], [0, 1]] = rows[:, :2] * sides
     intrinsics[:, :2, 2] = rows[:, 2:4] * sides
@@ -101,21 +101,30 @@ def make_clip(key: str, source: Path, timestamps: Sequence[int], rows: Float[Ten
     return Clip(key, source, Cameras(pose, intrinsics, size), images)
 
 
+def _refuse_frames(bad: Bool[Tensor, " view"], kind: type[DataError], reason: str) -> None:
+    """Refuse a clip with bad frames, and name the first of them."""
+    if bad.any():
+        raise kind(reason, frame=int(bad.nonzero()[0]))
+
+
 def _stored(image: Path | Tensor, source: Path) -> tuple[Path | bytes, str]:
     """Return an image's file or content, and the file to name in errors."""
-    return (image, str(image)) if isinstance(image, Path) else (image.numpy().tobytes(), str(source))
+    if isinstance(image, Path):
+        return image, str(image)
+    return image.numpy().tobytes(), str(source)
 
 
 class TextClips:
-    """Clips of one folder that have a folder of frames; `missing` names the clips without one."""
+    """Clips of one folder that have a folder of frames. `missing` names the clips without one."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         with os.scandir(folder) as entries:
-            folders = {entry.name: _is_folder(entry) for entry in entries}
-        texts = sorted(name.removesuffix(".txt") for name in folders if name.endswith(".txt"))
-        self.keys = [key for key in texts if folders.get(key)]
-        self.missing = [key for key in texts if not folders.get(key)]
+            names = [entry.name for entry in entries]
+        texts = sorted(name.removesuffix(".txt") for name in names if name.endswith(".txt"))
+        folders = {key for key in set(texts).intersection(names) if isdir(folder / key)}
+        self.keys = [key for key in texts if key in folders]
+        self.missing = [key for key in texts if key not in folders]
         self.refused: list[DataError] = []
 
     def chunks(self, keys: Sequence[str]) -> list[list[int]]:
@@ -123,7 +132,7 @@ class TextClips:
         return [list(range(len(keys)))]
 
     def clip(self, key: str) -> Clip:
-        """Read a clip's text file and list its frames; refuse a malformed text file or a missing frame."""
+        """Read a clip's text file and list its frames, or refuse a malformed text file or a missing frame."""
         path = self.folder / f"{key}.txt"
         with errors_at(path, key):
             timestamps, rows = _read_text(path)
@@ -137,16 +146,11 @@ class TextClips:
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the text files' names and sizes (reading tens of thousands would be slow)."""
-        texts = [(key, self.folder / f"{key}.txt") for key in self.keys]
-        sizes = [(key, text.stat().st_size if text.is_file() else None) for key, text in texts]
+        sizes: list[tuple[str, int | None]] = []
+        for key in self.keys:
+            text = self.folder / f"{key}.txt"
+            sizes.append((key, text.stat().st_size if text.is_file() else None))
         return hashlib.sha256(json.dumps(sizes).encode()).hexdigest()
-
-
-def _is_folder(entry: os.DirEntry[str]) -> bool:
-    try:
-        return entry.is_dir()
-    except OSError:  # a ring of links
-        return False
 
 
 def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
@@ -154,7 +158,9 @@ def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
     timestamps = []
     rows = []
     lines = [line.split() for line in read_text(path, MOST_BYTES).splitlines() if line.strip()]
-    for frame, columns in enumerate(lines[1:] if lines and len(lines[0]) == 1 else lines):
+    if lines and len(lines[0]) == 1:
+        del lines[0]
+    for frame, columns in enumerate(lines):
         with errors_at(frame=frame):
             if len(columns) != 1 + CAMERA_NUMBERS:
                 raise BadAnnotation(f"{len(columns)} columns instead of {1 + CAMERA_NUMBERS}")
@@ -167,18 +173,18 @@ def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
 
 
 def _images_of(folder: Path) -> dict[int, Path]:
-    """Return image files by timestamp; JPEG is preferred to PNG."""
+    """Return image files by timestamp, where JPEG is preferred to PNG."""
     try:
         paths = list(folder.iterdir())
     except OSError as error:
         raise UnreadableFile(f"cannot be listed ({error.strerror})", str(folder)) from None
-    suffixes = {path: path.suffix.lower() for path in paths}
-    ordered = sorted((path for path in paths if suffixes[path] in SUFFIXES), key=lambda path: suffixes[path] != ".png")
-    return {int(path.stem): path for path in ordered if path.stem.isdecimal()}
+    images = [path for path in paths if path.suffix.lower() in SUFFIXES and path.stem.isdecimal()]
+    png_first = sorted(images, key=lambda path: path.suffix.lower() != ".png")
+    return {int(path.stem): path for path in png_first}
 
 
 class ChunkedClips:
-    """Clips of one folder whose chunks exist; at most two chunks (about 100 MB each) are in memory.
+    """Clips of one folder whose chunks exist, with at most two chunks (about 100 MB each) in memory.
 
     Attributes:
         keys: names of the clips, in the order of their files.
@@ -205,13 +211,14 @@ class ChunkedClips:
         self._loaded: dict[Path, Chunk] = {}
 
     def chunks(self, keys: Sequence[str]) -> list[list[int]]:
+        """Group clips by their chunks."""
         members: dict[Path, list[int]] = {}
         for number, key in enumerate(keys):
             members.setdefault(self._files[key], []).append(number)
         return list(members.values())
 
     def clip(self, key: str) -> Clip:
-        """Return a clip from its chunk, which is read unless it is in memory; refuse an unreadable chunk or clip."""
+        """Return a clip from its chunk, which is read unless it is in memory, or refuse an unreadable chunk or clip."""
         path = self._files[key]
         with errors_at(path, key):
             chunk = self._chunk(path)
@@ -229,8 +236,9 @@ class ChunkedClips:
         if path not in self._loaded and len(self._loaded) >= CHUNKS_IN_MEMORY:
             # Delete the least recently used chunk before reading the next one, so that there are never three.
             del self._loaded[next(iter(self._loaded))]
-        self._loaded[path] = self._loaded.pop(path) if path in self._loaded else read_chunk(path)
-        return self._loaded[path]
+        chunk = self._loaded.pop(path) if path in self._loaded else read_chunk(path)
+        self._loaded[path] = chunk  # the last one, as the most recently used
+        return chunk
 
 
 def read_chunk(path: Path) -> Chunk:
@@ -246,7 +254,7 @@ def read_chunk(path: Path) -> Chunk:
         content = read_tensor_file(path)
     except TensorFileError as error:
         raise UnreadableFile(f"not a chunk that can be read safely ({error})", str(path)) from None
-    if not isinstance(content, list) or not all(isinstance(e, dict) and isinstance(e.get("key"), str) for e in content):
+    if not isinstance(content, list) or not all(map(_has_key, content)):
         raise BadAnnotation("not a list of clips with keys", str(path))
     chunk = {entry["key"]: entry for entry in content}
     if len(chunk) < len(content):
@@ -254,7 +262,12 @@ def read_chunk(path: Path) -> Chunk:
     return chunk
 
 
+def _has_key(entry: object) -> bool:
+    return isinstance(entry, dict) and isinstance(entry.get("key"), str)
+
+
 def _clip_from_entry(path: Path, key: str, entry: dict[str, object]) -> Clip:
+    """Check an entry of a chunk and return its clip."""
     images = entry.get("images")
     times = entry.get("timestamps")
     rows = entry.get("cameras")

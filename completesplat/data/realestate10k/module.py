@@ -8,18 +8,19 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
-from completesplat.data.images.crop import Square, principal_square
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import EvaluationScenes
-from completesplat.data.loading.view_selection import Choice, GrowingGap, evaluation_views_within, nearby_views
+from completesplat.data.loading.view_selection import Choice, ClipViews, GrowingGap
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.realestate10k.clips import ChunkedClips, Clip, TextClips
-from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys
-from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource, split_by_hash
+from completesplat.data.realestate10k.evaluation_index import EvaluationIndex, choose_clips, read_index, read_keys
+from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
+from completesplat.data.splits import split_by_hash
 from completesplat.data.validation import require_file
 from completesplat.errors import CompleteSplatError, DataError, errors_at, refused_to
 from completesplat.geometry.cameras import crop_resize
-from completesplat.settings.schema import Natural, Positive, Share
+from completesplat.photo.crop import Square, principal_square
+from completesplat.quantities import Natural, Positive, Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 
@@ -27,7 +28,7 @@ Clips = TextClips | ChunkedClips
 
 
 class ClipFraming(NamedTuple):
-    """Settings of images and cameras; see `RE10KDataModule`."""
+    """Settings of images and cameras, which `RE10KDataModule` explains."""
 
     image_size: int
     crop: str
@@ -46,7 +47,7 @@ def open_clips(folder: Path) -> Clips:
 
 
 class RE10KSource(SequenceSource):
-    """Some clips of one folder; see `SequenceSource`. Several sources may share `clips`."""
+    """Some clips of one folder. Several sources may share `clips`."""
 
     def __init__(self, clips: Clips, names: list[str], framing: ClipFraming) -> None:
         left_out = {"frames are missing": clips.missing} if clips.missing else {}
@@ -62,7 +63,7 @@ class RE10KSource(SequenceSource):
         return self._clips.fingerprint()
 
     def read(self, name: str) -> PosedSequence:
-        """Read one clip's cameras; its images are read by `PosedSequence.read`."""
+        """Read one clip's cameras. `PosedSequence.read` reads its images."""
         clip = self._clips.clip(name)
         framing = self.framing
         count = len(clip.images)
@@ -80,7 +81,10 @@ class RE10KSource(SequenceSource):
 def _square(clip: Clip, crop: str, frame: int) -> Square:
     height, width = clip.cameras.image_size
     with errors_at(clip.source, clip.key, frame):
-        x, y = clip.cameras.intrinsics[frame, :2, 2].tolist() if crop == "principal" else (width / 2, height / 2)
+        x = width / 2
+        y = height / 2
+        if crop == "principal":
+            x, y = clip.cameras.intrinsics[frame, :2, 2].tolist()
         return principal_square((x, y), (height, width))
 
 
@@ -130,13 +134,10 @@ class RE10KDataModule(SceneDataModule):
         **settings: Any,
     ) -> None:
         super().__init__(root, **settings)
-        self.max_gap = GrowingGap(max_gap, max_gap, 0) if isinstance(max_gap, int) else GrowingGap(**max_gap)
-        if not 1 <= min_gap <= self.max_gap.first:
-            raise CompleteSplatError("data: needs 1 <= min_gap <= max_gap")
+        largest = GrowingGap(max_gap, max_gap, 0) if isinstance(max_gap, int) else GrowingGap(**max_gap)
+        self.views = ClipViews(min_gap, largest, evaluation_targets, evaluation_gap or largest.last)
         if not 0 < near < far or not scale > 0:
             raise CompleteSplatError("data: needs 0 < near < far and 0 < scale")
-        self.min_gap = min_gap
-        self.evaluation = evaluation_targets, evaluation_gap or self.max_gap.last
         self.evaluation_index = Path(evaluation_index) if evaluation_index else None
         self.scene_list = Path(scene_list) if scene_list else None
         self.framing = ClipFraming(self.image_size, crop, scale, near, far)
@@ -150,16 +151,18 @@ class RE10KDataModule(SceneDataModule):
         return None if self.evaluation_index is None else read_index(self.evaluation_index)
 
     def describe(self) -> dict[str, str]:
-        """Return facts for results; a file is named by its checksum, an index also by its format."""
-        views = "reference: first frame; {} targets, the last {} frames away".format(*self.evaluation)
-        if self.index is not None:
-            views = f"index in {self.index.form}'s format, SHA-256 {_checksum(self.evaluation_index)}"
-        return {
+        """Return facts for results, in which a file is named by its checksum, and an index also by its format."""
+        facts = {
             "data_set": "realestate10k",
             "crop": f"largest square, {self.framing.crop}",
-            "protocol_views": views,
-            **({} if self.scene_list is None else {"scene_list": f"SHA-256 {_checksum(self.scene_list)}"}),
+            "protocol_views": self.views.described(),
         }
+        if self.index is not None and self.evaluation_index is not None:
+            checksum = _checksum(self.evaluation_index)
+            facts["protocol_views"] = f"index in {self.index.form}'s format, SHA-256 {checksum}"
+        if self.scene_list is not None:
+            facts["scene_list"] = f"SHA-256 {_checksum(self.scene_list)}"
+        return facts
 
     def packed_settings(self) -> dict[str, Scalar]:
         return {**self.framing._asdict(), "val_fraction": self.val_fraction, "val_seed": self.val_seed}
@@ -172,9 +175,12 @@ class RE10KDataModule(SceneDataModule):
         clips = open_clips(self.root / "train")
         train, val = split_by_hash(clips.keys, self.val_fraction, self.val_seed)
         # Both sources share the two chunks in memory.
-        return {"train": RE10KSource(clips, train, self.framing), "val": RE10KSource(clips, val, self.framing)}
+        return {
+            "train": RE10KSource(clips, train, self.framing),
+            "val": RE10KSource(clips, val, self.framing),
+        }
 
-    def evaluated(self, split: str, source: SequenceSource) -> SequenceSource:
+    def select_sequences(self, split: str, source: SequenceSource) -> SequenceSource:
         """Select the test clips that are in the evaluation index and in the scene list."""
         if split != "test":
             return source
@@ -195,20 +201,19 @@ class RE10KDataModule(SceneDataModule):
 
     def stackable(self, scenes: EvaluationScenes) -> bool:
         """Decide by the evaluation index, because reading all clips would take hours."""
-        views = self._test_views
-        return len({len(views[name][1]) for name in scenes.store.names if name in views}) <= 1
+        views = [self._test_views[name] for name in scenes.store.names if name in self._test_views]
+        return len({len(targets) for _, targets in views}) <= 1
 
     def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
-        return nearby_views(frames, self.targets, self.min_gap, self.max_gap.at(epoch), rng)
+        return self.views.training(frames, self.targets, epoch, rng)
 
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
-        """Return the views of the evaluation index; without an index, the first frame and frames after it."""
+        """Return the views of the evaluation index or, without one, the first frame and frames after it."""
         if sequence.name not in self._test_views:
-            return evaluation_views_within(len(sequence.frames), *self.evaluation)
+            return self.views.evaluation(len(sequence.frames))
         reference, targets = self._test_views[sequence.name]
         return sequence.frames.index(reference), [sequence.frames.index(frame) for frame in targets]
 
 
-def _checksum(path: Path | None) -> str:
-    assert path is not None
+def _checksum(path: Path) -> str:
     return sha256_of(require_file(path))[:12]

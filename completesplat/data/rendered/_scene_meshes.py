@@ -17,10 +17,21 @@ IMPORTERS = {
     "ply": "wm.ply_import",
     "stl": "wm.stl_import",
     "fbx": "import_scene.fbx",
-    **dict.fromkeys(USD := ("usd", "usda", "usdc", "usdz"), "wm.usd_import"),
+    "usd": "wm.usd_import",
+    "usda": "wm.usd_import",
+    "usdc": "wm.usd_import",
+    "usdz": "wm.usd_import",
 }
 # With these, an importer keeps vertices that are not finite, which it would otherwise move to the origin.
-AS_STORED = {"stl": {"use_mesh_validate": False}, **{kind: {"validate_meshes": False} for kind in ("obj", *USD)}}
+UNCHECKED = {"validate_meshes": False}
+AS_STORED = {
+    "stl": {"use_mesh_validate": False},
+    "obj": UNCHECKED,
+    "usd": UNCHECKED,
+    "usda": UNCHECKED,
+    "usdc": UNCHECKED,
+    "usdz": UNCHECKED,
+}
 MOST = 0.99
 FAR = 4.0  # share of the surface, and its reach times which faces count as stray
 
@@ -30,7 +41,7 @@ class RefusedMesh(Exception):
 
 
 def import_mesh(path: Path, root: Path) -> None:
-    """Import a file into the empty scene; refuse one that Blender cannot read, or whose textures it cannot use."""
+    """Import a file into the empty scene, or refuse one that Blender cannot read, or whose textures it cannot use."""
     kind = path.suffix[1:].lower()
     module, name = IMPORTERS[kind].split(".")
     try:
@@ -58,7 +69,7 @@ def check_texture(image: Any, root: Path) -> None:
 
 
 def find_factory(name: str) -> Any:
-    """Return Infinigen's class of procedural objects; import only the package that names it, which saves seconds."""
+    """Return Infinigen's class of procedural objects, and import only the package that names it to save seconds."""
     try:
         import infinigen.assets.objects as kinds
     except ImportError as error:

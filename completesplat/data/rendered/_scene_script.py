@@ -28,7 +28,7 @@ TINY_FILTER = 0.01  # Blender's narrowest: the ray of a pixel with one sample go
 
 
 def paint_back(objects: list[Any], toward: list[float], least: float) -> Any:
-    """Paint all faces that point away from a camera; return the socket of the paint's colour.
+    """Paint all faces that point away from a camera, and return the socket of the paint's colour.
 
     These are the faces whose normal n has n . d < -`least`, for the direction d `toward` the camera. A camera at e sees
     of both sides of a face at p the one with n . (e - p) > 0. In the unit ball this means n . d > -1 / |e|. So with
@@ -39,7 +39,9 @@ def paint_back(objects: list[Any], toward: list[float], least: float) -> Any:
         group.interface.new_socket("Shader", in_out=side, socket_type="NodeSocketShader")
     new = group.nodes.new
     link = group.links.new
-    color, paint, mix = (new(f"ShaderNode{kind}") for kind in ("RGB", "BsdfDiffuse", "MixShader"))
+    color = new("ShaderNodeRGB")
+    paint = new("ShaderNodeBsdfDiffuse")
+    mix = new("ShaderNodeMixShader")
     facing = new("ShaderNodeVectorMath")
     away = new("ShaderNodeMath")
     seen = new("ShaderNodeMath")
@@ -71,7 +73,8 @@ def add_plane(corners: list[tuple[float, float, float]], surface: dict[str, Any]
     """Add a rectangle whose texture coordinates are lengths along its first and last side."""
     mesh = bpy.data.meshes.new("plane")
     mesh.from_pydata(corners, [], [(0, 1, 2, 3)])
-    width, height = (math.dist(corners[0], corners[k]) for k in (1, 3))
+    width = math.dist(corners[0], corners[1])
+    height = math.dist(corners[0], corners[3])
     layer = mesh.uv_layers.new()
     for loop, place in zip(layer.data, [(0, 0), (width, 0), (width, height), (0, height)], strict=True):
         loop.uv = place
@@ -236,8 +239,10 @@ def render(folder: Path, views: list[dict[str, Any]], samples: int, paint: Any, 
     """Render all views with every colour of the paint (`[]`: without), then geometry at the pixels' centres."""
     scene = bpy.context.scene
     outputs = set_up_outputs(folder)
-    further = [("", f"{index}_", color) for index, color in enumerate(colors) if index]
-    for task, prefix, color in [("coverage", "", (*colors, None)[0]), *further, ("geometry", "", None)]:
+    tasks: list[tuple[str, str, list[float] | None]] = [("coverage", "", colors[0] if colors else None)]
+    tasks += [("", f"{index}_", color) for index, color in enumerate(colors) if index]
+    tasks.append(("geometry", "", None))
+    for task, prefix, color in tasks:
         images = task != "geometry"
         scene.cycles.samples = samples if images else 1
         scene.cycles.use_denoising = images
@@ -255,7 +260,8 @@ def render(folder: Path, views: list[dict[str, Any]], samples: int, paint: Any, 
             scene.render.filepath = str(folder / f"{prefix}{number:04d}.png")
             bpy.ops.render.render(write_still=images)
     for number in range(len(views)):
-        geometry, coverage = (read_exr(folder / f"{name}_{number:04d}.exr") for name in ("geometry", "coverage"))
+        geometry = read_exr(folder / f"geometry_{number:04d}.exr")
+        coverage = read_exr(folder / f"coverage_{number:04d}.exr")
         np.save(folder / f"{number:04d}.npy", np.concatenate([geometry[..., :2], coverage[..., :1]], axis=-1))
 
 
@@ -270,7 +276,7 @@ def read_exr(path: Path) -> Any:
 
 
 def run(job: dict[str, Any]) -> dict[str, Any]:
-    """Render the job's mesh or procedural object; return its place and scale, or the reason for a refusal.
+    """Render the job's mesh or procedural object, and return its place and scale, or the reason for a refusal.
 
     Without views, only look for the factory of procedural objects.
     """

@@ -35,7 +35,7 @@ class Blender(NamedTuple):
 
 
 def find_blender(program: str | None = None) -> Blender:
-    """Return the given program; else that of COMPLETESPLAT_BLENDER, `blender` on the path, or this Python with `bpy`.
+    """Return the given program, or that of COMPLETESPLAT_BLENDER, `blender` on the path, or this Python with `bpy`.
 
     A program is Blender, or a Python that has `bpy`.
 
@@ -53,12 +53,17 @@ def find_blender(program: str | None = None) -> Blender:
         output = _output_of(*command, "-c", "import bpy; print('Blender', bpy.app.version_string)")
     version = re.search(r"^Blender ((\d+)\.(\d+)\S*)", output, re.MULTILINE)
     if version is None:
-        last = (output.strip().splitlines() or ["it prints nothing"])[-1]
+        last = _last_line(output, "it prints nothing")
         raise CompleteSplatError(f"{program}: neither Blender nor a Python with bpy ({last}); get one by {ADVICE}")
     if (int(version[2]), int(version[3])) < LEAST_VERSION:
         least = ".".join(map(str, LEAST_VERSION))
         raise CompleteSplatError(f"{program}: Blender {version[1]} is older than {least}; get one by {ADVICE}")
     return Blender(command, version[1])
+
+
+def _last_line(text: str, default: str) -> str:
+    lines = text.strip().splitlines()
+    return lines[-1] if lines else default
 
 
 def _output_of(*command: str) -> str:
@@ -74,7 +79,7 @@ def _output_of(*command: str) -> str:
 def run_job(
     blender: Blender, job: dict[str, Any], folder: Path, stopped: Event, minutes: float = math.inf
 ) -> dict[str, Any]:
-    """Run `_scene_script.py` with a job; return its result, or `refused` with the reason for which Blender failed.
+    """Run `_scene_script.py` with a job, and return its result, or `refused` with the reason for which Blender failed.
 
     Args:
         folder: an existing folder for the job's files and Blender's messages.
@@ -110,5 +115,5 @@ def run_job(
     if process.returncode < 0:
         limit = "out" if memory is None else f"more than {memory / 1e9:.1f} GB"
         return {"refused": f"Blender ended by signal {-process.returncode} (a crash, or {limit} of memory)"}
-    last = (messages.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
+    last = _last_line(messages.read_text(errors="replace"), "no message")
     return {"refused": f"Blender failed: {last[:200]}"}

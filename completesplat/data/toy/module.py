@@ -6,13 +6,13 @@ from typing import Any
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
+from completesplat.data.toy.data_sets import DESCRIPTION, ROOMS, SUBSET, DataSetSize, write
 from completesplat.data.toy.object_scene import PATCH_COLORS
-from completesplat.data.toy.writing import DESCRIPTION, ROOMS, SUBSET, DataSetSize, write
 from completesplat.errors import MissingFile
-from completesplat.settings.schema import Natural, Positive, Side
+from completesplat.quantities import Natural, Positive, Side
 
 OWN_PLACE = Path("outputs/data")
-"""Folder below which toy data are written without `make`; `data.root` of `conf/data/toy_*.yaml` lies there."""
+"""Folder below which toy data are written without `make`. `data.root` of `conf/data/toy_*.yaml` lies there."""
 
 
 def _provide(kind: str, root: Path, make: bool, numbers: DataSetSize) -> None:
@@ -31,10 +31,15 @@ def _provide(kind: str, root: Path, make: bool, numbers: DataSetSize) -> None:
 class ToyObjectsDataModule(CO3DDataModule):
     """`CO3DDataModule` of toy objects, which are written to `root` on first use: below `OWN_PLACE`, or with `make`.
 
-    Existing scenes are used as they are, whatever their number is. `category` is a key of `DRAW`; `scenes`, `frames`
-    and `data_seed` determine the data to write; the others are settings of `CO3DDataModule`. The default of
-    `depth_before` is smaller than there and equals that in `conf/data/toy_objects.yaml`, because a model knows the
-    depth range that it was trained with.
+    Existing scenes are used as they are, whatever their number is. The default of `depth_before` is smaller than that
+    of `CO3DDataModule` and equals that in `conf/data/toy_objects.yaml`, because a model knows the depth range that it
+    was trained with.
+
+    Args:
+        scenes, frames, data_seed: data to write.
+        category: a key of `DRAW`.
+        make: write data outside of `OWN_PLACE`, too.
+        **reading: settings of `CO3DDataModule`.
     """
 
     record = DESCRIPTION
@@ -67,8 +72,12 @@ class ToyObjectsDataModule(CO3DDataModule):
 class ToyRoomsDataModule(RE10KDataModule):
     """`RE10KDataModule` of toy rooms, which are written to `root` on first use: below `OWN_PLACE`, or with `make`.
 
-    Existing clips are used as they are, whatever their number is. `scenes`, `frames`, `height` and `data_seed`
-    determine the data to write; the others are settings of `RE10KDataModule`.
+    Existing clips are used as they are, whatever their number is.
+
+    Args:
+        scenes, frames, height, data_seed: data to write.
+        make: write data outside of `OWN_PLACE`, too.
+        **reading: settings of `RE10KDataModule`.
     """
 
     def __init__(
@@ -91,4 +100,5 @@ class ToyRoomsDataModule(RE10KDataModule):
         return super().describe() | {"data_set": ROOMS}
 
     def prepare_data(self) -> None:
+        """Write the clips if there are none."""
         _provide("rooms", self.home, self.make, self.making)

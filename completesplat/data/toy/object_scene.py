@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from completesplat.data.placement import OBJECT_HALF_SIZE
-from completesplat.data.toy.raytracing import Dome, Light, Patch, trace
+from completesplat.data.toy.raytracing import trace
 from completesplat.data.toy.shapes import (
     CHECKS,
     ELLIPSOID,
@@ -34,6 +34,7 @@ from completesplat.data.toy.shapes import (
     plain_look,
     rotation_about,
 )
+from completesplat.data.toy.surroundings import Dome, Light, Patch
 from completesplat.geometry.cameras import invert_rigid, look_at
 
 DARK = np.full(3, 0.07)
@@ -48,7 +49,7 @@ class Blueprint(NamedTuple):
 
 
 class _Painter:
-    """Random colours and patterns of an object: one base hue, and other hues for accents."""
+    """Random colours and patterns of an object: one base hue, and accents of a different hue."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -65,12 +66,13 @@ class _Painter:
         return np.stack([first, second]), np.array([pattern, frequency, phase])
 
     def detail(self) -> Look:
-        """Draw colours and texture of a small part; every call draws another shade of the accent."""
+        """Draw colours and texture of a small part. Every call draws another shade of the accent."""
         shade = color(self.accent + self.rng.uniform(-0.08, 0.08), self.rng.uniform(0.5, 0.9), self.rng.uniform(0.6, 1))
         return plain_look(shade)
 
 
 def ball(center: Point, half_sizes: Point | float, look: Look, axes: Array | None = None) -> Part:
+    """Make an ellipsoid, or a ball of one radius."""
     sizes = half_sizes if isinstance(half_sizes, tuple) else (half_sizes,) * 3
     return make_part(ELLIPSOID, center, sizes, look, axes)
 
@@ -81,7 +83,7 @@ def _frustum(center: Point, radius: float, half_height: float, look: Look, taper
 
 
 def bear(rng: np.random.Generator) -> Blueprint:
-    """Draw a sitting bear: body, belly, head with a face, ears, arms, legs; the patch is on its back."""
+    """Draw a sitting bear: body, belly, head with a face, ears, arms, legs. The patch is on its back."""
     paint = _Painter(rng)
     fur = paint.body()
     light = plain_look(color(paint.hue + 0.04, 0.25, 0.95))
@@ -118,7 +120,7 @@ def _arm(side: int, wide: float, tall: float, rng: np.random.Generator, paint: _
 
 
 def hydrant(rng: np.random.Generator) -> Blueprint:
-    """Draw a fire hydrant: base, body, dome, a large outlet in front, two at the sides; the patch is on its back."""
+    """Draw a fire hydrant: base, body, dome, a large outlet in front, two at the sides. The patch is on its back."""
     paint = _Painter(rng)
     radius = rng.uniform(0.22, 0.29)
     half = rng.uniform(0.4, 0.5)
@@ -163,7 +165,7 @@ UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 
 class ToyScene(NamedTuple):
-    """Scene and its cameras (OpenCV axes, [frame 4 4]); `unit` and `origin` place it in an arbitrary world.
+    """Scene and its cameras (OpenCV axes, [frame 4 4]). `unit` and `origin` place it in an arbitrary world.
 
     `chances` are the probabilities of `PATCH_COLORS`, given everything except the patch.
     """
@@ -184,7 +186,7 @@ class ToyScene(NamedTuple):
 
 
 def draw_object_scene(rng: np.random.Generator, frames: int) -> ToyScene:
-    """Draw a random scene and `frames` cameras on one full turn; the patch faces away from the first camera."""
+    """Draw a random scene and `frames` cameras on one full turn. The patch faces away from the first camera."""
     blueprint = FAMILIES[rng.integers(len(FAMILIES))](rng)
     return _placed(rng, frames, blueprint, _surroundings, tilt=0.0, edge=0.4)
 
@@ -271,7 +273,7 @@ def draw_orbit(rng: np.random.Generator, frames: int, start: float) -> Array:
 
 
 def _surroundings(rng: np.random.Generator) -> tuple[Dome, Light]:
-    """Draw a dome of one palette, a ground of two related colours and a light from above; `_placed` sets the height."""
+    """Draw a dome of one palette, a ground of two related colours and a light from above. `_placed` sets the height."""
     hue = rng.uniform()
     floor = hue + rng.uniform(0.3, 0.7)
     azimuth = rng.uniform(0, 2 * np.pi)
@@ -320,9 +322,9 @@ def _surface(
         radius = np.sqrt(rng.uniform(0, 1, SURFACE_RAYS))
         rays = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(SURFACE_RAYS, 20.0)], axis=-1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        seen, coverage, distances = trace(shapes, light, (dome, patch), pose, rays[:, None])
+        traced, coverage, distances = trace(shapes, light, (dome, patch), pose, rays[:, None])
         points.append((pose[:3, 3] + distances[:, None] * rays @ pose[:3, :3].T)[coverage > 0])
-        colors.append(seen[coverage > 0])
+        colors.append(traced[coverage > 0])
     return np.concatenate(points), np.concatenate(colors)
 
 

@@ -1,83 +1,18 @@
-"""Analytic ray tracer: ellipsoids, cone frusta and boxes on the ground of a coloured dome, or in a room."""
+"""Analytic ray tracer: ellipsoids, cone frusta and boxes on the ground of a coloured dome, or in a room.
+
+All of it is one file, because numba compiles a kernel again only when the kernel's own file changes.
+"""
 
 import math
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
 from completesplat.data.toy.shapes import BOX, CHECKS, ELLIPSOID, FRUSTUM, RIPPLES, STRIPES, Array, Shapes
+from completesplat.data.toy.surroundings import DOME, GROUND, Dome, Light, Patch, Room
 from completesplat.rasterizers.kernels.compilation import helper, kernel
 
-# Numbers of faces. A room has two across each of x, y and z, the lower one first; else there are a ground and a dome.
-FLOOR = 2
-CEILING = 3
-WALLS = (0, 1, 4, 5)
-GROUND = 6
-DOME = 7
-
 SELF_INTERSECTION = 1e-6
-WHITE = (1.0, 1.0, 1.0)
-
-
-class Light(NamedTuple):
-    """Ambient light, and direct light from the direction `place`, or from the point `place` if `is_point`.
-
-    `sky` is the share of the ambient light from above, and `shadow` is the share of direct light that shadows keep.
-    `color` has factors of red, green and blue for both; the dome is not lit.
-    """
-
-    place: Array
-    is_point: bool
-    ambient: float
-    sky: float
-    shadow: float
-    color: Array = np.array(WHITE)
-
-
-class Dome(NamedTuple):
-    """Ground plane at height `ground` with two colours and a pattern, under a dome with a palette.
-
-    The dome's hue is `hue` + 0.17 sin(azimuth - `turn`), with panels of the same phase. This law is the same in all
-    scenes, so that the dome behind a camera can partly be inferred from the one in front. A `plain` dome is grey.
-    """
-
-    ground: float
-    ground_colors: Array
-    ground_texture: Array
-    radius: float
-    hue: float
-    turn: float
-    plain: bool
-
-
-class Patch(NamedTuple):
-    """Disc on an object's first part: its normals have a cosine above `edge` with the direction `facing`.
-
-    `heights` is the local range of y that it may cover.
-    """
-
-    facing: Array
-    color: Array
-    heights: Array
-    edge: float
-
-
-class Room(NamedTuple):
-    """Inside of a box of `size`, with `colors` [face 2 3] and `textures` [face 3].
-
-    `decals` [decal 6] are rectangles on faces: face, range of the first coordinate, range of the second, width of the
-    rim. The coordinates are (z, y) on walls across x, (x, y) on walls across z. `decal_colors` [decal 3 3] are the rim
-    and two inner colours.
-    """
-
-    size: Array
-    colors: Array
-    textures: Array
-    decals: Array
-    decal_colors: Array
-    decal_textures: Array
-
 
 # Without the kernels' "fastmath", so that all machines draw the same images.
 compiled = partial(kernel, fastmath=False)
@@ -87,6 +22,7 @@ inlined = partial(helper, fastmath=False)
 
 @inlined
 def map_direction(m, x, y, z):
+    """Multiply a direction by the linear part of a map."""
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
         m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
@@ -96,6 +32,7 @@ def map_direction(m, x, y, z):
 
 @inlined
 def map_point(m, x, y, z):
+    """Apply a map [3 4] to a point."""
     x, y, z = map_direction(m, x, y, z)
     return x + m[0, 3], y + m[1, 3], z + m[2, 3]
 
@@ -303,7 +240,7 @@ def _furniture_color(shapes, solid, lx, ly, lz, hx, hy, hz):
 
 @inlined
 def _face_color(room, face, x, y, z):
-    """Return the colour of a point on a face of the room; later decals cover earlier ones."""
+    """Return the colour of a point on a face of the room. Later decals cover earlier ones."""
     u, v = (z, y) if face < 2 else ((x, z) if face < 4 else (x, y))
     for i in range(len(room.decals) - 1, -1, -1):
         decal = room.decals[i]
@@ -317,6 +254,7 @@ def _face_color(room, face, x, y, z):
 
 @inlined
 def _dome_color(dome, face, x, y, z):
+    """Return the colour of a point on the ground or on the dome."""
     if face == GROUND:
         kind = dome.ground_texture[0]
         frequency = dome.ground_texture[1]
@@ -417,6 +355,7 @@ def _shade(shapes, light, dome, patch, room, ox, oy, oz, dx, dy, dz):
 
 @compiled
 def _trace(shapes, light, dome, patch, room, pose, rays):
+    """Render the pixels of `trace`, with either a dome and a patch or a room. The rest is None."""
     pixels, samples, _ = rays.shape
     colors = np.zeros((pixels, 3))
     coverage = np.zeros(pixels)
@@ -445,5 +384,7 @@ def trace(
     The `rays` [pixel sample 3] are in the camera's frame and, in a dome, have unit length. Colours and coverage are
     means over a pixel's rays. The distance is measured along the middle ray, in units of its length.
     """
-    dome, patch, room = (None, None, surroundings) if isinstance(surroundings, Room) else (*surroundings, None)
-    return _trace(shapes, light, dome, patch, room, pose, rays)
+    if isinstance(surroundings, Room):
+        return _trace(shapes, light, None, None, surroundings, pose, rays)
+    dome, patch = surroundings
+    return _trace(shapes, light, dome, patch, None, pose, rays)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from completesplat.data.toy.raytracing import CEILING, FLOOR, WALLS, Light, Room, trace
+from completesplat.data.toy.raytracing import trace
 from completesplat.data.toy.shapes import (
     BOX,
     CHECKS,
@@ -24,6 +24,7 @@ from completesplat.data.toy.shapes import (
     make_part,
     rotation_about,
 )
+from completesplat.data.toy.surroundings import CEILING, FLOOR, WALLS, Light, Room
 from completesplat.geometry.cameras import invert_rigid, look_at
 
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
@@ -77,6 +78,7 @@ def sofa(rng: np.random.Generator) -> Piece:
 
 
 def pouf(rng: np.random.Generator) -> Piece:
+    """Draw one ellipsoid."""
     half = (rng.uniform(0.2, 0.4), rng.uniform(0.18, 0.3), rng.uniform(0.2, 0.4))
     return [make_part(ELLIPSOID, (0, half[1], 0), half, _look(rng))]
 
@@ -102,8 +104,8 @@ def furnish(rng: np.random.Generator, size: Array) -> list[Piece]:
         piece = _placed(rng, PIECES[rng.integers(len(PIECES))](rng), size)
         low, high = _ground_extent(piece)
         inside = (np.abs(np.stack([low, high])) <= size[[0, 2]] / 2 - GAP + 1e-9).all()
-        others = map(_ground_extent, pieces)
-        if inside and not any((low < end + GAP).all() and (start < high + GAP).all() for start, end in others):
+        placed = map(_ground_extent, pieces)
+        if inside and not any((low < end + GAP).all() and (start < high + GAP).all() for start, end in placed):
             pieces.append(piece)
         if len(pieces) == count:
             break

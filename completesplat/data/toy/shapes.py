@@ -63,7 +63,7 @@ class Part(NamedTuple):
         return self._replace(center=center, half_sizes=scale * self.half_sizes, axes=rotation @ self.axes)
 
     def distances(self, points: Array) -> Array:
-        """Return the distances of points [n 3] to the (bounding) box; 0 inside."""
+        """Return the distances of points [n 3] to the (bounding) box, 0 inside."""
         outside = np.abs((points - self.center) @ self.axes) - self.half_sizes
         return np.linalg.norm(outside.clip(0), axis=-1)
 
@@ -75,6 +75,7 @@ def make_part(kind: int, center: Point, half: Point, look: Look, axes: Array | N
 
 
 def as_arrays(parts: Sequence[Part]) -> Shapes:
+    """Return parts as the ray tracer's arrays."""
     squared_radii = [(part.half_sizes**2).sum() * (1 + abs(part.taper)) ** 2 for part in parts]
     return Shapes(
         kinds=np.array([part.kind for part in parts]),
@@ -88,7 +89,7 @@ def as_arrays(parts: Sequence[Part]) -> Shapes:
 
 
 def rotation_about(axis: str, radians: float) -> Array:
-    """Return the rotation matrix about a coordinate axis; about y it turns +z towards +x."""
+    """Return the rotation matrix about a coordinate axis. The one about y turns +z towards +x."""
     cos = np.cos(radians)
     sin = np.sin(radians)
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]

@@ -3,7 +3,10 @@
 import json
 import os
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import is_dataclass
+from functools import partial
 from gzip import GzipFile
 from pathlib import Path, PurePath, PureWindowsPath
 from types import UnionType
@@ -46,7 +49,7 @@ def path_below(root: Path, relative: str) -> Path:
     """
     path = PurePath(relative.replace("\\", "/"))
     windows = PureWindowsPath(relative)
-    absolute = path.is_absolute() or windows.drive
+    absolute = path.is_absolute() or bool(windows.drive)
     preview = printable(repr(relative), SHORT)
     if not path.parts or ".." in path.parts or any(text in relative for text in ("\0", "://")):
         raise OutsidePath(f"leads outside of {root}, or nowhere: {preview}")
@@ -74,28 +77,21 @@ def read_json(path: Path, allow_nan: bool = False) -> Any:
         MissingFile: the file does not exist.
         UnreadableFile: it is no (gzipped) JSON in UTF-8, or too large, unpacked or not.
     """
-    try:
+    with _refused_as_unreadable(path, "JSON file"):
         text = _read(path, MOST_BYTES).decode("utf-8-sig")
         return json.loads(text, parse_constant=float if allow_nan else _refuse_constant)
-    except (OSError, EOFError, ValueError, zlib.error, RecursionError, MemoryError) as error:
-        raise UnreadableFile(f"not a JSON file ({str(error) or type(error).__name__})", str(path)) from None
 
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
-    """Read a text file in UTF-8; errors as in `read_json`."""
-    try:
+    """Read a text file in UTF-8, with the errors of `read_json`."""
+    with _refused_as_unreadable(path, "text file"):
         return _read(path, most_bytes).decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UnreadableFile(f"not a text file ({type(error).__name__})", str(path)) from None
 
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Read the positions of a PLY file's vertices in float64; errors as in `read_json`."""
-    require_file(path)
-    try:
+    """Read the positions of a PLY file's vertices in float64, with the errors of `read_json`."""
+    with _refused_as_unreadable(require_file(path), "point cloud"):
         vertices = read_vertices(path, "xyz")
-    except PlyError as error:
-        raise UnreadableFile(f"not a point cloud ({error})", str(path)) from None
     return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
 
 
@@ -123,24 +119,31 @@ def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
     if origin is dict and type(value) is dict:
         return {key: parsed(arguments[1], item, key) for key, item in value.items()}
     if isinstance(kind, type) and is_dataclass(kind) and type(value) is dict:
-        return kind(**{key: parsed(hint, _entry(value, key), key) for key, hint in get_type_hints(kind).items()})
+        fields = {key: parsed(hint, _entry(value, key), key) for key, hint in get_type_hints(kind).items()}
+        return kind(**fields)
     if kind is float and type(value) is int:  # some programs write 0 for 0.0
         return value
-    if type(value) in (arguments if origin is UnionType else (kind,)):
+    allowed = arguments if origin is UnionType else (kind,)
+    if type(value) in allowed:
         return value
     preview = printable(repr(value), SHORT)
     raise BadAnnotation(f"{name} must be of type {getattr(kind, '__name__', kind)}, not {preview}")
 
 
 def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert numbers from JSON to float64; refuse other types, another shape, and what is not finite in float32."""
+    """Convert numbers from JSON to float64.
+
+    Raises:
+        BadAnnotation: the value has another type or shape, or is not finite in float32.
+    """
     try:
         array = np.array(value)
     except ValueError:  # Lists of unequal length.
         array = np.array(None)
     # Strings that look like numbers, truth values and None become arrays of other kinds.
     if array.shape != shape or array.dtype.kind not in "iuf":
-        numbers = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
+        count = " x ".join(map(str, shape))
+        numbers = f"{count} numbers" if shape else "a number"
         raise BadAnnotation(f"{what} must be {numbers}, not {printable(repr(value), SHORT)}")
     array = array.astype(np.float64)
     if not (np.abs(array) < LARGEST).all():
@@ -149,7 +152,7 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
 
 
 def require_rotation(matrix: np.ndarray, what: str) -> None:
-    """Refuse a 3 x 3 matrix that is no rotation; the tolerance is 1e-3 for each entry of R R^T."""
+    """Refuse a 3 x 3 matrix that is no rotation, with a tolerance of 1e-3 for each entry of R R^T."""
     error = np.abs(matrix @ matrix.T - np.eye(3)).max()
     if error > ROTATION_TOLERANCE:
         raise BadCamera(f"{what} is not orthonormal (R R^T - I up to {error:.2g}, at most {ROTATION_TOLERANCE:g})")
@@ -157,14 +160,25 @@ def require_rotation(matrix: np.ndarray, what: str) -> None:
         raise BadCamera(f"{what} is a reflection, not a rotation")
 
 
+@contextmanager
+def _refused_as_unreadable(path: Path, kind: str) -> Iterator[None]:
+    """Turn the errors by which Python's readers and ours notice a damaged file into an UnreadableFile."""
+    try:
+        yield
+    except (OSError, EOFError, ValueError, zlib.error, RecursionError, MemoryError, PlyError) as error:
+        raise UnreadableFile(f"not a {kind} ({str(error) or type(error).__name__})", str(path)) from None
+
+
 def _read(path: Path, most_bytes: int) -> bytearray:
     """Read the bytes of a file, unpacked if its name ends in `.jgz`."""
     raw = bytearray()
     size = require_file(path).stat().st_size
     packed = path.suffix == ".jgz"
-    limit = min(most_bytes, max(BYTES_OF_ANY_RATIO, LARGEST_RATIO * size)) if packed else most_bytes
+    limit = most_bytes
+    if packed:
+        limit = min(most_bytes, max(BYTES_OF_ANY_RATIO, LARGEST_RATIO * size))
     with GzipFile(path) if packed else path.open("rb") as file:
-        while chunk := file.read(CHUNK):
+        for chunk in iter(partial(file.read, CHUNK), b""):
             raw += chunk
             if len(raw) > limit:
                 raise UnreadableFile(f"{size:,} bytes hold more than {limit:,} bytes", str(path))

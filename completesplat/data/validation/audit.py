@@ -9,7 +9,8 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from completesplat.data.sequences import SequenceSource, overlaps, shared_names
+from completesplat.data.sequences import SequenceSource
+from completesplat.data.splits import overlaps, shared_names
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError, TooFewFrames, refused_to
 from completesplat.files import printable
@@ -44,7 +45,7 @@ class AuditReport:
     shared: dict[str, list[str]]
 
     def by_kind(self) -> dict[str, list[DataError]]:
-        """Group errors by kind, and sequences left out by reason; the most frequent group comes first."""
+        """Group errors by kind, and sequences left out by reason. The most frequent group comes first."""
         kinds: dict[str, list[DataError]] = {}
         for error in self.refused:
             kind = f"{error.kind}: {error.reason}" if isinstance(error, ExcludedSequence) else error.kind
@@ -52,6 +53,7 @@ class AuditReport:
         return dict(sorted(kinds.items(), key=lambda item: -len(item[1])))
 
     def json(self) -> dict[str, object]:
+        """Return the content of `check.json`."""
         parts = ("sequence", "frame", "file", "reason")
         return {
             "usable": {"sequences": self.sequences, "frames": self.frames},
@@ -67,9 +69,12 @@ def check(
 ) -> AuditReport:
     """Read every sequence and every image once, even if several splits share them.
 
-    A sequence without errors that is not usable is refused for too few frames. `workers` are processes (None: one for
-    each core); with several, the sources (by split) must be picklable. Shared sequences are reported unless the splits
-    share them on purpose (`SceneDataModule.splits_share_sequences`).
+    A sequence without errors that is not usable is refused for too few frames. Shared sequences are reported unless the
+    splits share them on purpose (`SceneDataSet.splits_share_sequences`).
+
+    Args:
+        sources: sequences by split, which several processes must be able to pickle.
+        workers: processes; None: one for each core.
     """
     refused = [error for source in sources.values() for error in _source_errors(source)]
     sequences = list[_Sequence]()
@@ -85,26 +90,29 @@ def check(
 def _report(
     sources: Sources, sequences: Sequence["_Sequence"], refused: list[DataError], splits_share_sequences: bool
 ) -> AuditReport:
-    """Return what was found in sequences, which were read, and in sources, which refused some before."""
-    refused = refused + [error for sequence in sequences for error in sequence.refused]
-    explained = {error.sequence for error in refused}
-    short = [x for x in sequences if len(x.usable) < FEWEST_FRAMES and x.name not in explained]
-    refused += [TooFewFrames(f"{len(x.usable)} usable, 2 are needed", sequence=x.name) for x in short]
-    unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in refused}
-    usable = {split: [x.usable & x.frames.get(split, set()) for x in sequences] for split in sources}
-    names = {split: source.names for split, source in sources.items()}
-    return AuditReport(
-        **_numbers([sequence.usable for sequence in sequences]),
-        refused=list(unique.values()),
-        splits={split: _numbers(frames) for split, frames in usable.items()},
-        shared={} if splits_share_sequences else shared_names(names),
-    )
+    """Return the findings about sequences, which were read, and about sources, which refused some before."""
+    errors = refused + [error for sequence in sequences for error in sequence.refused]
+    explained = {error.sequence for error in errors}
+    for sequence in sequences:
+        if len(sequence.usable) < FEWEST_FRAMES and sequence.name not in explained:
+            reason = f"{len(sequence.usable)} usable, {FEWEST_FRAMES} are needed"
+            errors.append(TooFewFrames(reason, sequence=sequence.name))
+    unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in errors}
+    splits = {}
+    for split in sources:
+        splits[split] = _numbers([sequence.usable & sequence.frames.get(split, set()) for sequence in sequences])
+    numbers = _numbers([sequence.usable for sequence in sequences])
+    shared = {} if splits_share_sequences else shared_names({split: x.names for split, x in sources.items()})
+    return AuditReport(numbers["sequences"], numbers["frames"], list(unique.values()), splits, shared)
 
 
 def _source_errors(source: SequenceSource) -> list[DataError]:
     """Return what a source refuses or leaves out before its sequences are read."""
-    left_out = [ExcludedSequence(reason, sequence=x) for reason, names in source.left_out.items() for x in names]
-    return [*source.refused, *left_out, *source.verify()]
+    errors = list(source.refused)
+    for reason, names in source.left_out.items():
+        errors.extend(ExcludedSequence(reason, sequence=name) for name in names)
+    errors.extend(source.verify())
+    return errors
 
 
 def show_findings(findings: AuditReport) -> None:
@@ -121,7 +129,7 @@ def show_findings(findings: AuditReport) -> None:
         console.print(table)
     for overlap in overlaps(findings.shared):
         console.print(Text(printable(overlap)), soft_wrap=True)
-    splits = ", ".join(f"{split} {n['sequences']} and {n['frames']}" for split, n in findings.splits.items())
+    splits = ", ".join(f"{split} {x['sequences']} and {x['frames']}" for split, x in findings.splits.items())
     usable = f"usable sequences: {findings.sequences}, their usable frames: {findings.frames} ({splits})"
     console.print(Text(usable), soft_wrap=True)
 
@@ -152,19 +160,19 @@ def _batches(sources: Sources) -> list[_Batch]:
 
 
 def _read_batch(sources: Sources, batch: _Batch) -> list[_Sequence]:
-    return [_read(sources, *item) for item in batch]
+    return [_read(sources, name, splits) for name, splits in batch]
 
 
 def _read(sources: Sources, name: str, splits: list[str]) -> _Sequence:
     sequence = _Sequence(name)
-    seen = set[int]()
+    done = set[int]()
     for split in splits:
         with refused_to(sequence.refused.append, sequence=name):
             posed = sources[split].read(name)
             sequence.frames[split] = set(posed.frames)
             for index, frame in enumerate(posed.frames):
-                if frame not in seen:
-                    seen.add(frame)
+                if frame not in done:
+                    done.add(frame)
                     with refused_to(sequence.refused.append, sequence=name, frame=frame):
                         posed.read(index)
                         sequence.usable.add(frame)

@@ -5,6 +5,7 @@ import pickle
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import TypeVar, cast
 
@@ -22,7 +23,7 @@ def usable_cores() -> int:
 
 
 def share_of(items: Sequence[Item], shard: int, shards: int) -> Sequence[Item]:
-    """Return every `shards`-th item from number `shard` on; raise CompleteSplatError if there is no such shard."""
+    """Return every `shards`-th item from number `shard` on. Raise CompleteSplatError if there is no such shard."""
     if not 0 <= shard < shards:
         raise CompleteSplatError(f"shard={shard}: must lie between 0 and {shards - 1}, for shards={shards}")
     return items[shard::shards]
@@ -35,13 +36,13 @@ def map_in_processes(work: Callable[[Item], Result], items: Sequence[Item], work
         CompleteSplatError: a process ended unexpectedly.
         Interrupted: the run was interrupted; the processes end with the same exception.
     """
-    workers = min(workers or usable_cores(), len(items))
-    if workers <= 1:
+    processes = min(workers or usable_cores(), len(items))
+    if processes <= 1:
         yield from map(work, items)
         return
     # Pickled to bytes, because torch would share each tensor as an open file, and there are too many cameras for that.
     contents = pickle.dumps(work)
-    with ProcessPoolExecutor(workers, get_context("spawn"), _start, (contents,)) as pool:
+    with ProcessPoolExecutor(processes, get_context("spawn"), _start, (contents,)) as pool:
         try:
             yield from cast(Iterator[Result], pool.map(_call, items))
         except BrokenProcessPool:
@@ -65,14 +66,19 @@ def _start(contents: bytes) -> None:
     global _function
     end_with_parent()
     torch.set_num_threads(1)  # There is one process for each core.
-    try:
+    with _ends_when_interrupted():
         _function = pickle.loads(contents)  # written by the parent process
-    except Interrupted as stop:
-        os._exit(128 + stop.signal)  # else the pool would print where it was interrupted
 
 
 def _call(item: object) -> object:
-    try:
+    with _ends_when_interrupted():
         return _function(item)
+
+
+@contextmanager
+def _ends_when_interrupted() -> Iterator[None]:
+    """End this process at once when it is interrupted, because the pool would print the exception or wait for it."""
+    try:
+        yield
     except Interrupted as stop:
-        os._exit(128 + stop.signal)  # the pool would return the exception as a result, and wait for the next item
+        os._exit(128 + stop.signal)

@@ -29,7 +29,7 @@ OPTIONS: dict[str, Any] = {
 
 
 def kernel(function: Callable[..., Result], **changed: object) -> Callable[..., Result]:
-    """Compile an entry point on its first call, with changed `OPTIONS`; later processes load it from the cache."""
+    """Compile an entry point on its first call, with changed `OPTIONS`. Later processes load it from the cache."""
     before = numba_config.CACHE_DIR
     directory = cache_directory()
     numba_config.CACHE_DIR = before if directory is None else str(directory)

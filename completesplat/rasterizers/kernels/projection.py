@@ -1,4 +1,4 @@
-"""Steps of the projection for 16 Gaussians at once, one in each lane; their backward pass.
+"""Steps of the projection and its backward pass, for 16 Gaussians at once, one in each lane.
 
 Scalars, and lanes in the forward pass, are float64, because huge scales must not overflow.
 """
@@ -25,7 +25,7 @@ SMALLEST_SQUARED_NORM = np.float64(1e-24)  # of a quaternion that has a directio
 
 @helper
 def unit_quaternion(quaternion):
-    """Return (w, x, y, z, 1 / norm); the identity with 1 / norm = 0 for a zero quaternion."""
+    """Return (w, x, y, z, 1 / norm), or the identity with 1 / norm = 0 for a zero quaternion."""
     w, x, y, z = quaternion
     squared = w * w + x * x + y * y + z * z
     inverse = keep(squared > SMALLEST_SQUARED_NORM, ONE / square_root(squared))
@@ -131,7 +131,7 @@ def lane_gaussians(prepared, start):
 
 @helper
 def lane_sums_of_view(gradients, places, start):
-    """Return the columns of these Gaussians' gradients in one view, summed over bands; REACHED counts the bands.
+    """Return the columns of these Gaussians' gradients in one view, summed over bands. REACHED counts the bands.
 
     Args:
         gradients, places: [band row 16] and [band lane].

@@ -104,7 +104,11 @@ def in_every_lane(builder, scalar):
 
 
 def _define_operator(function, emit, mask=False, count=2):
-    """Define a Python operator with `count` operands for vectors and scalars beside them; `mask`: it returns a mask."""
+    """Define a Python operator with `count` operands for vectors and scalars beside them.
+
+    Args:
+        mask: whether it returns a mask.
+    """
     for kind in (VECTOR, DOUBLES):
         _define_for(kind, MASK if mask else kind, function, emit, count)
 
@@ -215,7 +219,7 @@ def square_root(builder, vector):
 
 @vector_function(VECTOR)
 def exp2(builder, x):
-    """Return 2^x with a relative error of 2e-7, for x from -126 to 127; meaningless (but harmless) outside.
+    """Return 2^x with a relative error of 2e-7 for x from -126 to 127. Other results are meaningless, but harmless.
 
     x is split into an integer, which is added to the exponent bits, and a rest in [-1/2, 1/2] for a polynomial.
     """
@@ -232,7 +236,7 @@ def exp2(builder, x):
 
 @vector_function(VECTOR)
 def lane_sums(builder, vectors):
-    """Return the vector whose lane i is the sum over vector i of a tuple of up to 16; other lanes are zero."""
+    """Return the vector whose lane i is the sum over vector i of a tuple of up to 16. Other lanes are zero."""
     rows = unpack(builder, vectors)
     rows += [uniform(0)] * (LANES - len(rows))
     step = 1
@@ -338,7 +342,7 @@ def store_columns(builder, array, stride, start, vectors):
 
 @vector_function(_vectors(LANES))
 def gathered_rows(builder, array, places, start):
-    """Gather the rows places[start] to places[start + 15], 16 wide, of a flat array; return their 16 columns."""
+    """Return the 16 columns of the rows places[start] to places[start + 15], each 16 wide, of a flat array."""
     rows = []
     for lane in range(LANES):
         entry = builder.gep(places, [builder.add(start, ir.Constant(I64, lane))], inbounds=True)
@@ -360,7 +364,7 @@ def transposed(builder, matrix):
 
 
 def _rows(builder, stride, start, last):
-    """Return the offsets of the rows start, ..., start + 15 of a flat array; row last - 1 replaces those beyond it."""
+    """Return the offsets of the rows start, ..., start + 15 of a flat array. Row last - 1 replaces those beyond it."""
     final = builder.sub(last, ir.Constant(last.type, 1))
     numbers = [builder.add(start, ir.Constant(start.type, lane)) for lane in range(LANES)]
     return [builder.mul(builder.select(builder.icmp_signed("<", i, final), i, final), stride) for i in numbers]

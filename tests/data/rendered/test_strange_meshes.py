@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from support import strict_json
 
-from completesplat.data.rendered.drawing import textures_of
+from completesplat.data.rendered.random_scenes import textures_of
 from completesplat.data.rendered.rendering import render
 from completesplat.errors import DataError
 from completesplat.ply_files import read_vertices

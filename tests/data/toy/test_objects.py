@@ -13,9 +13,9 @@ from support import refused
 
 from completesplat.data.co3d.annotations import camera_from_viewpoint
 from completesplat.data.toy import object_scene, write_objects, write_rooms
+from completesplat.data.toy.data_sets import draw_category
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.data.toy.object_scene import CHANCES, PATCH_COLORS, draw_mini, draw_object_scene, render_frame
-from completesplat.data.toy.writing import draw_category
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import pixel_centers, project, unproject
 

@@ -19,8 +19,8 @@ from numba.core.caching import CacheImpl
 from support import LIMIT, python
 
 from completesplat.data.toy import raytracing
-from completesplat.rasterizers.kernels import compilation, drawing
-from completesplat.rasterizers.kernels.drawing import parallel
+from completesplat.rasterizers.kernels import compilation, runtime
+from completesplat.rasterizers.kernels.runtime import parallel
 from completesplat.rasterizers.tiled import TiledRasterizer
 
 
@@ -113,39 +113,39 @@ def _double(x: int) -> int:
 
 def test_memory_is_aligned_reused_and_not_shared() -> None:
     """Memory is in use as long as any view of the array."""
-    drawing.release()
-    first, second = drawing.empty((1000, 7)), drawing.empty((1000, 7))
+    runtime.release()
+    first, second = runtime.empty((1000, 7)), runtime.empty((1000, 7))
     assert first.ctypes.data % 64 == second.ctypes.data % 64 == 0
     assert not np.shares_memory(first, second)
     address, part = first.ctypes.data, first[1:].T.view(np.int32)
     del first
     gc.collect()
-    third = drawing.empty((7, 1000))
+    third = runtime.empty((7, 1000))
     assert not np.shares_memory(part, third)
     del part
     gc.collect()
-    assert drawing.empty((7, 1000), np.int32).ctypes.data == address
+    assert runtime.empty((7, 1000), np.int32).ctypes.data == address
 
 
 def test_free_memory_beyond_the_limit_is_given_up_oldest_first_and_only_for_new_memory(monkeypatch) -> None:
     """New memory costs more than writing to it, so a large scene that is drawn again needs none."""
-    monkeypatch.setattr(drawing, "MOST_FREE_BYTES", 20_000)
-    drawing.release()
-    arrays = [drawing.empty((2**size,), np.uint8) for size in (13, 14, 15)]
+    monkeypatch.setattr(runtime, "MOST_FREE_BYTES", 20_000)
+    runtime.release()
+    arrays = [runtime.empty((2**size,), np.uint8) for size in (13, 14, 15)]
     while arrays:
         del arrays[0]
     sizes = [2**13, 2**14, 2**15]
-    assert [len(memory) for memory in drawing._free] == sizes
-    again = drawing.empty((2**15,), np.uint8)
-    assert [len(memory) for memory in drawing._free] == sizes[:2]
-    larger = drawing.empty((2**17,), np.uint8)
-    assert [len(memory) for memory in drawing._free] == sizes[1:2]
+    assert [len(memory) for memory in runtime._free] == sizes
+    again = runtime.empty((2**15,), np.uint8)
+    assert [len(memory) for memory in runtime._free] == sizes[:2]
+    larger = runtime.empty((2**17,), np.uint8)
+    assert [len(memory) for memory in runtime._free] == sizes[1:2]
     del again, larger
 
 
 def test_a_scene_that_is_drawn_again_needs_no_new_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    drawing.release()
+    runtime.release()
     gaussians = healthy(500).map(lambda tensor: tensor.requires_grad_())
     pools = []
     for _ in range(3):
@@ -154,8 +154,8 @@ def test_a_scene_that_is_drawn_again_needs_no_new_memory(monkeypatch: pytest.Mon
         address = gradients[0].data_ptr()
         del rendering, gradients
         gc.collect()
-        pools.append({id(memory) for memory in drawing._free})
-        assert address in {np.frombuffer(memory, np.uint8).ctypes.data for memory in drawing._free}
+        pools.append({id(memory) for memory in runtime._free})
+        assert address in {np.frombuffer(memory, np.uint8).ctypes.data for memory in runtime._free}
     assert pools[0] == pools[1] == pools[2]
 
 
@@ -168,9 +168,9 @@ def test_the_system_may_take_large_free_memory() -> None:
     def lazily_freed() -> int:
         return next(int(line.split()[1]) for line in rollup.read_text().splitlines() if line.startswith("LazyFree:"))
 
-    drawing.release()
+    runtime.release()
     before = lazily_freed()
-    array = drawing.empty((2**22,))
+    array = runtime.empty((2**22,))
     array.fill(1)
     assert lazily_freed() == before
     del array
@@ -181,6 +181,6 @@ def test_the_system_may_take_large_free_memory() -> None:
 @pytest.mark.processes
 def test_memory_that_is_in_use_when_the_interpreter_ends() -> None:
     """Python clears the kernels' module before the main one, which holds the array."""
-    code = "from completesplat.rasterizers.kernels import drawing; array = drawing.empty((3,))"
+    code = "from completesplat.rasterizers.kernels import drawing; array = runtime.empty((3,))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT)
     assert (result.returncode, result.stderr) == (0, "")
