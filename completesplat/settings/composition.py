@@ -84,8 +84,8 @@ def nearest_names(verb: str) -> Iterator[None]:
         unknown = UNKNOWN_KEY.match(str(error))
         if unknown is None:
             raise
-        known = {*setting_names(_composed(verb)), *groups()}
-        message = f"{unknown[0]}{did_you_mean(unknown[1], known)}"
+        names = {*setting_names(_composed(verb)), *groups()}
+        message = f"{unknown[0]}{did_you_mean(unknown[1], names)}"
         raise CompleteSplatError(message) from error
     except ValueError as error:  # Hydra's, for `group=null`
         raise CompleteSplatError(str(error)) from error

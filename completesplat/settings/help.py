@@ -7,12 +7,11 @@ from typing import Any
 import yaml
 
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.options import TASKS, conf_folder, conf_text, did_you_mean, options
+from completesplat.settings.options import LOADER, TASKS, conf_folder, conf_text, did_you_mean, options
 
 FLAGS = ("--help", "-h")
 NO_SETTINGS = ("defaults", "verb", "description", "hydra", "task")
 """Keys of a file that are no settings of its verb."""
-LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def help_page(verb: str, arguments: Sequence[str] = ()) -> str:

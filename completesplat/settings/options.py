@@ -3,7 +3,12 @@
 from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
+import yaml
+
+LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""The faster of PyYAML's loaders that build plain values only."""
 TASKS = ("data", "bench", "report")
 """Verbs with several tasks: `data toy` is short for `data data_task=toy`."""
 LEAST_LIKE = 0.6
