@@ -17,6 +17,7 @@ from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryV
 from yaml import YAMLError
 
 from completesplat.commands import jobs, new
+from completesplat.commands.locks import hold_job_lock, one_of_several
 from completesplat.errors import CompleteSplatError
 from completesplat.files import file_refusal
 from completesplat.settings import composition, help
@@ -60,7 +61,7 @@ def launch(verb: str, arguments: list[str]) -> None:
 
     def job(config: DictConfig) -> float | None:
         try:
-            with jobs.hold_job_lock(*jobs.job_folders(config)):
+            with hold_job_lock(*jobs.job_folders(config)):
                 return jobs.run_job(verb, config, program, arguments)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -86,7 +87,7 @@ def _check_start(overrides: Sequence[str]) -> None:
             raise CompleteSplatError(f"{empty}: names no folder; give out=DIR")
     if is_sweep(overrides) and any(argument.startswith("--cfg=") for argument in overrides):
         raise CompleteSplatError("--cfg shows the settings of one run: leave out -m")
-    if not jobs.one_of_several():
+    if not one_of_several():
         return
     if is_sweep(overrides):
         message = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"

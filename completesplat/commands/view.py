@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from completesplat.commands.jobs import is_running
+from completesplat.commands.locks import is_running
 from completesplat.errors import CompleteSplatError, needing
 from completesplat.files import SPLATS, printable
 from completesplat.settings.checks import REMOVE, check_parts

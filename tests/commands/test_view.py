@@ -16,7 +16,7 @@ from support import LIMIT
 from viewer_scenes import balls
 from written_commands import ROOT
 
-from completesplat.commands.jobs import hold_job_lock
+from completesplat.commands.locks import hold_job_lock
 from completesplat.commands.view import newest_scenes, scenes_in, setting_of_path, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.description import UP
