@@ -16,13 +16,19 @@ def main() -> None:
             if sys.stdout is not None:
                 sys.stdout.flush()
     except OSError:
-        try:
-            os.write(sys.stdout.fileno(), b"\n")
-        except OSError as error:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            closed = isinstance(error, BrokenPipeError)  # by the reader of the output (`head`, say)
-            sys.exit(1 if closed else _refuse(f"standard output: cannot be written: {error.strerror}", 1))
+        _check_output()
         raise
+
+
+def _check_output() -> None:
+    """Exit with status 1 if standard output cannot be written, in silence if its reader (`head`, say) has closed it."""
+    try:
+        os.write(sys.stdout.fileno(), b"\n")
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more is written when Python ends
+        if not isinstance(error, BrokenPipeError):
+            _refuse(f"standard output: cannot be written: {error.strerror}")
+        sys.exit(1)
 
 
 def _run() -> None:

@@ -120,18 +120,25 @@ def quieten() -> None:
 def refusal(error: BaseException) -> str | None:
     """Return one line for an error that the user can put right, None for a fault of the program."""
     message: str | None = None
-    if (own_error := _own_error(error)) is not None:
+    own_error = _own_error(error)
+    if own_error is not None:
         message = str(own_error)
     elif isinstance(error, MissingMandatoryValue | InterpolationToMissingValueError):
-        named = str(error).partition("Missing mandatory value: ")[2].split()  # OmegaConf has it nowhere else
-        key = error.full_key if isinstance(error, MissingMandatoryValue) else named[0]
-        key = (key or "").removeprefix("task.")  # whose settings are given without
+        key = _missing_key(error)
         message = f"{key} is needed: give {key}=VALUE"
     elif isinstance(error, InstantiationException):
         message = _of_a_part(error)
     elif isinstance(error, HydraException | OmegaConfBaseException | YAMLError):
         message = str(error)
     return None if message is None else " ".join(message.split())
+
+
+def _missing_key(error: MissingMandatoryValue | InterpolationToMissingValueError) -> str:
+    """Return the setting without a value; those of a task are given without `task.`"""
+    key = error.full_key or ""
+    if isinstance(error, InterpolationToMissingValueError):  # whose key is that of the setting that refers to it
+        key = str(error).partition("Missing mandatory value: ")[2].split()[0]
+    return key.removeprefix("task.")
 
 
 def _of_a_part(error: InstantiationException) -> str | None:
