@@ -8,7 +8,10 @@ VERBS = ("data", "plan", "fit", "test", "predict", "view", "report", "new", "ben
 
 
 def main() -> None:
-    """Run the command; exit with status 0 only if everything worked, 2 for a refused input, 1 for other failures."""
+    """Run the command.
+
+    The exit status is 0 only if everything worked, 2 for a refused input, 1 for other failures.
+    """
     try:
         try:
             _run()

@@ -97,7 +97,10 @@ def _check_start(overrides: Sequence[str]) -> None:
 
 
 def _join_job(verb: str, argument: str) -> None:
-    """Work on a job whose first process has started; end when that one ends."""
+    """Work on a job whose first process has started.
+
+    This process ends when that one ends.
+    """
     starter, _, out = argument.partition("=")[2].partition(":")
     end_with(int(starter))
     with ended_by_signals():
@@ -134,7 +137,10 @@ def refusal(error: BaseException) -> str | None:
 
 
 def _missing_key(error: MissingMandatoryValue | InterpolationToMissingValueError) -> str:
-    """Return the setting without a value; those of a task are given without `task.`"""
+    """Return the setting without a value.
+
+    Those of a task are given without `task.`
+    """
     key = error.full_key or ""
     if isinstance(error, InterpolationToMissingValueError):  # whose key is that of the setting that refers to it
         key = str(error).partition("Missing mandatory value: ")[2].split()[0]

@@ -40,7 +40,10 @@ def run(config: DictConfig, out: Path) -> None:
 
 
 def findings(check: Callable[[], Iterator[tuple[str, str]]]) -> Mapping[str, str]:
-    """Return the lines of a check by name; an exception of any library is the line of the check that it ends."""
+    """Return the lines of a check by name.
+
+    An exception of any library is the line of the check that it ends.
+    """
     lines = {}
     try:
         for name, text in check():

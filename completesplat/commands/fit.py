@@ -63,7 +63,10 @@ def instantiate(config: DictConfig) -> tuple[SceneDataModule, Scorer]:
 
 @stopped_together()
 def run(config: DictConfig, out: Path) -> None:
-    """Train and test; write `metrics.csv`, checkpoints and at the end `metrics.json` into the run directory."""
+    """Train and test.
+
+    Write `metrics.csv`, checkpoints and at the end `metrics.json` into the run directory.
+    """
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
     refuse_without_effect(config, out)
@@ -112,7 +115,12 @@ def _print_layers(module: Scorer) -> None:
 
 
 def _train(trainer: Trainer, module: Stage, data: SceneDataModule, resumed: str | None, out: Path) -> dict[str, float]:
-    """Train, save the weights, and return all logged figures; refuse a checkpoint of another model."""
+    """Train, save the weights, and return all logged figures.
+
+    Raises:
+        WeightsError: the checkpoint to continue from is of another model.
+        CompleteSplatError: Lightning refuses a setting of its trainer.
+    """
     try:
         trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
     except MisconfigurationException as error:

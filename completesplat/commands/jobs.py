@@ -104,7 +104,11 @@ def _resolve_start_weights(config: DictConfig) -> None:
 
 
 def optimized(metric: str | None, out: Path) -> float | None:
-    """Return a job's metric for sweepers (NaN: not finite, None: not asked); raise CompleteSplatError if absent."""
+    """Return a job's metric for sweepers (NaN: not finite, None: not asked).
+
+    Raises:
+        CompleteSplatError: the job has no such metric.
+    """
     if metric is None:
         return None
     figures = {name: value for name, value in read_mapping(out / METRICS).items() if isinstance(value, float)}
@@ -132,7 +136,11 @@ def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) 
 
 
 def start(verb: str, config: DictConfig, out: Path) -> object:
-    """Check the settings and call the config's task or else the verb's `run`; return its result (a text is printed)."""
+    """Check the settings and call the config's task or else the verb's `run`.
+
+    Returns:
+        The result of `run` or of the task. A text is printed.
+    """
     first = "torch" not in sys.modules
     gc.disable()  # it takes a third of a prediction's time to examine all that is imported again and again
     try:
@@ -227,7 +235,10 @@ def _differences(first: object, second: object, moved: tuple[str, str], key: str
 
 @contextmanager
 def _recorded(out: Path, job: Mapping[str, object], config: Mapping[str, object]) -> Iterator[None]:
-    """Record a job and its config; restore those of an earlier job if this one ends before it has written a file."""
+    """Record a job and its config.
+
+    Those of an earlier job are restored if this one ends before it has written a file.
+    """
     earlier = {path: path.read_bytes() for path in (out / RECORD, out / CONFIG) if path.is_file()}
     before = _written(out)
     renamed = _record(out, job, config)
@@ -257,7 +268,11 @@ def _written(out: Path) -> set[tuple[int, int]]:
 
 
 def _record(out: Path, job: Mapping[str, object], config: Mapping[str, object]) -> Path | None:
-    """Write `run.json` with `job_entries`, times and earlier ends; rename earlier results and return their new name."""
+    """Write `run.json` with `job_entries`, times and earlier ends.
+
+    Returns:
+        The new name of earlier results, if there were any.
+    """
     path = out / RECORD
     now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
     record: dict[str, Any] = {"version": __version__, "commit": git_commit(), **job, "started": now}
@@ -277,7 +292,11 @@ def _record(out: Path, job: Mapping[str, object], config: Mapping[str, object]) 
 
 
 def _rename_results(out: Path) -> Path | None:
-    """Name the results of a run that goes on after their number of steps; return the new path, None without any."""
+    """Name the results of a run that goes on after their number of steps.
+
+    Returns:
+        The new path, or None if there are no results.
+    """
     results = out / METRICS
     if not results.is_file():
         return None

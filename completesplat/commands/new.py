@@ -20,7 +20,10 @@ FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)  # line of a template that name
 
 
 def run(config: DictConfig) -> None:
-    """Write the part's files into the working folder; print their names and the commands that test and use them."""
+    """Write the part's files into the working folder.
+
+    Print their names and the commands that test and use them.
+    """
     kind = str(config.kind)
     name = str(config.name)
     files = new_files(kind, name)
@@ -35,7 +38,11 @@ def run(config: DictConfig) -> None:
 
 
 def new_files(kind: str, name: str) -> dict[Path, str]:
-    """Return a new part's files by path; raise CompleteSplatError if kind or name is unfit, or a file exists."""
+    """Return a new part's files by path.
+
+    Raises:
+        CompleteSplatError: kind or name is unfit, or a file exists.
+    """
     if kind not in KINDS:
         raise CompleteSplatError(f"kind={kind}: choose one of {', '.join(KINDS)}")
     if not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):

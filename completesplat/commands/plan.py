@@ -47,7 +47,11 @@ def run(config: DictConfig, out: Path) -> None:
 
 
 def measured_plan(config: DictConfig) -> dict[str, Any]:
-    """Return the figures of a training; raise CompleteSplatError if a setting does not fit, or a step does not work."""
+    """Return the figures of a training.
+
+    Raises:
+        CompleteSplatError: a setting does not fit, or a step does not work.
+    """
     check_image_size(config)
     check_optimizer(config.optimizer)
     data = training_data(config)
@@ -77,7 +81,11 @@ def measured_plan(config: DictConfig) -> dict[str, Any]:
 
 
 def training_data(config: DictConfig) -> SceneDataModule | None:
-    """Return the training's data; None if their folder is not there yet, and no latents stand for them."""
+    """Return the training's data.
+
+    Returns:
+        The data module, or None if there is no folder of data yet and no latent cache is given.
+    """
     data = config.data
     root = None if OmegaConf.is_missing(data, "root") else str(data.root)
     there = root is not None and ("://" in root or Path(root).is_dir())
@@ -89,14 +97,21 @@ def training_data(config: DictConfig) -> SceneDataModule | None:
 
 
 def batch_of_device(config: DictConfig) -> int:
-    """Return the scenes that a device takes at once; raise CompleteSplatError if devices cannot share the batch."""
+    """Return the scenes that a device takes at once.
+
+    Raises:
+        CompleteSplatError: devices cannot share the batch.
+    """
     devices = config.trainer.devices
     count = devices if isinstance(devices, int) else 1
     return batch_per_process(config.data.batch_size, count, config.trainer.accumulate_grad_batches)
 
 
 def measure(config: DictConfig, data: SceneDataModule | None) -> tuple[Training, float]:
-    """Train a few steps from random weights; return the training, and the median seconds of a step with its loading.
+    """Train a few steps from random weights.
+
+    Returns:
+        The training, and the median seconds of a step, its loading included.
 
     Raises:
         CompleteSplatError: the model has no steps of its own, or one of them fails, because memory is short, say.
@@ -126,7 +141,10 @@ def measure(config: DictConfig, data: SceneDataModule | None) -> tuple[Training,
 
 
 def scene_batches(config: DictConfig, data: SceneDataModule | None) -> Iterator[Batch]:
-    """Yield batches of the training, again and again; noise of the same sizes, if there are no data."""
+    """Yield batches of the training, again and again.
+
+    Without data, the batches are noise of the same sizes.
+    """
     batch = batch_of_device(config)
     if data is None:
         noise = synthetic_batch(config.data.image_size, batch, config.data.targets)
@@ -139,7 +157,11 @@ def scene_batches(config: DictConfig, data: SceneDataModule | None) -> Iterator[
 
 
 def number_of_steps(config: DictConfig, data: SceneDataModule | None) -> int | None:
-    """Return the optimizer steps of the training; None if it has no end, or epochs of data that are not there."""
+    """Return the optimizer steps of the training.
+
+    Returns:
+        The number, or None if the training has no end, or ends after epochs of data that are not there.
+    """
     limits = []
     epochs = config.trainer.get("max_epochs")
     if config.trainer.max_steps >= 0:

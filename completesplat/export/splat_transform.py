@@ -31,7 +31,11 @@ LARGEST_FOV = 120.0  # phones' windows
 
 
 def convert(program: str, source: Path, target: Path, options: Sequence[str] = ()) -> None:
-    """Write `target` in its suffix's format, whole or not at all; raise CompleteSplatError if the program fails."""
+    """Write `target` in its suffix's format, whole or not at all.
+
+    Raises:
+        CompleteSplatError: the program fails.
+    """
     with atomic_path(target) as temporary:
         _run([program, "--quiet", "--overwrite", *options, str(source), str(temporary)])
         if not temporary.is_file():
@@ -39,7 +43,11 @@ def convert(program: str, source: Path, target: Path, options: Sequence[str] = (
 
 
 def find_splat_transform() -> str:
-    """Return the program on PATH or npm's (`npx` downloads 200 MB once); raise CompleteSplatError if neither works."""
+    """Return the program on PATH or npm's (`npx` downloads 200 MB once).
+
+    Raises:
+        CompleteSplatError: neither works.
+    """
     return _find(shutil.which(PROGRAM), shutil.which("npx"))
 
 
@@ -57,7 +65,11 @@ def _find(program: str | None, npx: str | None) -> str:
 
 
 def _run(command: Sequence[str]) -> str:
-    """Run a program in a new session, so that npx's child processes can be killed with it; return its output."""
+    """Run a program in a new session, so that npx's child processes can be killed with it.
+
+    Returns:
+        What the program prints.
+    """
     name = Path(command[0]).name
     try:
         process = subprocess.Popen(

@@ -39,7 +39,11 @@ def check_values(verb: str, config: DictConfig) -> None:
 
 
 def check_parts_of_verb(verb: str, config: DictConfig) -> None:
-    """Complete a verb's task; raise CompleteSplatError for the first unfit setting of its parts, except for `view`."""
+    """Complete a verb's task.
+
+    Raises:
+        CompleteSplatError: a setting of its parts does not fit, except for `view`.
+    """
     if "task" in config:
         complete_task(config)
     if verb != "view":  # `view` shows its page before it imports torch, so it checks its parts later

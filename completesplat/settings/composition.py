@@ -29,7 +29,10 @@ LONGEST_NAME = 120
 
 
 class SettingsOfWorkingFolder(SearchPathPlugin):
-    """Hydra plugin that finds further options of the config groups in `./conf`; the package's own come first."""
+    """Hydra plugin that finds further options of the config groups in `./conf`.
+
+    The package's own come first.
+    """
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         """Append `./conf`, if it exists, to the search path (Hydra calls this method)."""
@@ -39,7 +42,10 @@ class SettingsOfWorkingFolder(SearchPathPlugin):
 
 
 def use_working_folder() -> None:
-    """Append the working folder to `sys.path`, and its `conf` to Hydra's search path; each process must call this."""
+    """Append the working folder to `sys.path`, and its `conf` to Hydra's search path.
+
+    Each process must call this.
+    """
     folder = str(Path.cwd())
     if not {"", folder} & set(sys.path):
         sys.path.append(folder)

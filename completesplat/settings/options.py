@@ -32,12 +32,18 @@ def groups() -> list[str]:
 
 
 def options(group: str) -> list[str]:
-    """Return the options of a config group; files that begin with `_` are parts of others."""
+    """Return the options of a config group.
+
+    Files that begin with `_` are parts of others.
+    """
     return sorted({file.stem for folder in folders() for file in (folder / group).glob("[!_]*.yaml")})
 
 
 def conf_text(name: str) -> str:
-    """Return the text of a file by its name without suffix (`data/toy_objects`); the package's own come first."""
+    """Return the text of a file by its name without suffix (`data/toy_objects`).
+
+    The package's own come first.
+    """
     for folder in folders():
         path = folder / f"{name}.yaml"
         if path.is_file():

@@ -82,7 +82,10 @@ def _observed_by(observe: Callable[[list[subprocess.Popen[bytes]]], None]) -> It
 
 
 def _end(process: "subprocess.Popen[bytes]", number: int) -> None:
-    """Wait for a process to end; send it the signal after a second, and kill it after five more."""
+    """Wait for a process to end.
+
+    Send it the signal after a second, and kill it after five more.
+    """
     for seconds, next_number in ((GRACE_SECONDS / 5, number), (GRACE_SECONDS, signal.SIGKILL)):
         try:
             process.wait(seconds)
@@ -142,7 +145,10 @@ class _Observer(threading.Thread):
 
 
 def agreed_signal(trainer: Trainer) -> int | None:
-    """Return the signal that a process of the run received, if any did; all processes have to call this."""
+    """Return the signal that a process of the run received, if any did.
+
+    All processes have to call this.
+    """
     if trainer.world_size == 1:
         return signals.received()  # without a wait for the GPU
     local = torch.tensor(signals.received() or 0, device=trainer.strategy.root_device)

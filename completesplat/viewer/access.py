@@ -65,11 +65,17 @@ class GuardedServer(viser.ViserServer):
 
     @property
     def address(self) -> str:
-        """Address that opens the page; it contains the token."""
+        """Address that opens the page.
+
+        It contains the token.
+        """
         return f"http://{self.get_host()}:{self.get_port()}/?token={self.token}"
 
     def _serve(self, serve: Callable[..., Any], *args: Any, process_request: Answer, **settings: Any) -> Any:
-        """Start viser's websocket server with our checks; viser calls this instead of `serve`."""
+        """Start viser's websocket server with our checks.
+
+        viser calls this instead of `serve`.
+        """
         self._guarded = True
         answer = partial(self._answer, process_request)
         return serve(*args, process_request=answer, **settings | {"max_size": MOST_FRAME})
@@ -128,7 +134,10 @@ def show_status(server: viser.ViserServer, text: str) -> None:
 
 
 def stop_server(server: viser.ViserServer) -> None:
-    """Stop a server; browsers then lose the page."""
+    """Stop a server.
+
+    Browsers then lose the page.
+    """
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
@@ -146,5 +155,8 @@ def tokens(request: Request, port: int) -> list[bytes]:
 
 
 def with_head(page: str) -> str:
-    """Return viser's HTML with our title, icon and script at the start of its head; viser has no settings for them."""
+    """Return viser's HTML with our title, icon and script at the start of its head.
+
+    viser has no settings for them.
+    """
     return page.replace("<head>", f"<head>{HEAD.read_text()}", 1)
