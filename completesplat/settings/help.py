@@ -4,8 +4,6 @@ from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any
 
-import yaml
-
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.options import LOADER, TASKS, conf_folder, conf_text, did_you_mean, options
 
@@ -127,4 +125,4 @@ def first_comment(name: str) -> str:
 @cache
 def contents(name: str) -> dict[str, Any]:
     """Return the keys and values of a file of `conf/`."""
-    return dict(yaml.load(conf_text(name), Loader=LOADER))
+    return dict(LOADER(conf_text(name)).get_single_data())
