@@ -9,10 +9,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from completesplat.commands.jobs import is_running
+from completesplat.commands.locks import is_running
 from completesplat.errors import CompleteSplatError, needing
 from completesplat.files import SPLATS, printable
-from completesplat.imports import importing, postponing
 from completesplat.settings.checks import REMOVE, check_parts
 from completesplat.signals import Interrupted
 from completesplat.weights import AUTO, CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, shipped
@@ -117,12 +116,11 @@ def holds_scene(folder: Path) -> bool:
 
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     """Create a server's page and fill it with the scenes or the model that the settings name."""
-    with importing(), postponing():
-        import completesplat.commands.trained
-        import completesplat.viewer.completion
-        import completesplat.viewer.page  # noqa: F401
+    import completesplat.commands.trained
+    import completesplat.viewer.completion
+    import completesplat.viewer.page  # noqa: F401
 
-        check_parts(config)
+    check_parts(config)
     if config.watch is not None:
         note, samples, up = newest_scenes(Path(config.watch))
         page = empty_page(server, config, out, up)

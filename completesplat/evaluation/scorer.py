@@ -25,6 +25,7 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.quantities import Share
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
+from completesplat.signals import restore_handlers
 
 Result = TypeVar("Result")
 Renders = Float[Tensor, "batch view 3 height width"]
@@ -118,6 +119,7 @@ class Scorer(LightningModule):
             return self.rasterizer(gaussians, cameras).over(self.background)
 
     def on_test_start(self) -> None:
+        restore_handlers()  # Lightning's would end a test with exit status 0
         self.evaluation.reset()
         self.evaluation.first_novel = self.first_novel
         self.seconds = defaultdict(list)
