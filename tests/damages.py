@@ -101,16 +101,17 @@ def must_refuse(reader: str, expected: Refused, source: Path, folder: Path) -> N
     frames = None
     try:
         usable = READERS[reader].read(folder)
+        assert isinstance(usable, Usable), "the damage was not noticed"
         refused = usable.refused
         frames = usable.frames
     except CompleteSplatError as error:
         refused = [error]
+    assert len(refused) == 1 + expected.others
     message = str(refused[0])
     assert "\n" not in message
     message = message.replace(f"{folder}/", "").replace(str(folder), "DIR")
     assert message.startswith(f"{expected.place}: " if expected.place else "")
     assert expected.reason in message
     assert isinstance(refused[0], expected.kind)
-    assert len(refused) == 1 + expected.others
     if expected.gone is not None:
         assert frames == WHOLE - {("a", frame) for frame in expected.gone}

@@ -71,6 +71,8 @@ CLOUD = f"{CATEGORY}/a/pointcloud.ply"
 ALL = [0, 1, 2, 3]
 F2 = f"{F}, a, frame 2"
 NO_CLOUD = put(S, "0.point_cloud", None)
+OTHER_FORMAT = put(F, "2.viewpoint.intrinsics_format", "screen")
+UNKNOWN_FRAME = edit(L, lambda lists: lists["train"].append(["a", 99]))
 CO3D = [
     Refused(put(F, "2.viewpoint", ...), BadAnnotation, F2, "no viewpoint", [2]),
     Refused(put(F, "2.viewpoint.R", ...), BadAnnotation, F2, "R must be 3 x 3 numbers", [2]),
@@ -80,7 +82,7 @@ CO3D = [
     Refused(put(F, "2.viewpoint.T", [0.0, 1e200, 4.0]), BadAnnotation, F2, "T is not finite in float32", [2]),
     Refused(put(F, "2.viewpoint.focal_length", [0, 2]), BadCamera, F2, "focal_length must be positive", [2]),
     Refused(put(F, "2.viewpoint.principal_point", [0, 1.2]), BadCamera, F2, "lies outside of the 32 x 24 image", [2]),
-    Refused(put(F, "2.viewpoint.intrinsics_format", "screen"), BadAnnotation, F2, "unknown intrinsics format", [2]),
+    Refused(OTHER_FORMAT, BadAnnotation, F2, "unknown intrinsics format 'screen'", [2]),
     Refused(put(F, "2.image.size", [0, 32]), BadAnnotation, F2, "two positive integers", [2]),
     Refused(put(F, "2.image.size", [10**400, 24]), BadAnnotation, F2, "two positive integers", [2]),
     Refused(put(F, "2.mask", None), BadAnnotation, F2, "mask must be of type dict", [2]),
@@ -100,7 +102,7 @@ CO3D = [
     Refused(edit(F, lambda frames: {"frames": frames}), BadAnnotation, F, "must hold a list"),
     Refused(edit(L, lambda lists: [lists]), BadAnnotation, L, "no train"),
     Refused(edit(L, lambda lists: lists["train"].append(["a"])), BadAnnotation, L, "expected", []),
-    Refused(edit(L, lambda lists: lists["train"].append(["a", 99])), BadAnnotation, f"{L}, a, frame 99", "not ann", []),
+    Refused(UNKNOWN_FRAME, BadAnnotation, f"{L}, a, frame 99", "not annotated", []),
     Refused(cut(F, 100), UnreadableFile, F, ""),
     Refused(cut(S, 100), UnreadableFile, S, ""),
     Refused(cut(L, 100), UnreadableFile, L, ""),
@@ -239,6 +241,8 @@ CHUNKS = [
 
 J = "transforms.json"
 POSE = "frames.5.transform_matrix.0.3"
+TWICE_NAMED = put(J, "frames.2.file_path", "./frame1")
+FISHEYE = put(J, "camera_model", "OPENCV_FISHEYE")
 WIDE = both(put(J, "fl_x", ...), put(J, "camera_angle_x", 3.2))
 TRANSFORMS = [
     Refused(content(J, b"null"), BadAnnotation, f"{J}, input", "no frames in"),
@@ -253,14 +257,14 @@ TRANSFORMS = [
     Refused(put(J, POSE, 1e25), BadAnnotation, f"{J}, input, frame 5", "not finite in float32: "),
     Refused(put(J, "frames.3.transform_matrix.0.0", 0.3), BadCamera, f"{J}, input, frame 3", "not orthonormal"),
     Refused(put(J, "frames.3.transform_matrix.3.0", 0.1), BadCamera, f"{J}, input, frame 3", "matrix ends in the row"),
-    Refused(put(J, "frames.2.file_path", "./frame1"), BadAnnotation, f"{J}, input, frame 2", "the same image as frame"),
+    Refused(TWICE_NAMED, BadAnnotation, f"{J}, input, frame 2", "the same image as frame 1"),
     Refused(put(J, "frames.2.file_path", "../frame2.png"), OutsidePath, f"{J}, input, frame 2", "leads outside"),
     Refused(put(J, "frames.4.mask_path", "m.png"), MissingFile, "m.png, input, frame 4", "no such file"),
     Refused(put(J, "fl_x", ...), BadAnnotation, f"{J}, input, frame 0", "neither fl_x nor camera_angle_x"),
     Refused(put(J, "frames.1.fl_y", -2.0), BadCamera, f"{J}, input, frame 1", "must be positive"),
     Refused(WIDE, BadCamera, f"{J}, input, frame 0", "view of 3.2"),
     Refused(put(J, "frames.1.cx", 16.0), BadCamera, f"{J}, input, frame 1", "principal point (16, 6) lies outside"),
-    Refused(put(J, "camera_model", "OPENCV_FISHEYE"), BadCamera, f"{J}, input, frame 0", "FISHEYE is not supported"),
+    Refused(FISHEYE, BadCamera, f"{J}, input, frame 0", "OPENCV_FISHEYE is not supported"),
     Refused(put(J, "is_fisheye", True), BadCamera, f"{J}, input, frame 0", "is_fisheye is not supported"),
     Refused(put(J, "k4", 0.1), BadCamera, f"{J}, input, frame 0", "k4 = 0.1 has no meaning for camera model OPENCV"),
     Refused(put(J, "ply_file_path", J), UnreadableFile, f"{J}, input", "not a point cloud"),
