@@ -207,8 +207,10 @@ def safe_name(text: str, ending: str = "") -> str:
 
 def by_numbers(path: Path) -> list[tuple[int, str]]:
     """Return a key that sorts paths with numbers by them, `r_2` before `r_10`."""
-    parts = re.split(r"([0-9]+)", str(path))
-    return [(len(part), part) if part.isdecimal() else (-1, part) for part in parts]
+    key: list[tuple[int, str]] = []
+    for part in re.split(r"([0-9]+)", str(path)):
+        key.append((len(part) if part.isdecimal() else -1, part))
+    return key
 
 
 def folder_names(stems: Iterable[str]) -> list[str]:

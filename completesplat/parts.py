@@ -67,7 +67,7 @@ class TrainingImages(TypedDict, total=False):
     shows this, before it is seen (0: even); low for renders, which are rare, and high for fruit on white. `box_masks`:
     how often parts of an image were hidden. `background`: grey value behind the objects, if images show nothing else.
     `depth_before`: depth range before the centre of an object of the common size. The others: mean
-    and standard deviation of the training images' features, see `completesplat.data.images.photograph.image_features`.
+    and standard deviation of the training images' features, see `completesplat.photo.features.image_features`.
     """
 
     content: str

@@ -46,12 +46,14 @@ def vertex_header(count: int, properties: Sequence[tuple[str, str]], comments: S
 
     Args:
         properties: names and types (`TYPES`), in the order of a record.
-        comments: one line each; characters outside ASCII are escaped.
+        comments: one line each. Characters outside ASCII are escaped.
     """
     lines = ["ply", "format binary_little_endian 1.0"]
     # A line break inside a comment would start another header line.
     lines += [f"comment {' '.join(comment.split())}" for comment in comments]
-    lines += [f"element vertex {count}", *(f"property {kind} {name}" for name, kind in properties), "end_header", ""]
+    lines.append(f"element vertex {count}")
+    lines += [f"property {kind} {name}" for name, kind in properties]
+    lines += ["end_header", ""]
     return "\n".join(lines).encode("ascii", "backslashreplace")
 
 

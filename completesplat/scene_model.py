@@ -3,10 +3,10 @@
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -15,12 +15,13 @@ from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import Images
 from completesplat.autoreconstructor.model import DepthRange, Reconstruction, ReconstructionModel
-from completesplat.data.images.photograph import ImageLike, Photograph, image_features, read_photograph
 from completesplat.data.placement import SMALLEST_NEAR
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import make_folder, write_bytes, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
+from completesplat.photo.photograph import read_photograph
+from completesplat.photo.reading import Framing, ImageLike, Photograph
 from completesplat.quantities import Natural, Positive, Seed
 from completesplat.rasterizers.front_fitting import fit_front
 from completesplat.rasterizers.selection import auto
@@ -29,7 +30,7 @@ from completesplat.settings.composition import has_bfloat16
 from completesplat.settings.schema import check_settings
 from completesplat.splatter_image import Parameterization
 from completesplat.tensors import concatenate, in_float32
-from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, read_small, shipped, write_sums
+from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
 
 Visible = Float[Tensor, "batch 1 height width"]  # masks that are 0 where an image is hidden, and 1 elsewhere
 OnScenes = Callable[[int, int, Gaussians], None]
@@ -175,7 +176,7 @@ class SceneModel(nn.Module):
 
         Args:
             image: a file, a PIL image, an array or a tensor (see `read`), or what `read` returned.
-            visible: 0 where the image is hidden; see `completesplat.data.images.photograph`.
+            visible: 0 where the image is hidden; by default what `read` was told.
             on_step: called after each denoising step; see `CompleteSplat.generate`.
             **settings: `samples`, `skip_weight`, `color_fits`, `steps`, `seed`, ...: see `Sampling`.
 
@@ -191,6 +192,7 @@ class SceneModel(nn.Module):
         device = self.up.device
         sampling = Sampling(**{"bfloat16": has_bfloat16(device.type), **settings})
         photograph = image if isinstance(image, Photograph) else self.read(image)
+        visible = photograph.visible if visible is None else visible
         shape = (1, self.image_size, self.image_size)
         if visible is not None and (visible.shape != shape or not ((visible >= 0) & (visible <= 1)).all()):
             raise CompleteSplatError(f"visible: needs values from 0 to 1 in shape {list(shape)}")
@@ -257,20 +259,37 @@ class SceneModel(nn.Module):
         near, far = depth_range.tolist()
         return float(near + self.parameterization.first_depth * (far - near))
 
-    def read(self, image: ImageLike, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
-        """Read an image at the model's size (`read_photograph`); an unknown field of view is the training set's.
+    @property
+    def framing(self) -> Framing:
+        """How photos are framed for this model, which is how its training images were.
 
-        The square is enlarged where a cut-out or transparent object reaches beyond it.
-
-        A model of objects on a background gets a cut-out or transparent object on it, as large as in training. It takes
-        every image as of its training's field of view, unless another one is given.
+        The central square is enlarged where a cut-out or transparent object reaches beyond it. A model of objects on a
+        background gets such an object on it, as large as in training. It takes every image as of its training's field
+        of view, unless another one is given.
         """
         typical = self.fov_degrees.item()
+        training = self.architecture.get("training") or {}
         if self.background is None:
-            return read_photograph(image, self.image_size, fov_degrees, typical, remove_background, whole_object=True)
-        known = typical if fov_degrees is None else fov_degrees
-        photo = read_photograph(image, self.image_size, known, known, remove_background, self.background, OBJECT_SHARE)
-        return photo if fov_degrees is not None else replace(photo, fov_source="default")
+            return Framing(self.image_size, typical, whole_object=True, training=training)
+        return Framing(
+            self.image_size,
+            typical,
+            reads_exif=False,
+            background=self.background,
+            object_share=OBJECT_SHARE,
+            training=training,
+        )
+
+    def read(
+        self,
+        image: ImageLike,
+        fov_degrees: float | None = None,
+        remove_background: bool = False,
+        mask: ImageLike | None = None,
+        box: Sequence[float] | None = None,
+    ) -> Photograph:
+        """Read an image at the model's size by `read_photograph`, which explains the arguments."""
+        return read_photograph(image, self.framing, fov_degrees, remove_background, mask, box)
 
     def camera(self, photograph: Photograph) -> Cameras:
         """Return the camera that took a photo, at the origin of the world."""
@@ -291,66 +310,6 @@ class SceneModel(nn.Module):
         write_bytes(folder / WEIGHTS_FILE, save(weights))  # safetensors' own files are readable by their owner alone
         write_text(folder / CONFIG_FILE, json.dumps(self.architecture, indent=2) + "\n")
         write_sums(folder)
-
-
-def distance_to_training(photograph: Photograph, architecture: Mapping[str, Any]) -> float | None:
-    """Return a photo's distance from the training images of weights, in standard deviations; None if it is unknown.
-
-    It is the root mean square over the `image_features`: about 1 for an image of the same kind.
-    """
-    training = architecture.get("training", {})
-    if not {"picture_mean", "picture_std"} <= training.keys():
-        return None
-    mean, std = (torch.tensor(training[name]) for name in ("picture_mean", "picture_std"))
-    return ((image_features(photograph.image) - mean) / std).square().mean().sqrt().item()
-
-
-class Match(NamedTuple):
-    """How an image fits weights: the probability that it is of their kind, and `distance_to_training`."""
-
-    probability: float
-    distance: float
-
-
-def shipped_configs() -> dict[str, Any]:
-    """Return the configs of the weights in the package by name, those for photos of anything first."""
-    configs = {name: json.loads(read_small(folder / CONFIG_FILE)) for name, folder in shipped().items()}
-    return dict(sorted(configs.items(), key=lambda item: "log_odds" in item[1]["training"]))
-
-
-def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str, Match]:
-    """Return how an image fits the weights in the package, the likeliest first.
-
-    Training images are taken as normally distributed, with `log_odds` before the image is seen. Distances depend on the
-    resolution, so the image, which is read once, is resized for each model. Weights of objects on one background are
-    left out if the image's border does not show it.
-
-    Raises:
-        CompleteSplatError: as `read_photograph`.
-    """
-    configs = shipped_configs()
-    largest = max((config["image_size"] for config in configs.values()), default=1)
-    square = read_photograph(image, largest, remove_background=remove_background, whole_object=True).image
-    distances = dict[str, float]()
-    logarithms = list[float]()
-    for name, config in configs.items():
-        if not _shows(config["training"].get("background"), square):
-            continue
-        distance = distance_to_training(read_photograph(square, config["image_size"]), config)
-        if distance is not None:
-            deviations = torch.tensor(config["training"]["picture_std"])
-            distances[name] = distance
-            density = -deviations.log().sum().item() - len(deviations) * distance**2 / 2
-            logarithms.append(density + config["training"].get("log_odds", 0.0))
-    probabilities = torch.tensor(logarithms, dtype=torch.float64).softmax(0).tolist()
-    matches = {name: Match(x, distances[name]) for name, x in zip(distances, probabilities, strict=True)}
-    return dict(sorted(matches.items(), key=lambda match: -match[1].probability))
-
-
-def _shows(background: float | None, square: Float[Tensor, "3 size size"]) -> bool:
-    """Return whether at least half of an image's border has this grey value, up to 0.1; None: any."""
-    border = torch.cat([square[:, [0, -1]].flatten(1), square[:, :, [0, -1]].flatten(1)], 1)
-    return background is None or ((border - background).abs().amax(0) < 0.1).float().mean().item() >= 0.5
 
 
 def camera_tensors(camera: Mapping[str, Any]) -> dict[str, Tensor]:

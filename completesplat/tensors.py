@@ -88,14 +88,16 @@ class TensorDataclass:
 def stack(items: Sequence[T]) -> T:
     """Stack equal-shaped dataclasses along a new leading axis (the collate function of the data loaders).
 
-    Strings are collected into a tuple; other static values must be the same in all items.
+    Strings are collected into a tuple. Other static values must be the same in all items.
 
     Raises:
         ValueError: there are no items, or a static value differs between them.
     """
     if not items:
         raise ValueError("cannot stack an empty sequence")
-    merged = {field.name: _merge([getattr(item, field.name) for item in items]) for field in fields(items[0])}
+    merged = {}
+    for field in fields(items[0]):
+        merged[field.name] = _merge([getattr(item, field.name) for item in items])
     return replace(items[0], **merged)
 
 
@@ -107,7 +109,9 @@ def concatenate(items: Sequence[T], axis: int = 0) -> T:
             return torch.cat(values, dim=axis)
         return concatenate(values, axis) if isinstance(values[0], TensorDataclass) else values[0]
 
-    joined = {field.name: join([getattr(item, field.name) for item in items]) for field in fields(items[0])}
+    joined = {}
+    for field in fields(items[0]):
+        joined[field.name] = join([getattr(item, field.name) for item in items])
     return replace(items[0], **joined)
 
 

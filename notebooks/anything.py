@@ -10,7 +10,7 @@ import torch
 
 import completesplat
 from completesplat.export.images import image_sheet, strip, write_png
-from completesplat.export.prediction import seen_center
+from completesplat.export.scene_files import seen_center
 from completesplat.geometry.trajectories import orbit
 from completesplat.rasterizers.selection import auto
 
@@ -19,7 +19,7 @@ model, rasterizer, rows = completesplat.CompleteSplat.from_pretrained("general")
 for name in sys.argv[2:]:
     photo = model.read(name)
     camera, (scene,) = model.camera(photo), model(photo, color_fits=40)
-    pivot = seen_center(rasterizer, scene, camera, None)
+    pivot = seen_center(rasterizer, scene, camera)
     cameras = orbit(camera, pivot, model.up, 360 // STEP)[torch.tensor(SHOWN)]
     with torch.no_grad():
         scenes = scene.map(lambda tensor: tensor.expand(len(SHOWN), *tensor.shape))

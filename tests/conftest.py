@@ -270,7 +270,7 @@ def rembg(monkeypatch):
     import numpy as np
     from PIL import Image, ImageOps
 
-    from completesplat.data.images import photograph
+    from completesplat.photo import background
 
     module = ModuleType("rembg")
     module.sessions = []
@@ -283,6 +283,6 @@ def rembg(monkeypatch):
 
     module.new_session, module.remove = lambda name: module.sessions.append(name), remove
     monkeypatch.setitem(sys.modules, "rembg", module)
-    photograph._session.cache_clear()
+    background._session.cache_clear()
     yield module
-    photograph._session.cache_clear()
+    background._session.cache_clear()

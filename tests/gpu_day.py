@@ -12,9 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from completesplat.commands.protocol import git_commit
+from completesplat.evaluation.provenance import git_commit, machine
 from completesplat.files import write_json
-from completesplat.results.machine import machine
 
 NETWORKS = ["autoreconstructor=tiny", "autoreconstructor.encoder.channels=[8,8,16,16]", "denoiser=tiny"]
 NETWORKS += ["denoiser.channels=[16,32]", "denoiser.attention_levels=[1]", "conditioning.channels=[8,8,16,16]"]

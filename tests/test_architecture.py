@@ -23,8 +23,8 @@ TREES = {path: ast.parse(text, path) for path, text in FILES.items()}
 LAYERS = """
     imports version errors quantities signals files settings ply_files weights tensors
     geometry gaussians splatter_image scene rasterizers
-    data autoreconstructor diffusion losses metrics scene_model baselines parts run_configs generator export
-    training viewer results studies commands cli
+    photo data autoreconstructor diffusion losses metrics scene_model baselines parts run_configs generator export
+    evaluation training viewer commands cli
     benchmarks
 """
 FLOORS = LAYERS.split()

@@ -17,7 +17,6 @@ from PIL import Image
 from support import SMALL, some_gaussians, tiny_generator
 
 from completesplat.commands import exit_status, refusal
-from completesplat.data.images.files import save_image
 from completesplat.data.toy import write_objects, write_rooms
 from completesplat.data.validation.audit import AuditReport
 from completesplat.errors import DiskError
@@ -26,6 +25,7 @@ from completesplat.export.images import write_png
 from completesplat.export.ply import write_ply
 from completesplat.export.video import write_video
 from completesplat.files import make_folder, write_json, write_text
+from completesplat.photo.saving import save_image
 from completesplat.tensors import concatenate
 from completesplat.training.checkpoints import CheckpointFiles
 from completesplat.training.loggers import MetricsFile

@@ -37,16 +37,17 @@ from splats_of_others import FILES
 from support import some_gaussians
 
 from completesplat.data.captures.captured_frames import CapturedFrame, Lens
+from completesplat.data.co3d.depth_maps import read_depth
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.images.exif import ORIENTATION
-from completesplat.data.images.files import decode_image, read_depth, stored_size
-from completesplat.data.images.photograph import read_photograph
 from completesplat.data.validation import read_points
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import write_splat
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.export.reading import read_gaussians
 from completesplat.generator import CompleteSplat
+from completesplat.photo.exif import ORIENTATION
+from completesplat.photo.files import decode_image, stored_size
+from completesplat.photo.reading import Framing, read_square
 from completesplat.weights import CONFIG_FILE, SUMS_FILE
 
 measured = pytest.mark.skipif(not CLEAR.exists(), reason="memory is measured as Linux reports it")
@@ -105,7 +106,7 @@ def test_images(tmp_path):
             partial(read_depth, path, 1.0),
             CapturedFrame(0, path, None, Lens((9.0, 9.0), (8.0, 6.0), (12, 16)), np.eye(4)).read,
         ]
-        each(*calls, partial(read_photograph, path, 16))
+        each(*calls, partial(read_square, path, Framing(16)))
 
     depth = np.full((12, 16), 4.0, np.float16).view(np.uint16)
     parts = [png_parts(content) for content in (*files["PNG"], encoded(depth, "PNG"))]

@@ -9,13 +9,13 @@ from PIL import Image
 from support import strict_json
 
 from completesplat.data.toy.module import ToyObjectsDataModule
+from completesplat.evaluation.scorer import copy_reference, repeat_image
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.trajectories import orbit
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.tiled import TiledRasterizer
 from completesplat.scene_model import Sampling
 from completesplat.tensors import stack
-from completesplat.training.scoring import copy_reference, repeat_image
 from completesplat.weights import SHIPPED, SUMS_FILE, locate, shipped
 
 NAME, COUCHES, FRUITS, GENERAL = "toy_objects", "rendered_couches", "fruits", "general"

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from completesplat.data.images.files import to_uint8
 from completesplat.data.toy.object_scene import ToyScene, draw_mini, render_frame
 from completesplat.data.toy.shapes import CHECKS, rotation_about
+from completesplat.photo.saving import to_uint8
 
 SIZE, DISTANCE = 48, 3.6
 

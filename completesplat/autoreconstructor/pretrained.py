@@ -44,7 +44,7 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
         source: a folder with `config.json` and `diffusion_pytorch_model.safetensors` (or `.bin`, `.fp16.safetensors`),
             a folder with these in a subfolder `vae`, a hub id of either, or a file of the VAE or of a whole model, with
             diffusers' names or Stable Diffusion's own (`first_stage_model`).
-        reconstructor: None loads the encoder of a conditioning; the checkpoint may then lack a decoder.
+        reconstructor: None loads the encoder of a conditioning. The checkpoint may then lack a decoder.
 
     Raises:
         WeightsError: the checkpoint is missing, damaged or not finite, or its VAE has another kind or size.
@@ -141,7 +141,7 @@ def _read_weights(file: Path) -> dict[str, Tensor]:
         contents = load_file(file)
     else:
         contents = torch.load(file, map_location="cpu", weights_only=True)
-    weights: dict[str, Any] = contents.get("state_dict", contents)
+    weights: Any = contents.get("state_dict", contents)
     levels = {match[1] for match in map(LDM.match, weights) if match}
     if levels:
         from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint

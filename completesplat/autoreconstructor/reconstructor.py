@@ -18,7 +18,7 @@ class Reconstructor(nn.Module):
 
     A skip passes the encoder's features of one level, before its downsampling, through a zero-initialised 1x1
     convolution and adds them to the input of the up block of the same resolution. The paper does not state the merge
-    operator; zero initialisation leaves pretrained weights intact at step 0.
+    operator. Zero initialisation leaves pretrained weights intact at step 0.
 
     Args:
         parameterization: layers and activations of the Splatter Image.

@@ -23,7 +23,7 @@ class AutoDecoder(nn.Module):
     should be off. The table has `rows * latent_channels * (image_size / 8)^2` numbers, thrice that with Adam's moments.
 
     Args:
-        rows: images that the table has room for; loading weights resizes the table to theirs.
+        rows: images that the table has room for. Loading weights resizes the table to theirs.
 
     Raises:
         CompleteSplatError: the reconstructor has skips, or its levels do not divide the image size.

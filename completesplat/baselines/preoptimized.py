@@ -118,8 +118,8 @@ class SparseVAE(nn.Module):
     """VAE from a Splatter Image to a Splatter Image, made of the autoreconstructor's blocks without skips.
 
     A place is one layer of one pixel. For each place the encoder sees 15 normalised raw values (zeros if the place is
-    empty), and whether it is occupied. The decoder's outputs are normalised raw values; a low opacity marks an empty
-    place. In training a latent is drawn from the posterior; in evaluation its mode is used.
+    empty), and whether it is occupied. The decoder's outputs are normalised raw values. A low opacity marks an empty
+    place. In training a latent is drawn from the posterior. In evaluation its mode is used.
 
     Args:
         encoder: builds an `Encoder` from a number of `in_channels`.
@@ -147,8 +147,8 @@ class SparseVAE(nn.Module):
 
     def forward(self, image: SplatterImage) -> Reconstruction:
         mask = occupied(image)[:, :, None]
-        seen = torch.cat([torch.where(mask, self.normalize(image.raw), 0.0), mask.float()], dim=2)
-        posterior, _ = self.encoder.encode(seen.flatten(1, 2))
+        inputs = torch.cat([torch.where(mask, self.normalize(image.raw), 0.0), mask.float()], dim=2)
+        posterior, _ = self.encoder.encode(inputs.flatten(1, 2))
         latent = posterior.sample() if self.training else posterior.mode()
         decoded = self.reconstructor(latent, ())
         return Reconstruction(SplatterImage(decoded.raw * self.std + self.mean, decoded.parameterization), posterior)
@@ -160,7 +160,9 @@ class SparseVAE(nn.Module):
     @torch.no_grad()
     def measure(self, images: Iterable[SplatterImage]) -> None:
         """Set the normalisation to the mean and standard deviation over the occupied places of these images."""
-        count, total, squares = (torch.zeros_like(as_float64(self.mean)) for _ in range(3))
+        count = torch.zeros_like(as_float64(self.mean))
+        total = torch.zeros_like(count)
+        squares = torch.zeros_like(count)
         for image in images:
             mask = occupied(image)[:, :, None]
             raw = as_float64(torch.where(mask, image.raw, 0.0))
@@ -170,14 +172,14 @@ class SparseVAE(nn.Module):
         mean = total / count.clamp(min=1)
         variance = squares / count.clamp(min=1) - mean.square()
         self.mean.copy_(mean)
-        # A channel that does not vary is only centred; a layer without Gaussians is not normalised.
+        # A channel that does not vary is only centred. A layer without Gaussians is not normalised.
         self.std.copy_(torch.where(variance > 1e-8, variance, 1.0).sqrt())
 
     def errors(self, predicted: SplatterImage, truth: SplatterImage) -> dict[str, Float[Tensor, ""]]:
         """Return the reconstruction error of each group of raw values.
 
-        It is the mean squared error of the normalised values over occupied places; for "opacity", the binary cross
-        entropy over all places in nats, where an empty place has opacity 0.
+        It is the mean squared error of the normalised values over occupied places. That of "opacity" is the binary
+        cross entropy over all places in nats, where an empty place has opacity 0.
         """
         mask = occupied(truth)[:, :, None]
         squared = torch.where(mask, self.normalize(predicted.raw) - self.normalize(truth.raw), 0.0).square()
@@ -186,4 +188,5 @@ class SparseVAE(nn.Module):
         errors = {name: group.sum() / (places * group.shape[2]) for name, group in groups.items()}
         logits = predicted.split()["opacity"]
         opacities = truth.split()["opacity"].sigmoid()
-        return errors | {"opacity": nn.functional.binary_cross_entropy_with_logits(logits, opacities)}
+        errors["opacity"] = nn.functional.binary_cross_entropy_with_logits(logits, opacities)
+        return errors

@@ -23,10 +23,10 @@ class SplatterImageUNet(ReconstructionModel):
     - Residual sums are not scaled by sqrt(1/2), and weights start from PyTorch's default initialisation.
     - Resampling blocks have no 1x1 convolution in their shortcut.
     - On the way up, attention follows every block of a level instead of only the last one.
-    - The last 3x3 convolution is the head; upstream has a 1x1 convolution after it.
+    - The last 3x3 convolution is the head. Upstream has a 1x1 convolution after it.
 
     Args:
-        channels: width of each level, from full resolution down; the image's sides are multiples of 2^(levels - 1).
+        channels: width of each level, from full resolution down. The image's sides are multiples of 2^(levels - 1).
         attention_levels: levels with self-attention (upstream: at 16 pixels, level 3 of images of 128).
         layers_per_block: residual blocks per level on the way down (the way up has one more).
         dropout: dropout probability before the second convolution of each residual block.

@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from completesplat.evaluation.provenance import machine
+from completesplat.evaluation.scorer import synchronized_time
+from completesplat.evaluation.tables import records_table, show
 from completesplat.files import write_json
-from completesplat.results.machine import machine
-from completesplat.results.tables import records_table, show
-from completesplat.training.scoring import synchronized_time
 
 Work = Callable[[], object]
 Row = dict[str, object]  # of a table; its values can be written as JSON

@@ -15,13 +15,13 @@ from rich.console import Console
 from completesplat.benchmarks.measuring import Row, report
 from completesplat.commands import quieten
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.scorer import synchronized_time
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unproject
 from completesplat.quantities import Entries, Positive
 from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.selection import FASTER, failure
-from completesplat.training.scoring import synchronized_time
 from completesplat.training.steps import DISTANCE, FOV_DEGREES, cameras_on_orbit, peak_megabytes
 
 Sizes = Annotated[Sequence[Positive], Entries(1)]

@@ -37,7 +37,7 @@ def stats(data: Any, splits: SplitNames, out: Path) -> None:
     """Write `stats.json` and `stats.png`, and print the numbers."""
     from rich.progress import track
 
-    from completesplat.studies.statistics import plot_statistics, show_statistics, statistics
+    from completesplat.evaluation.studies.statistics import plot_statistics, show_statistics, statistics
 
     sources = _sources(data, splits)
     tracked_names = {split: track(source.names, f"reading cameras of {split}") for split, source in sources.items()}
@@ -49,7 +49,7 @@ def stats(data: Any, splits: SplitNames, out: Path) -> None:
 
 def show(data: Any, split: SplitName, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path) -> None:
     """Write `show.png`: images of some sequences, evenly spread over a split."""
-    from completesplat.studies.contact_sheet import write_contact_sheet
+    from completesplat.evaluation.studies.contact_sheet import write_contact_sheet
 
     source = _sources(data, [split])[split]
     names = source.names

@@ -109,8 +109,8 @@ def check_device() -> Iterator[Finding]:
     """Yield CPU, GPUs, what runs where, and rasterizers. A missing GPU is no error: small models are fast without."""
     import torch
 
+    from completesplat.evaluation.provenance import machine
     from completesplat.rasterizers.selection import FASTER, failure
-    from completesplat.results.machine import machine
     from completesplat.tensors import used_device
 
     yield Finding("CPU", "yes", f"{machine()['processor']}, {os.cpu_count()} cores")

@@ -14,21 +14,22 @@ from lightning.pytorch.utilities.model_summary.model_summary import ModelSummary
 from omegaconf import DictConfig, OmegaConf
 
 from completesplat.commands import quieten
-from completesplat.commands.evaluate import built_parts, scored_data, set_scoring
+from completesplat.commands.evaluate import built_parts
 from completesplat.commands.jobs import LAST, METRICS
-from completesplat.commands.protocol import checkpoint_facts, protocol
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.evaluation.protocol import describe_test, scored_data, set_metrics
+from completesplat.evaluation.provenance import checkpoint_facts
+from completesplat.evaluation.records import read_record
+from completesplat.evaluation.score_tables import evaluation_table
+from completesplat.evaluation.scorer import Scorer
+from completesplat.evaluation.tables import show
 from completesplat.files import counted, write_json
-from completesplat.results.measured import evaluation_table
-from completesplat.results.runs import PLAN, read_record
-from completesplat.results.tables import show
 from completesplat.settings import checks
 from completesplat.settings.schema import start_weights
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs
-from completesplat.training.scoring import Scorer
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
 from completesplat.weights import RUN_WEIGHTS
@@ -55,7 +56,7 @@ def instantiate(config: DictConfig) -> tuple[SceneDataModule, Scorer]:
     data = build(config.data, _convert_="all")
     module = build(config.model, _convert_="all")
     if config.test:
-        set_scoring(module, config.evaluation)
+        set_metrics(module, config.evaluation)
     if isinstance(module, Stage):
         module.keep_config(config.model)
     return data, module
@@ -95,9 +96,9 @@ def run(config: DictConfig, out: Path) -> None:
         if not trainer.is_global_zero:
             return
         results: dict[str, object] = {"steps": trainer.global_step, "data.batch_per_process": share, **metrics}
-        if scores is not None:
+        if tested is not None and scores is not None:
             evaluation: Any = OmegaConf.to_container(config.evaluation, resolve=True)
-            described = protocol(evaluation, module, tested, scores, out) | _facts(trainer, out)
+            described = describe_test(evaluation, module, tested, scores, out) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
             show(evaluation_table({"protocol": described} | scores), width=160)
         write_json(out / METRICS, results)  # the last file, because it means that the job is done
@@ -137,13 +138,13 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
 def refuse_without_effect(config: DictConfig, out: Path) -> None:
     """Raise CompleteSplatError for a setting of a command, not of a sweep, that its model does not use."""
     stage = get_class(config.model._target_)
-    given = read_record(out).get("overrides", [])
-    unused: tuple[str, ...] = getattr(stage, "without_effect", ())
-    if any((parent / PLAN).is_file() for parent in out.parents):
+    record = read_record(out)
+    unused: tuple[str, ...] = getattr(stage, "unused_settings", ())
+    if record.get("sweep") is not None:
         return
     if "trainer.max_" in unused and not config.test:
         raise CompleteSplatError(f"test=false: {stage.__name__} only fits the scenes of a test; leave it out")
-    for setting in given:
+    for setting in record.get("overrides", []):
         if setting.lstrip("+~").startswith(unused):
             raise CompleteSplatError(f"{setting}: {stage.__name__} does nothing with it; leave it out")
 

@@ -11,7 +11,23 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import printable
 from completesplat.weights import AUTO, check_name
 
-SUFFIXES = tuple(".jpg .jpeg .png .webp .tif .tiff .avif .jp2 .bmp .gif .ppm .pgm .pnm .heic .heif".split())  # noqa: SIM905
+SUFFIXES = (
+    ".jpg",
+    ".jpeg",
+    ".png",
+    ".webp",
+    ".tif",
+    ".tiff",
+    ".avif",
+    ".jp2",
+    ".bmp",
+    ".gif",
+    ".ppm",
+    ".pgm",
+    ".pnm",
+    ".heic",
+    ".heif",
+)
 
 
 def check_inputs(verb: str, config: DictConfig) -> None:
@@ -38,7 +54,7 @@ def find_images(image: object) -> list[Path]:
     Raises:
         CompleteSplatError: no file exists, a folder or pattern has no image, the list is empty, or an entry is no name.
     """
-    entries = image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
+    entries = entries_of(image)
     if not entries:
         raise CompleteSplatError("image=[]: name at least one image")
     if any(entry == "" or isinstance(entry, bool) or not isinstance(entry, str | int) for entry in entries):
@@ -51,10 +67,14 @@ def find_images(image: object) -> list[Path]:
 
 def left_out(image: object, images: Sequence[Path]) -> list[str]:
     """Return the names of other files, without hidden ones, in folders that are given as `image`."""
-    entries = image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
-    folders = [Path(str(entry)) for entry in entries if os.path.isdir(str(entry))]
-    there = {file for folder in folders for file in folder.glob("[!.]*") if file.is_file()}
-    return sorted(file.name for file in there.difference(images))
+    folders = [Path(str(entry)) for entry in entries_of(image) if os.path.isdir(str(entry))]
+    files = {file for folder in folders for file in folder.glob("[!.]*") if file.is_file()}
+    return sorted(file.name for file in files.difference(images))
+
+
+def entries_of(image: object) -> Sequence[object]:
+    """Return the entries of the setting `image`, which is one of them or a list."""
+    return image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
 
 
 def _images_of(path: Path) -> list[Path]:

@@ -21,11 +21,11 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from completesplat.commands.inputs import check_inputs
-from completesplat.commands.protocol import git_commit
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.provenance import git_commit
+from completesplat.evaluation.records import job_entries, read_mapping
 from completesplat.files import UNFINISHED, atomic_path, write_bytes, write_json, writing
 from completesplat.imports import importing, postponing
-from completesplat.results.runs import read_mapping
 from completesplat.settings.checks import check_parts_of_verb, check_values
 from completesplat.settings.composition import shard_folder, use_working_folder
 from completesplat.settings.options import did_you_mean
@@ -143,7 +143,7 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
         return optimized(config.get("optimized_metric"), out)
     first = is_first_process()
     try:
-        recorded = folder, [f"completesplat {verb}", *given], list(hydra_config.overrides.task), resolved
+        recorded = folder, job_entries(verb, given, folder), resolved
         with ended_by_signals(), _recorded(*recorded) if first else nullcontext():
             for key in ("checkpoint", "autoreconstructor_checkpoint"):
                 # The path may refer to the job's choices (`hydra:runtime.choices`), which `start` cannot resolve.
@@ -263,11 +263,11 @@ def _differences(first: object, second: object, moved: tuple[str, str], key: str
 
 
 @contextmanager
-def _recorded(out: Path, command: list[str], overrides: list[str], config: Mapping[str, object]) -> Iterator[None]:
+def _recorded(out: Path, job: Mapping[str, object], config: Mapping[str, object]) -> Iterator[None]:
     """Record a job and its config; restore those of an earlier job if this one ends before it has written a file."""
     earlier = {path: path.read_bytes() for path in (out / RECORD, out / CONFIG) if path.is_file()}
     before = _written(out)
-    renamed = _record(out, command, overrides, config)
+    renamed = _record(out, job, config)
     with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
         OmegaConf.save(config, temporary)
     try:
@@ -288,12 +288,11 @@ def _written(out: Path) -> set[tuple[int, int]]:
     return {(path.stat().st_ino, path.stat().st_mtime_ns) for path in paths if path.is_file()}
 
 
-def _record(out: Path, command: list[str], overrides: list[str], config: Mapping[str, object]) -> Path | None:
-    """Write `run.json` with times, command and earlier ends; rename earlier results, and return their new name."""
+def _record(out: Path, job: Mapping[str, object], config: Mapping[str, object]) -> Path | None:
+    """Write `run.json` with `job_entries`, times and earlier ends; rename earlier results and return their new name."""
     path = out / RECORD
     now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-    record: dict[str, Any] = {"version": __version__, "commit": git_commit(), "command": command}
-    record |= {"overrides": overrides, "started": now}
+    record: dict[str, Any] = {"version": __version__, "commit": git_commit(), **job, "started": now}
     renamed = None
     if path.is_file() and (out / LAST).is_file():
         earlier = json.loads(path.read_text())

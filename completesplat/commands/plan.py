@@ -24,13 +24,13 @@ from completesplat.data.loading.data_module import MOST_WORKERS
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import CompleteSplatError, DataError
+from completesplat.evaluation.scorer import synchronized_time
+from completesplat.evaluation.tables import Table, records_table, show
 from completesplat.files import write_json
-from completesplat.results.tables import Table, records_table, show
 from completesplat.scene import Batch, SceneBatch
 from completesplat.settings.checks import check_image_size, check_optimizer, each_part, remove_start_weights
 from completesplat.settings.options import did_you_mean
 from completesplat.training.latent_diffusion import LatentDiffusion
-from completesplat.training.scoring import synchronized_time
 from completesplat.training.stage import Stage
 from completesplat.training.step_counts import Operation, StepCounts, count_step, with_latents
 from completesplat.training.steps import MEBIBYTE, Training, peak_megabytes, synthetic_batch

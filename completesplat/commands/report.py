@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from completesplat.errors import CompleteSplatError
-from completesplat.results.paper_figures import published_tables
-from completesplat.results.runs import find_results
-from completesplat.results.sweeps import write_summary
-from completesplat.results.tables import show, write_tables
+from completesplat.evaluation.paper_tables import published_tables
+from completesplat.evaluation.records import find_results
+from completesplat.evaluation.sweep_summary import write_summary
+from completesplat.evaluation.tables import show, write_tables
 
 logger = logging.getLogger(__name__)
 

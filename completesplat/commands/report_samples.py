@@ -1,7 +1,7 @@
 """`completesplat report`: studies of a trained model's samples.
 
 Each study raises the errors of `TrainedModel.open`, `diffusion_of`, `first_scenes` and the functions of its module in
-`completesplat.studies`.
+`completesplat.evaluation.studies`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,17 +14,17 @@ from rich.console import Console
 
 from completesplat.commands import quieten
 from completesplat.commands.trained import TrainedModel, diffusion_of
+from completesplat.evaluation.studies.calibration import calibration_rows, plot_calibration
+from completesplat.evaluation.studies.controls import OnProgress, controls_rows, controls_strips, grid, plot_controls
+from completesplat.evaluation.studies.depth import depth_rows, depth_strips
+from completesplat.evaluation.studies.ladder import ladder_rows
+from completesplat.evaluation.studies.samples import SampleRenderer, first_scenes
+from completesplat.evaluation.tables import records_table, show
 from completesplat.export.images import image_sheet, write_png
 from completesplat.files import counted, write_json
 from completesplat.quantities import Entries, Positive, Range, Share
-from completesplat.results.tables import records_table, show
 from completesplat.scene import SceneBatch
 from completesplat.settings.schema import ModelSettings
-from completesplat.studies.calibration import calibration_rows, plot_calibration
-from completesplat.studies.controls import OnProgress, controls_rows, controls_strips, grid, plot_controls
-from completesplat.studies.depth import depth_rows, depth_strips
-from completesplat.studies.ladder import ladder_rows
-from completesplat.studies.samples import SampleRenderer, first_scenes
 
 Weights = Annotated[Sequence[Share], Entries(1)]
 

@@ -1,10 +1,7 @@
 """Models for commands, from a run's checkpoint, from weights or from files of scenes, and the data to use with them."""
 
 import logging
-import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,12 +11,12 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from completesplat.commands.inputs import check_one_model
-from completesplat.commands.protocol import checkpoint_facts
-from completesplat.errors import CompleteSplatError, ImageError, WeightsError
-from completesplat.files import printable
+from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.provenance import checkpoint_facts
 from completesplat.generator import CompleteSplat
+from completesplat.photo.choice import likeliest_weights
 from completesplat.run_configs import config_of_run
-from completesplat.scene_model import SceneModel, match_shipped, shipped_configs
+from completesplat.scene_model import SceneModel
 from completesplat.settings.checks import REMOVE
 from completesplat.tensors import used_device
 from completesplat.weights import AUTO, RUN_CHECKPOINT, sha256_of, shipped
@@ -27,10 +24,10 @@ from completesplat.weights.checkpoint_reading import load_part
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
-    from completesplat.training.scoring import SceneFiles, Scorer
+    from completesplat.evaluation.scene_files import SceneFiles
+    from completesplat.evaluation.scorer import Scorer
 
 logger = logging.getLogger(__name__)
-LOOKED_AT = 8  # images, of which weights=auto is chosen
 WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no effect"
 
 
@@ -65,7 +62,7 @@ class TrainedModel:
 
     @cached_property
     def files(self) -> "SceneFiles":
-        from completesplat.training.scoring import SceneFiles
+        from completesplat.evaluation.scene_files import SceneFiles
 
         rendering = self._rendering((self.data or {}).get("background"))
         return SceneFiles(str(self.scenes), self.frame, self.align, self.method, **rendering)
@@ -134,32 +131,6 @@ class TrainedModel:
         if isinstance(self.model, CompleteSplat):
             return DiffusionScorer(self.model, **rendering)
         return ReconstructionScorer(self.model.reconstruction_model, **rendering)
-
-
-def likeliest_weights(images: Sequence[Path], remove_background: bool) -> tuple[str, str]:
-    """Return the name of the likeliest shipped weights for `LOOKED_AT` of the images, and the reason as a clause.
-
-    Without an image, they are those for photos of anything.
-
-    Raises:
-        WeightsError: the package has no weights.
-    """
-    if not shipped():
-        raise WeightsError("weights=auto: this package has no weights; give weights=DIR")
-    sums = Counter[str]()
-    read = list[str]()
-    for image in images[:: math.ceil(len(images) / LOOKED_AT) or 1]:
-        with suppress(ImageError, OSError):  # which ends the prediction of this image alone, when its turn comes
-            sums.update({name: x.probability for name, x in match_shipped(image, remove_background).items()})
-            read.append(printable(image.name))
-    if not read:
-        name, *names = shipped_configs()
-        why = "no image can be read" if images else "there is no image to choose by"
-        return name, f"; {why} (weights=NAME takes others: {', '.join(names)})"
-    shares = [f"{name} {total / len(read):.0%}" for name, total in sums.most_common()]
-    shares += [f"{name} needs a plain background" for name in shipped() if name not in sums]
-    whose = read[0] if len(images) == 1 else f"{len(read)} of {len(images)} images"
-    return sums.most_common(1)[0][0], f"; likeliest for {whose} ({', '.join(shares)})"
 
 
 def open_generator(config: Any, images: Sequence[Path], announced: bool = True) -> SceneModel:

@@ -1,7 +1,7 @@
 """`completesplat view`: a page in the browser that shows scenes and samples new ones."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from signal import SIGINT
@@ -18,7 +18,7 @@ from completesplat.signals import Interrupted
 from completesplat.weights import AUTO, CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, shipped
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
-KINDS = dict.fromkeys(SPLATS, "scene") | dict.fromkeys((".ckpt", ".pth", ".safetensors"), "weights")
+WEIGHT_SUFFIXES = (".ckpt", ".pth", ".safetensors")
 PAUSE = 2.0  # seconds between two checks for new scenes of a run
 SCENE_FILES = ("sample_*.ply", "scene.ply")
 AT_STEP = "step {} of the training"
@@ -35,9 +35,11 @@ def run(config: DictConfig, out: Path) -> None:
 
     from completesplat.viewer.access import start_server, stop_server
 
-    config.update(setting_of_path(Path(config.path)) if config.path is not None else {})
-    _check_asked(config)
-    own_files = (config.image, config.scene) != (None, None) or config.weights not in (AUTO, *shipped())
+    if config.path is not None:
+        config.update(setting_of_path(Path(config.path)))
+    check_asked(config)
+    own_weights = config.weights not in (AUTO, *shipped())
+    own_files = config.image is not None or config.scene is not None or own_weights
     server = start_server(0 if config.export is not None else config.port)
     address = f"{server.address} (Ctrl-C ends it)"
     page = None
@@ -61,7 +63,8 @@ def run(config: DictConfig, out: Path) -> None:
         stop_server(server) if page is None else page.close()
 
 
-def _check_asked(config: DictConfig) -> None:
+def check_asked(config: DictConfig) -> None:
+    """Raise CompleteSplatError if the page's file has another suffix, or a scene is given with what makes new ones."""
     if config.export is not None and Path(config.export).suffix.lower() != ".html":
         raise CompleteSplatError(f"export={config.export}: a page is written, so give a name such as export=page.html")
     shown = config.watch if config.scene is None else config.scene
@@ -72,7 +75,7 @@ def _check_asked(config: DictConfig) -> None:
 def setting_of_path(path: Path) -> dict[str, str]:
     """Return the setting (`scene`, `image`, `weights`, `watch`) for a path; raise CompleteSplatError if none fits."""
     if path.is_file():
-        return {KINDS.get(path.suffix.lower(), "image"): str(path)}
+        return {setting_of_file(path): str(path)}
     if not path.is_dir():
         raise CompleteSplatError(f"{path}: no such file or folder")
     if (path / NEWEST).parent.is_dir() and is_running(path):
@@ -89,63 +92,105 @@ def setting_of_path(path: Path) -> dict[str, str]:
     raise CompleteSplatError(f"{path}: neither weights nor scenes in it or in weights/ ({names})")
 
 
+def setting_of_file(path: Path) -> str:
+    """Return the setting for a file, by its suffix."""
+    suffix = path.suffix.lower()
+    if suffix in SPLATS:
+        return "scene"
+    return "weights" if suffix in WEIGHT_SUFFIXES else "image"
+
+
 def scenes_in(path: Path) -> dict[str, Path]:
     """Return a scene itself (a file, a prediction, a fitted scene), or those in a folder and its `scenes/`, by name."""
-    if path.is_file() or any(any(path.glob(name)) for name in SCENE_FILES):
+    if path.is_file() or holds_scene(path):
         return {path.name: path}
-    inner = [entry for folder in (path, path / SCENES) if folder.is_dir() for entry in sorted(folder.iterdir())]
-    scenes = [x for x in inner if x.suffix.lower() in SPLATS or any(any(x.glob(name)) for name in SCENE_FILES)]
-    return {printable(x.relative_to(path).as_posix()): x for x in scenes}
+    folders = [folder for folder in (path, path / SCENES) if folder.is_dir()]
+    entries = [entry for folder in folders for entry in sorted(folder.iterdir())]
+    scenes = [entry for entry in entries if entry.suffix.lower() in SPLATS or holds_scene(entry)]
+    return {printable(scene.relative_to(path).as_posix()): scene for scene in scenes}
+
+
+def holds_scene(folder: Path) -> bool:
+    """Return whether a folder has the files of a prediction or of a fitted scene."""
+    return any(any(folder.glob(name)) for name in SCENE_FILES)
 
 
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     """Create a server's page and fill it with the scenes or the model that the settings name."""
     with importing(), postponing():
-        from hydra.utils import instantiate
-
-        from completesplat.commands.trained import open_generator, shown_background
-        from completesplat.viewer.access import show_background
-        from completesplat.viewer.completion import Completion
-        from completesplat.viewer.page import Page, Saver
-        from completesplat.viewer.panel import SLIDERS
-        from completesplat.viewer.sample import read_scene
-        from completesplat.viewer.splat_view import SplatView
+        import completesplat.commands.trained
+        import completesplat.viewer.completion
+        import completesplat.viewer.page  # noqa: F401
 
         check_parts(config)
-    model = None
-    scenes = {}
-    status = ""
     if config.watch is not None:
-        status, samples, up = newest_scenes(Path(config.watch))
-    elif config.scene is not None:
-        scenes = scenes_in(Path(config.scene)) or {"": Path(config.scene)}  # which `read_scene` refuses
-        status, path = next(iter(scenes.items()))
-        samples, up = read_scene(path)
-    else:
-        model = open_generator(config, [] if config.image is None else [Path(config.image)])
-        samples = []
-        up = tuple(model.up.tolist())
+        note, samples, up = newest_scenes(Path(config.watch))
+        page = empty_page(server, config, out, up)
+        page.show(samples, note)
+        return page
+    if config.scene is not None:
+        return page_of_scenes(server, config, out)
+    return page_of_model(server, config, out)
+
+
+def page_of_scenes(server: Any, config: DictConfig, out: Path) -> Any:
+    """Create a page that shows the first of the scenes in a file or folder, and lets others be chosen."""
+    from completesplat.viewer.sample import read_scene
+
+    scenes = scenes_in(Path(config.scene)) or {"": Path(config.scene)}  # which `read_scene` refuses
+    name, path = next(iter(scenes.items()))
+    samples, up = read_scene(path)
+    page = empty_page(server, config, out, up, scenes=scenes)
+    page.show(samples, name)
+    page.show_photo(path)
+    return page
+
+
+def page_of_model(server: Any, config: DictConfig, out: Path) -> Any:
+    """Create a page that draws scenes from photos, the first of which the settings may name."""
+    from completesplat.commands.trained import open_generator
+    from completesplat.viewer.completion import Completion
+    from completesplat.viewer.panel import SLIDERS
+
+    image = None if config.image is None else Path(config.image)
     remove = config.background == REMOVE
+    model = open_generator(config, [] if image is None else [image])
+    photograph = None if image is None else model.read(image, config.fov, remove)
+    page = empty_page(server, config, out, model.up.tolist(), model)
+    start = {name: config[name] for name in SLIDERS}
+    completion = Completion(page, model, {**start, "remove_background": remove})
+    if image is not None and photograph is not None:
+        completion.load(printable(image.name), photograph)
+    return page
+
+
+def empty_page(
+    server: Any,
+    config: DictConfig,
+    out: Path,
+    up: Sequence[float],
+    model: Any = None,
+    scenes: Mapping[str, Path] | None = None,
+) -> Any:
+    """Create a page without samples.
+
+    Args:
+        up: the direction up.
+        model: the model that draws scenes on the page, if one does.
+        scenes: scenes to choose from, by name.
+    """
+    from hydra.utils import instantiate
+
+    from completesplat.commands.trained import shown_background
+    from completesplat.viewer.access import show_background
+    from completesplat.viewer.page import Page, Saver
+    from completesplat.viewer.splat_view import SplatView
+
     background = shown_background(config.background, model)
     show_background(server, background)
-    photograph = None
-    if model is not None and config.image is not None:
-        photograph = model.read(Path(config.image), config.fov, remove)
-    splats = SplatView(server, up)
-    splats.show(samples)
-    rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
-    saver = Saver(out, splats, rasterizer, config.frames, background)
-    page = Page(server, splats, saver, scenes)
-    if model is None:
-        page.show(samples, status)
-        if config.scene is not None:
-            page.show_photo(path)
-        return page
-    start = {name: config[name] for name in SLIDERS} | {"remove_background": remove}
-    completion = Completion(page, model, start)
-    if photograph is not None:
-        completion.load(printable(Path(config.image).name), photograph)
-    return page
+    view = SplatView(server, up)
+    make_rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
+    return Page(server, view, Saver(out, view, make_rasterizer, config.frames, background), scenes or {})
 
 
 def newest_scenes(run: Path) -> tuple[str, Sequence[Any], Sequence[float]]:

@@ -9,10 +9,10 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from completesplat.data.images.crop import Square, cut_square, principal_square
 from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.errors import BadCamera, BadPlacement
 from completesplat.geometry.cameras import Cameras, crop_resize, nearest_to_axes, transform_points
+from completesplat.photo.crop import Square, cut_square, principal_square
 from completesplat.tensors import stack
 
 UP = 1

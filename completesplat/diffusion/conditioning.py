@@ -20,7 +20,7 @@ STABLE_DIFFUSION_SCALE = 0.18215
 class LearnedConditioning(nn.Module):
     """Small convolutional encoder that is trained together with the denoiser.
 
-    It is for setups without Stable Diffusion's weights; the paper uses the frozen encoder of Stable Diffusion's VAE.
+    It is for setups without Stable Diffusion's weights. The paper uses the frozen encoder of Stable Diffusion's VAE.
 
     Args:
         out_channels: channels of phi_ref.

@@ -46,7 +46,7 @@ def guided_noise(
     """Return eps = (1 - w) * eps_conditional + w * eps_unconditional, with w in [0, 1].
 
     The customary guidance scale is s = 1 - w. The unconditional prediction has its conditioning zeroed, as in
-    training with probability 0.2. w = 0 and w = 1 cost one denoiser call; other weights cost one of twice the batch.
+    training with probability 0.2. w = 0 and w = 1 cost one denoiser call. Other weights cost one of twice the batch.
 
     Raises:
         CompleteSplatError: w lies outside of [0, 1].

@@ -62,7 +62,7 @@ def with_screen_space_dilation(gaussians: Gaussians, reference: Cameras) -> Gaus
     """Return Gaussians enlarged by the blur that a rasterizer adds in the reference view.
 
     A rasterizer adds `blur` px^2 to each projected covariance. Training relies on this at its own image size, and makes
-    Gaussians far smaller than a pixel; in a larger image they would be dots with gaps between them. At depth z,
+    Gaussians far smaller than a pixel. In a larger image they would be dots with gaps between them. At depth z,
     `blur * (z / focal length)^2` is therefore added to the covariance in all directions, which preserves its axes.
     `reference` is the camera of the photo, unbatched, at the image size that the model was trained with.
     """

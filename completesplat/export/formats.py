@@ -71,7 +71,7 @@ def write_format(
     the colours that the reference camera sees, if these depend on the direction. The `.ply` keeps colours above 1,
     because Gaussians may be seen through others, and all harmonics. All files keep the frame of the given
     Gaussians, except the page, which is turned upright. `.ply`, `.splat` and `.sog` keep our axes (+y down). `.glb` and
-    `.spz` prescribe +y up and +z towards the viewer; readers of `.spz` undo this. `.spz` omits `transparent` Gaussians.
+    `.spz` prescribe +y up and +z towards the viewer. Readers of `.spz` undo this. `.spz` omits `transparent` Gaussians.
 
     Returns:
         The file's name by its purpose: `NAME` for the `.ply`, `NAME_spz` and so on for the others.

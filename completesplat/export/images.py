@@ -11,8 +11,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from completesplat.data.images.files import image_bytes, label_font
 from completesplat.files import write_bytes
+from completesplat.photo.saving import image_bytes, label_font
 
 Maps = Float[Tensor, "*batch 1 height width"]
 Colors = Float[Tensor, "*batch 3 height width"]

@@ -78,7 +78,7 @@ def read_ply(path: str | Path) -> Gaussians:
     become 0, as in other 3DGS renderers.
 
     Raises:
-        PlyError: `read_vertices` fails, or no Gaussian is finite; a warning counts those that are not.
+        PlyError: `read_vertices` fails, or no Gaussian is finite. A warning counts those that are not.
     """
     try:
         vertices = read_vertices(path, REQUIRED)

@@ -1,7 +1,7 @@
 """Pinhole cameras and their conventions, which are stated here only.
 
 Axes are OpenCV's: +x right, +y down, +z forward. `world_to_camera` maps homogeneous world points to camera
-points. Intrinsics are in pixels; pixel (column i, row j) covers [i, i + 1) x [j, j + 1), so its centre lies at
+points. Intrinsics are in pixels. Pixel (column i, row j) covers [i, i + 1) x [j, j + 1), so its centre lies at
 (i + 0.5, j + 0.5) and (0, 0) is the top left corner of the image.
 """
 

@@ -15,7 +15,7 @@ Vector = Float[Tensor, "3"]
 def orbit(reference: Cameras, pivot: Vector, up: Vector, frames: int, degrees: float = 360.0) -> Cameras:
     """Return cameras that circle the axis through `pivot` along `up`, starting at the reference camera.
 
-    The reference camera (unbatched) keeps its distance and height; every camera looks at `pivot`. The last frame
+    The reference camera (unbatched) keeps its distance and height. Every camera looks at `pivot`. The last frame
     stops one step short of `degrees`, so that a full turn loops smoothly.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Metrics of images, of image sets and of samples, and their averages over scenes."""
+"""Metrics of images, of sets of images and of samples, and their format in tables."""
 
 from dataclasses import dataclass
 
@@ -7,8 +7,11 @@ PSNR_LIMIT = 100.0
 
 
 @dataclass(frozen=True)
-class Style:
-    """How tables show a metric: heading, what is better (↑ or ↓, else no value is marked as the best) and decimals."""
+class MetricFormat:
+    """Format of a metric in tables: its heading, what is better (↑ or ↓) and the number of decimals.
+
+    No value is marked as the best if `better` is empty.
+    """
 
     heading: str
     better: str = ""
@@ -22,6 +25,12 @@ class Style:
         return f"{value:.{self.decimals}f}"
 
 
-STYLES = {"psnr": Style("PSNR", "↑", 2), "ssim": Style("SSIM", "↑"), "lpips": Style("LPIPS", "↓")}
-STYLES |= {"fid": Style("FID", "↓", 1), "kid": Style("KID", "↓", 4), "sharpness": Style("sharpness", "(truth: 1)", 2)}
-"""Styles of the package's metrics. Of sharpness a blur has less than the truth and noise has more."""
+METRIC_FORMATS = {
+    "psnr": MetricFormat("PSNR", "↑", 2),
+    "ssim": MetricFormat("SSIM", "↑"),
+    "lpips": MetricFormat("LPIPS", "↓"),
+    "fid": MetricFormat("FID", "↓", 1),
+    "kid": MetricFormat("KID", "↓", 4),
+    "sharpness": MetricFormat("sharpness", "(truth: 1)", 2),  # a blur has less than the truth, noise has more
+}
+"""Formats of the package's metrics."""

@@ -76,7 +76,9 @@ class ImageSets:
                     figures |= metric.distances(true_set, torch.cat([predicted[name] for name in names]))
                 except Exception as error:  # of any metric; the other scores must not be lost
                     missing |= dict.fromkeys(metric.settings(), f"missing: {first_line(error)}")
-        missing |= {name: f"missing: not finite ({x})" for name, x in figures.items() if not math.isfinite(x)}
+        for name, value in figures.items():
+            if not math.isfinite(value):
+                missing[name] = f"missing: not finite ({value})"
         return {name: value for name, value in figures.items() if math.isfinite(value)}
 
 
@@ -172,6 +174,7 @@ def kernel_distance(
     generator = torch.Generator().manual_seed(seed)
     values = []
     for _ in range(subsets):
-        a, b = (x[torch.randperm(len(x), generator=generator)[:size].to(x.device)] for x in (first, second))
-        values.append(poly_mmd(a, b))
+        some = torch.randperm(len(first), generator=generator)[:size].to(first.device)
+        others = torch.randperm(len(second), generator=generator)[:size].to(second.device)
+        values.append(poly_mmd(first[some], second[others]))
     return torch.stack(values).mean().item()

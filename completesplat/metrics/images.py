@@ -1,4 +1,4 @@
-"""Image metrics with one value per image: PSNR, SSIM, LPIPS if its weights are available, and the user's own."""
+"""Metrics with one value per image: PSNR, SSIM, LPIPS (if its weights are available), depth errors, the user's own."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,11 +12,12 @@ from torch import Tensor, nn
 from completesplat.errors import WeightsError
 from completesplat.losses.lpips import PerceptualDistance, load_heads, load_vgg16
 from completesplat.losses.ssim import structural_similarity
-from completesplat.metrics import PSNR_LIMIT, STYLES, Style
+from completesplat.metrics import METRIC_FORMATS, PSNR_LIMIT, MetricFormat
 
 T = TypeVar("T")
 Images = Float[Tensor, "image 3 height width"]
 PerImage = Float[Tensor, " image"]
+DepthMaps = Float[Tensor, "image 1 height width"]
 Counted = Bool[Tensor, "image 1 height width"]
 ImageMetric = Callable[..., Tensor]
 """Callable of predicted and true images, and of `masks` if it has this argument, as `values_of` calls it."""
@@ -68,12 +69,17 @@ def values_of(metric: ImageMetric, predicted: Images, true: Images, counted: Cou
     return metric(predicted, true, masks=counted) if masked else metric(predicted, true)
 
 
-def style_of(name: str, metric: Any) -> Style:
-    """Return a metric's style: its attributes `heading`, `higher_is_better`, `decimals`, else the style of its name."""
-    known = STYLES.get(name, Style(name))
+def format_of(name: str, metric: Any) -> MetricFormat:
+    """Return a metric's format in tables.
+
+    Its attributes `heading`, `higher_is_better` and `decimals` replace the values of the format with its name.
+    """
+    known = METRIC_FORMATS.get(name, MetricFormat(name))
+    better = known.better
     higher = getattr(metric, "higher_is_better", None)
-    better = known.better if higher is None else "↑" if higher else "↓"
-    return Style(getattr(metric, "heading", known.heading), better, getattr(metric, "decimals", known.decimals))
+    if higher is not None:
+        better = "↑" if higher else "↓"
+    return MetricFormat(getattr(metric, "heading", known.heading), better, getattr(metric, "decimals", known.decimals))
 
 
 def psnr(predicted: Images, true: Images) -> PerImage:
@@ -94,7 +100,9 @@ def gradient_energy(images: Images, counted: Counted) -> float:
     """Return the sum of squared differences between neighbours in rows and columns, where both pixels are counted."""
     total = 0.0
     for axis in (-2, -1):
-        first, second = (counted.narrow(axis, start, counted.shape[axis] - 1) for start in (0, 1))
+        pairs = counted.shape[axis] - 1
+        first = counted.narrow(axis, 0, pairs)
+        second = counted.narrow(axis, 1, pairs)
         total += images.diff(dim=axis).square().mul(first & second).sum().item()
     return total
 
@@ -106,10 +114,40 @@ def sharpness(predicted: Images, true: Images, counted: Counted) -> float | None
     with few gradients has little weight. None if the truth has no gradient (`FLATTEST`).
     """
     truth = gradient_energy(true, counted)
-    return gradient_energy(predicted, counted) / truth if truth >= FLATTEST else None
+    if truth < FLATTEST:
+        return None
+    return gradient_energy(predicted, counted) / truth
 
 
 def perceptual_metric(vgg_weights: str | None, vgg_sha256: str | None = None) -> PerceptualDistance | MissingMetrics:
     """Return LPIPS with VGG16 as in the paper (Tables 2 to 5), or why it is missing; see `load_vgg16`."""
-    load = lambda weights: PerceptualDistance(load_vgg16(weights, vgg_sha256), load_heads())  # noqa: E731
+
+    def load(weights: str) -> PerceptualDistance:
+        return PerceptualDistance(load_vgg16(weights, vgg_sha256), load_heads())
+
     return load_or_missing(vgg_weights, load, ADVICE, ("lpips",))
+
+
+def depth_errors(predicted: DepthMaps, true: DepthMaps, valid: Counted) -> list[dict[str, float] | None]:
+    """Return each image's errors over valid pixels with finite, positive true depth, without aligning the scale.
+
+    `abs_rel`: mean of |predicted - true| / true; `rmse`: in the depth's unit; `delta1`: share of pixels where
+    predicted / true and true / predicted are less than 1.25 (Eigen et al. 2014, Section 4.2). None for an image
+    without any of these pixels. `predicted` is 0 where nothing is predicted.
+    """
+    errors: list[dict[str, float] | None] = []
+    for estimate, depth, counted in zip(predicted, true, valid & true.isfinite() & (true > 0), strict=True):
+        if not counted.any():
+            errors.append(None)
+            continue
+        p = estimate[counted]
+        t = depth[counted]
+        ratio = torch.maximum(p / t, t / p)
+        difference = p - t
+        measured = {
+            "abs_rel": (difference.abs() / t).mean().item(),
+            "rmse": difference.square().mean().sqrt().item(),
+            "delta1": ((ratio < 1.25) & (p > 0)).float().mean().item(),
+        }
+        errors.append(measured)
+    return errors

@@ -29,7 +29,9 @@ class ReferenceRasterizer:
     @with_view_colors
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         batch, view = cameras.world_to_camera.shape[:2]
-        scenes = [stack([self._render(gaussians[b], cameras[b, v]) for v in range(view)]) for b in range(batch)]
+        scenes = []
+        for b in range(batch):
+            scenes.append(stack([self._render(gaussians[b], cameras[b, v]) for v in range(view)]))
         return stack(scenes)
 
     def _render(self, gaussians: Gaussians, camera: Cameras) -> Rendering:

@@ -99,11 +99,12 @@ class _Rasterize(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *image_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         images = ctx.saved_tensors[5:]
-        filled = [
-            # Zeros from NumPy, because torch would wake its threads, which then spin for a while on the kernels' cores.
-            torch.from_numpy(np.zeros(image.shape, np.float32)) if gradient is None else gradient.contiguous()
-            for image, gradient in zip(images, image_gradients, strict=True)
-        ]
+        filled = []
+        for image, gradient in zip(images, image_gradients, strict=True):
+            if gradient is None:
+                # NumPy's zeros: torch would wake its threads, which then spin on the kernels' cores for a while.
+                gradient = torch.from_numpy(np.zeros(image.shape, np.float32))
+            filled.append(gradient.contiguous())
         gradients = ctx.rendering.backward(RenderedImages(*_arrays(images)), RenderedImages(*_arrays(filled)))
         return None, None, *(torch.from_numpy(gradient) for gradient in gradients)
 

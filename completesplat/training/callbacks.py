@@ -148,7 +148,7 @@ class ExponentialMovingAverage(WeightAveraging):
     """Average of the weights over the steps, which checkpoints, validation and the end of training use.
 
     Lightning's own `EMAWeightAveraging` computes decay * a + (1 - decay) * b, which lets frozen weights and measured
-    buffers drift by rounding; linear interpolation leaves them exactly as they are. The paper states no `decay`.
+    buffers drift by rounding. Linear interpolation leaves them exactly as they are. The paper states no `decay`.
     Lightning also keeps the average on the CPU, because it makes it before the model moves to a GPU.
     """
 

@@ -19,7 +19,10 @@ from completesplat.baselines import fitting
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.sequences import PosedSequence, first_names
 from completesplat.errors import CompleteSplatError
-from completesplat.export.prediction import FileUnits, OutputFiles, Shot, write_fitted_scene, write_scene
+from completesplat.evaluation.scorer import Renders
+from completesplat.export.fitted_scene import FittedViews, write_fitted_scene
+from completesplat.export.placed_scene import FileCoordinates, PlacedScene
+from completesplat.export.scene_files import OutputFiles, write_scene
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import Prediction, WeightedSum
@@ -27,7 +30,6 @@ from completesplat.quantities import CameraPath, Format, NonNegative, Positive, 
 from completesplat.scene import Batch, SceneBatch, Views
 from completesplat.tensors import stack
 from completesplat.training.optimization import Schedule, constant
-from completesplat.training.scoring import Renders
 from completesplat.training.stage import Stage
 
 REFINED_SHARE = 0.8  # of the run, in which Gaussians move and are added (25,000 of 30,000 steps in 3DGS-MCMC)
@@ -40,12 +42,12 @@ class CaptureSettings:
     """Settings of the Gaussians of a capture.
 
     Attributes:
-        initial, most: first and largest number of Gaussians; the first is at most that of the points.
+        initial, most: first and largest number of Gaussians. The first is at most that of the points.
         opacity: initial opacity of all Gaussians.
         refine_every: steps between relocations of dead Gaussians, which add the share `growth` of new ones.
         opacity_weight, scale_weight: weights of mean opacity and mean scale in the loss.
         position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
-        opacity_rate: factor on the opacities' learning rate; with 4, captures of flat floors and walls collapse.
+        opacity_rate: factor on the opacities' learning rate. With 4, captures of flat floors and walls collapse.
     """
 
     initial: fitting.Count = 20_000
@@ -73,7 +75,7 @@ class CaptureFit(Stage):
     """
 
     first_novel = 0  # all held-out photos count as one
-    without_effect = ("optimizer", "schedule")
+    unused_settings = ("optimizer", "schedule")
 
     def __init__(
         self,
@@ -89,7 +91,7 @@ class CaptureFit(Stage):
         self.loss = loss
         self.fitting = fitting
         self.scene_folder = None if scene_folder is None else Path(scene_folder)
-        self.files = OutputFiles(formats, videos, frames, self.background)
+        self.outputs = OutputFiles(formats, videos, frames, self.background)
         self.raw = nn.ParameterDict(
             {
                 "means": torch.zeros(fitting.most, 3),
@@ -244,30 +246,29 @@ class CaptureFit(Stage):
         if self.scene_folder is None:
             return
         sequence = self.sequence("test")
-        scene = self.gaussians().detach()
         poses = cameras.world_to_camera @ sequence.cameras.world_to_camera[0].to(cameras.world_to_camera)
         placed = replace(cameras, world_to_camera=poses)
         up = normalize(-poses[:, 1, :3].mean(0), dim=-1)
         self.scene_folder.mkdir(parents=True, exist_ok=True)
         reference, targets = self.data.evaluation_views(sequence, "test")
         photos = tuple(sequence.photos[index] for index in (reference, *targets))
-        shot = Shot(scene, placed[0], up, FileUnits(sequence.scale, sequence.origin), photos)
+        coordinates = FileCoordinates(sequence.scale, sequence.origin)
+        scene = PlacedScene(self.gaussians().detach(), placed[0], up, coordinates=coordinates)
         names = dict[str, str]()
         comments = [f"scene {name}"]
         on_file = partial(logger.info, "writing %s")
         # Each format is written on its own, so that one that fails leaves the others.
-        parts = [replace(self.files, formats=())]
-        for scene_format in self.files.formats:
-            parts.append(replace(self.files, formats=[scene_format], videos=()))
+        parts = [replace(self.outputs, formats=())]
+        for scene_format in self.outputs.formats:
+            parts.append(replace(self.outputs, formats=[scene_format], videos=()))
         for part in parts:
             try:
-                *_, written = write_scene(
-                    self.scene_folder, "scene", "", shot, self.rasterizer, part, comments, on_file
-                )
+                written = write_scene(self.scene_folder, "scene", "", scene, self.rasterizer, part, comments, on_file)
             except CompleteSplatError as error:
                 logger.warning("left out: %s", error)
             else:
                 names.update(written)
         title = f"{name}: held-out photos, Gaussians fitted to the {len(self.sequence('train').frames)} others"
         seed = self.evaluation.scene_seed(name)
-        write_fitted_scene(self.scene_folder, name, title, shot, images[0], truth.images, seed, names)
+        views = FittedViews(images[0], truth.images, photos)
+        write_fitted_scene(self.scene_folder, name, title, scene, views, seed, names)

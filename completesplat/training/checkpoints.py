@@ -110,7 +110,7 @@ class Checkpoints(Checkpoint):
         keep_signals(True)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
-        # Several batches share an optimizer step if gradients are accumulated; checkpoints lack accumulated gradients.
+        # Several batches share an optimizer step if gradients are accumulated. Checkpoints lack accumulated gradients.
         stepped = trainer.global_step != self.step
         self.step = trainer.global_step
         if stepped:

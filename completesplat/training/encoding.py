@@ -60,7 +60,7 @@ def check_cache(store: LatentCache, autoreconstructor: VariationalAutoReconstruc
     """Raise WeightsError if a cache was made with other networks. (The data module checks data and their settings.)
 
     Args:
-        conditioning: the run's; the cache must hold its features if it is frozen, else images.
+        conditioning: the run's. The cache must hold its features if it is frozen, else images.
     """
     latents, features = fingerprints(autoreconstructor, conditioning)
     if store.origin.encoder != latents:
@@ -128,7 +128,7 @@ class FrameEncoder:
             encoder,
             features,
             source,
-            data.packed_settings(),
+            dict(data.packed_settings()),
             data.image_size,
             frames,
             views,

@@ -17,13 +17,13 @@ from PIL import Image
 from torch import Tensor
 
 from completesplat.export.cleaning import storable, with_screen_space_dilation
+from completesplat.export.description import plain_camera
 from completesplat.export.images import Sheet, SheetCell, color_depth, image_sheet, strip, write_png
 from completesplat.export.ply import write_ply
-from completesplat.export.prediction import plain_camera
 from completesplat.files import make_folder, write_json
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
-from completesplat.metrics.scoring import diversity
+from completesplat.metrics.sample_scores import diversity
 from completesplat.quantities import Positive
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
@@ -41,7 +41,7 @@ class DrawsFixedScenes(Callback):
 
     Args:
         folder, scenes: folder of the images, and the number of scenes in them.
-        every_n_steps: optimizer steps between drawings; the last drawing is at the end of training.
+        every_n_steps: optimizer steps between drawings. The last drawing is at the end of training.
         views: number of targets drawn for each scene, evenly spread over its targets; all if it has fewer.
     """
 
@@ -225,7 +225,7 @@ def layer_figures(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, float]:
 def gaussian_figures(gaussians: Gaussians) -> dict[str, float]:
     """Return percentiles of the opacities, of log10 of the scales, and of the depths in the reference's frame.
 
-    Keys are `gaussians/opacity_p10`, `gaussians/log10_scale_p50` and so on; depths are in scene units.
+    Keys are `gaussians/opacity_p10`, `gaussians/log10_scale_p50` and so on. Depths are in scene units.
     """
     tensors = {
         "opacity": gaussians.opacities,
@@ -273,7 +273,9 @@ class Samples(DrawsFixedScenes):
             images = rendering.over(module.background).clamp(0, 1)
             drawings.append(SceneDrawings(views.images[0], images, rendering.expected_depth()[:1]))
         scores = [drawing.scores() for drawing in drawings]
-        means = {f"samples/{name}": sum(values[name] for values in scores) / len(scores) for name in scores[0]}
+        means = {}
+        for name in scores[0]:
+            means[f"samples/{name}"] = sum(values[name] for values in scores) / len(scores)
         return samples_sheet(drawings), means
 
 

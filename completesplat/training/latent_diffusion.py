@@ -16,13 +16,13 @@ from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.diffusion.guidance import Latents
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.evaluation.scorer import Scorer
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.quantities import Natural, Positive, Share
 from completesplat.scene import Batch, SceneBatch
 from completesplat.scene_model import Sampling
 from completesplat.training.encoding import check_cache
-from completesplat.training.scoring import Scorer
 from completesplat.training.stage import Compile, Stage, prepare_network
 from completesplat.weights.checkpoint_reading import load_part
 

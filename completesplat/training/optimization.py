@@ -24,7 +24,7 @@ def muon(
     directions, so Muon needs fewer steps than Adam but, on a CPU, a third more time for each.
 
     Args:
-        lr: learning rate of matrices and kernels; the size of their gradients makes no difference.
+        lr: learning rate of matrices and kernels. The size of their gradients makes no difference.
         adam_lr, adam_betas: learning rate and betas of biases and norms.
     """
     from pytorch_optimizer import Muon  # imports a hundred other modules

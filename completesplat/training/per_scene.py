@@ -19,7 +19,9 @@ from completesplat.baselines.preoptimized import SparseVAE, project_to_splatter_
 from completesplat.data.loading.distributed import gather_values, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.errors import CompleteSplatError
-from completesplat.export.prediction import Shot, write_fitted_scene
+from completesplat.evaluation.scorer import Renders, Scorer
+from completesplat.export.fitted_scene import FittedViews, write_fitted_scene
+from completesplat.export.placed_scene import PlacedScene
 from completesplat.files import counted, make_folder, safe_name, write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -29,7 +31,6 @@ from completesplat.quantities import NonNegative
 from completesplat.scene import SceneBatch, Views
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import stack
-from completesplat.training.scoring import Renders, Scorer
 from completesplat.training.stage import Stage
 
 logger = logging.getLogger(__name__)
@@ -46,7 +47,7 @@ class PerScene(Scorer):
 
     upper_bound = True
     fitted_to = "each scene's test views, the ones that it is scored on"
-    without_effect: tuple[str, ...] = ("optimizer", "schedule", "trainer.max_", "trainer.val_check")
+    unused_settings: tuple[str, ...] = ("optimizer", "schedule", "trainer.max_", "trainer.val_check")
 
     def __init__(
         self, loss: WeightedSum, fitting: FittingSettings, scenes_folder: str | None = None, **others: Any
@@ -66,7 +67,8 @@ class PerScene(Scorer):
             make_folder(self.scenes_folder)
             make_folder(folder)
             title = f"{name}: fitted to these views"
-            write_fitted_scene(folder, name, title, Shot(gaussians[0], cameras[0]), images[0], truth.images, seed)
+            scene = PlacedScene(gaussians[0], cameras[0])
+            write_fitted_scene(folder, name, title, scene, FittedViews(images[0], truth.images), seed)
         except CompleteSplatError as error:
             logger.warning("%s: %s", folder, error)
 
@@ -90,7 +92,7 @@ class Preoptimized(PerScene):
     """Fitted Gaussians, as many as a Splatter Image of the reference view has room for.
 
     Like `PerScene`, it has seen the views that it is scored on. The results of a test have the share of pixels without
-    any Gaussian as `empty_pixels`, a mean over scenes; the paper reports 80 %.
+    any Gaussian as `empty_pixels`, a mean over scenes. The paper reports 80 %.
     """
 
     def __init__(self, parameterization: Parameterization, **fitting_and_rendering: Any) -> None:
@@ -135,9 +137,9 @@ class FittedScenes:
     One sequence at a time is in memory (16 bytes a pixel, and Gaussians). A file takes 56 bytes for each Gaussian.
 
     Args:
-        folder: folder of the files, which several processes may share; scenes in it are not fitted again.
+        folder: folder of the files, which several processes may share. Scenes in it are not fitted again.
         fit: a batch of one scene -> its Gaussians, in the reference camera's frame.
-        settings: text of all settings that the fit depends on; another text means other files.
+        settings: text of all settings that the fit depends on. Another text means other files.
     """
 
     def __init__(
@@ -204,7 +206,7 @@ class PreoptimizedVAE(Preoptimized, Stage):
         **preoptimized: see `Preoptimized`.
     """
 
-    without_effect = ()
+    unused_settings = ()
 
     def __init__(
         self,

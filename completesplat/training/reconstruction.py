@@ -14,6 +14,7 @@ from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.baselines.autodecoder import AutoDecoder, Codes, optimize_codes
 from completesplat.baselines.splatter_image.model import PublishedSplatterImage, write_trained
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
+from completesplat.evaluation.scorer import Scorer
 from completesplat.gaussians import Gaussians
 from completesplat.generator import DeterministicModel
 from completesplat.losses import Prediction, WeightedSum
@@ -21,7 +22,6 @@ from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch, Views
 from completesplat.scene_model import camera_tensors
 from completesplat.splatter_image import SplatterImage
-from completesplat.training.scoring import Scorer
 from completesplat.training.stage import Compile, Stage, prepare_network
 from completesplat.weights import CAMERA
 from completesplat.weights.checkpoint_reading import load_part
@@ -63,7 +63,7 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         loss: weighted terms by name.
         checkpoint: checkpoint of an earlier stage, whose weights this one starts from.
         masked: the model sees only the visible part of the reference image (`data.box_masks`) and learns to complete
-            it; renders are compared with whole images. The paper leaves this as future work.
+            it. Renders are compared with whole images. The paper leaves this as future work.
         channels_last, compile: see `prepare_network`.
         **rendering_and_optimization: see `Stage`.
     """

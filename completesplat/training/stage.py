@@ -19,13 +19,13 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from completesplat.data.loading.distributed import mean_of_processes
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.evaluation.scorer import Scorer
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
 from completesplat.quantities import Share
 from completesplat.rasterizers import Rasterizer
 from completesplat.run_configs import check_names, without_training
 from completesplat.scene import Batch, SceneBatch
-from completesplat.training.scoring import Scorer
 from completesplat.weights.checkpoint_reading import load_part, read_checkpoint
 
 # "cudagraphs" also records a call's operations on a GPU, to start them at once.

@@ -8,11 +8,11 @@ from typing import Any
 
 import viser
 
-from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.export.images import to_pixels
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
+from completesplat.photo.reading import Photograph
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.access import show_status
 from completesplat.viewer.page import SHOWN, Page
@@ -54,7 +54,8 @@ class Completion:
     def complete(self, image: Path, name: str, client: viser.ClientHandle | None) -> None:
         """Load an image file; raise a `CompleteSplatError` if it is none, or its background cannot be removed."""
         show_status(self.page.server, f"reading {name}")
-        self.load(name, self.model.read(image, remove_background=self.controls.remove_background.value), client)
+        photograph = self.model.read(image, remove_background=self.controls.remove_background.value)
+        self.load(name, photograph, client)
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
         if not isinstance(self.model, CompleteSplat):
@@ -73,39 +74,55 @@ class Completion:
         forming = self.controls.forming.value
         before = self.page.view.samples
         up = self.model.up.tolist()
-        earlier = [sample for sample in before if sample.finished] if self.controls.keep.value else []
         if self.page.view.up.tolist() != up:  # that of a scene which was opened meanwhile
             self.page.view.set_up(up)
-        layers = self.model.parameterization.layers
-        reference = self.model.camera(photograph).to("cpu")
-        last_shown = 0.0
-
-        def arranged(scenes: Sequence[Gaussians], finished: bool) -> list[Sample]:
-            """Return the earlier samples and then the new ones, without the first ones if there are too many."""
-            infos = [{**settings, "image": name, "sample": i} for i in range(len(scenes))]
-            new = [Sample(x.to("cpu"), layers, reference, infos[i], finished, True) for i, x in enumerate(scenes)]
-            return [*earlier, *new][-MOST_SAMPLES:]
-
-        def formed(step: int, level: int, estimate: Gaussians) -> None:
-            nonlocal last_shown
-            if self.page.worker.closed:
-                raise SystemExit  # ends this job
-            progress.value = min(100.0, 100 * (step + 1) / settings["steps"])
-            # A model that draws the samples in several batches does not say which of them these are.
-            if len(estimate.means) == settings["samples"] and time.monotonic() - last_shown > PAUSE:
-                self.page.show(arranged([estimate[i] for i in range(settings["samples"])], finished=False), "drawing")
-                last_shown = time.monotonic()
-
+        drawing = Drawing(self, name, photograph, settings)
         show_status(self.page.server, f"drawing from {name}")
         progress.animated = not forming
         progress.visible = True
         progress.value = 0.0 if forming else 100.0
         try:
-            scenes = self.model(photograph, on_step=formed if forming else None, **settings)
-            self.page.show(arranged(scenes, finished=True), f"{len(scenes)} drawn in {time.monotonic() - began:.1f} s")
+            scenes = self.model(photograph, on_step=drawing.show_estimate if forming else None, **settings)
+            seconds = time.monotonic() - began
+            self.page.show(drawing.arranged(scenes, finished=True), f"{len(scenes)} drawn in {seconds:.1f} s")
         except Exception:
             if self.page.view.samples is not before:
                 self.page.show(before)
             raise
         finally:
             progress.visible = False
+
+
+class Drawing:
+    """One drawing of samples of a photo, while it is under way."""
+
+    def __init__(self, completion: Completion, name: str, photograph: Photograph, settings: dict[str, Any]) -> None:
+        self.page = completion.page
+        self.progress = completion.controls.progress
+        self.name = name
+        self.settings = settings
+        self.layers = completion.model.parameterization.layers
+        self.reference = completion.model.camera(photograph).to("cpu")
+        self.earlier: list[Sample] = []
+        if completion.controls.keep.value:
+            self.earlier = [sample for sample in self.page.view.samples if sample.finished]
+        self.last_shown = 0.0
+
+    def arranged(self, scenes: Sequence[Gaussians], finished: bool) -> list[Sample]:
+        """Return the earlier samples and then the new ones, without the first ones if there are too many."""
+        new = []
+        for i, scene in enumerate(scenes):
+            settings = {**self.settings, "image": self.name, "sample": i}
+            new.append(Sample(scene.to("cpu"), self.layers, self.reference, settings, finished, exact=True))
+        return [*self.earlier, *new][-MOST_SAMPLES:]
+
+    def show_estimate(self, step: int, level: int, estimate: Gaussians) -> None:
+        """Show the scenes as they are estimated after a denoising step, unless it is too early for another image."""
+        if self.page.worker.closed:
+            raise SystemExit  # ends this job
+        count = self.settings["samples"]
+        self.progress.value = min(100.0, 100 * (step + 1) / self.settings["steps"])
+        # A model that draws the samples in several batches does not say which of them these are.
+        if len(estimate.means) == count and time.monotonic() - self.last_shown > PAUSE:
+            self.page.show(self.arranged([estimate[i] for i in range(count)], finished=False), "drawing")
+            self.last_shown = time.monotonic()

@@ -14,16 +14,17 @@ import numpy as np
 import torch
 import viser
 
-from completesplat.data.images.files import open_image, refused_as_bad
 from completesplat.errors import CompleteSplatError
+from completesplat.export.description import is_described
 from completesplat.export.formats import FORMATS, suffix, write_format
 from completesplat.export.images import to_pixels
-from completesplat.export.prediction import PHOTO_FILE, is_described
+from completesplat.export.prediction import PHOTO_FILE
 from completesplat.export.splat_transform import PageView
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.files import SPLATS, printable, write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit
+from completesplat.photo.files import open_image, refused_as_bad
 from completesplat.rasterizers import Rasterizer
 from completesplat.viewer import panel
 from completesplat.viewer.access import GuardedServer, show_status, stop_server, with_head

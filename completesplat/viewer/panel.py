@@ -13,10 +13,10 @@ from diffusers import DDIMScheduler
 from jaxtyping import UInt8
 from PIL import Image
 
-from completesplat.data.images.files import image_bytes
 from completesplat.diffusion.sampling import Sampler
 from completesplat.files import SPLATS
 from completesplat.generator import CompleteSplat
+from completesplat.photo.saving import image_bytes
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.sample import MOST_LAYERS
 

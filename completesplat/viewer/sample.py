@@ -6,25 +6,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.data.images.files import MOST_PIXELS
-from completesplat.data.validation import field, finite_array, read_json, require_rotation
-from completesplat.errors import BadAnnotation, BadCamera, CompleteSplatError, errors_at
-from completesplat.export.cleaning import LARGEST, with_screen_space_dilation
-from completesplat.export.prediction import SCENE_FILE, is_described
+from completesplat.data.validation import field, read_json
+from completesplat.errors import CompleteSplatError, errors_at
+from completesplat.export.cleaning import with_screen_space_dilation
+from completesplat.export.description import SCENE_FILE, UP, described_camera, described_up, is_described
 from completesplat.export.reading import read_gaussians
 from completesplat.files import by_numbers
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 
-UP = (0.0, -1.0, 0.0)
 NEWEST_FILE = "scenes.json"
 MOST_LAYERS = 16
-EXTREME = 1e6  # ratio of focal length and image, and length of the direction up
 FRAMING_FOV = 50.0
 FRAMING_SIZE = 512
 
@@ -75,19 +71,23 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     Raises:
         CompleteSplatError: there is nothing that can be shown.
     """
-    files = [path] if path.is_file() else sorted([*path.glob("sample_*.ply"), *path.glob("scene.ply")], key=by_numbers)
+    if path.is_file():
+        folder = path.parent
+        files = [path]
+    else:
+        folder = path
+        files = sorted([*path.glob("sample_*.ply"), *path.glob("scene.ply")], key=by_numbers)
     if not files:
         raise CompleteSplatError(f"{path}: no sample_*.ply or scene.ply in this folder")
     scenes = [read_gaussians(file) for file in files]
-    description = (path.parent if path.is_file() else path) / SCENE_FILE
-    is_ours = all(file.name.startswith(("sample_", "scene.")) for file in files) and is_described(description.parent)
-    if not is_ours:
+    named_by_us = all(file.name.startswith(("sample_", "scene.")) for file in files)
+    if not named_by_us or not is_described(folder):
         return [Sample(scene, 1, framing_camera(scene)) for scene in scenes], UP
-    with errors_at(description):
-        data = read_json(description)
-        reference = _camera(field(data, "reference_camera", dict))
+    with errors_at(folder / SCENE_FILE):
+        data = read_json(folder / SCENE_FILE)
+        reference = described_camera(data)
         settings = field(data, "settings", dict)
-        up = _up(settings)
+        up = described_up(settings)
     return [Sample(scene, _layers(scene, reference), reference, settings) for scene in scenes], up
 
 
@@ -98,12 +98,12 @@ def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
     with errors_at(path):
         data = read_json(path)
         step = field(data, "step", int)
-        up = _up(data)
+        up = described_up(data)
         for row in field(data, "scenes", list):
-            camera = _camera(field(row, "reference_camera", dict))
-            settings = {"scene": field(row, "scene", str)}
+            camera = described_camera(row)
+            settings = {"scene": field(row, "scene", str), "step": step}
             scene = read_gaussians(folder / Path(field(row, "file", str)).name)
-            samples.append(Sample(scene, _layers(scene, camera), camera, settings | {"step": step}))
+            samples.append(Sample(scene, _layers(scene, camera), camera, settings))
     return step, samples, up
 
 
@@ -123,26 +123,3 @@ def _layers(gaussians: Gaussians, reference: Cameras) -> int:
     """Return the number of layers, or 1 if it is unknown because Gaussians were left out of the file."""
     layers, rest = divmod(gaussians.count, math.prod(reference.image_size))
     return layers if 1 <= layers <= MOST_LAYERS and not rest else 1
-
-
-def _up(settings: Mapping[str, Any]) -> tuple[float, ...]:
-    up = finite_array(settings.get("up", UP), (3,), "up")
-    if not 1 / EXTREME < np.abs(up).max() < EXTREME:
-        raise BadAnnotation(f"up must have a length, not {settings['up']}")
-    return tuple(up.tolist())
-
-
-def _camera(plain: Mapping[str, Any]) -> Cameras:
-    """Convert a camera of a description; raise DataError for one that cannot be."""
-    pose = finite_array(plain.get("world_to_camera"), (4, 4), "world_to_camera")
-    intrinsics = finite_array(plain.get("intrinsics"), (3, 3), "intrinsics")
-    height, width = size = finite_array(plain.get("image_size"), (2,), "image_size").tolist()
-    require_rotation(pose[:3, :3], "world_to_camera")
-    if np.abs(pose).max() > LARGEST:
-        raise BadCamera(f"world_to_camera is farther than {LARGEST:g} from the origin")
-    if not 1 <= min(size) <= height * width <= MOST_PIXELS:
-        raise BadAnnotation(f"image_size must be from 1 to {MOST_PIXELS:,} pixels, not {plain['image_size']}")
-    relative = np.abs(intrinsics) / max(size)
-    if intrinsics.diagonal()[:2].min() < max(size) / EXTREME or relative.max() > EXTREME:
-        raise BadCamera(f"intrinsics of no camera: {plain['intrinsics']}")
-    return Cameras(torch.from_numpy(pose).float(), torch.from_numpy(intrinsics).float(), (int(height), int(width)))

@@ -16,12 +16,12 @@ from completesplat.benchmarks.rasterizers import (
     working_backends,
 )
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation import scorer
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rendering, RenderingConstants, selection
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.selection import failure
-from completesplat.training import scoring
 
 
 class Broken(ReferenceRasterizer):
@@ -58,7 +58,7 @@ class Clock:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 0.0
         self.turns: list[str] = []
-        for module in (rasterizers, scoring):
+        for module in (rasterizers, scorer):
             monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: self.now))
 
     def backend(self, name: str, *seconds: float) -> Backend:

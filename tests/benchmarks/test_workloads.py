@@ -9,12 +9,13 @@ import torch
 from rasterizer_scenes import render_with_gradients
 
 from completesplat.benchmarks.rasterizers import OPACITIES, rendering_milliseconds, splatter_scene
+from completesplat.evaluation import scorer
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers import Rendering
 from completesplat.rasterizers.kernels import drawing
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.training import scoring, steps
+from completesplat.training import steps
 from completesplat.training.steps import FOV_DEGREES, peak_megabytes
 
 
@@ -58,7 +59,7 @@ def test_gradients_of_all_images_are_taken_for_all_parameters() -> None:
 
 def test_the_first_figure_is_the_forward_pass_and_the_second_both(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(scoring, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(scorer, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     def passes(seconds: float) -> None:
         now[0] += seconds

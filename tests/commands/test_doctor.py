@@ -83,7 +83,7 @@ def test_missing_node_and_blender_are_no_errors_but_ffmpeg_and_space_are_needed(
 
 
 def test_the_device_is_named_with_what_runs_on_it(monkeypatch):
-    monkeypatch.setattr("completesplat.results.machine.machine", lambda: {"processor": "any"})
+    monkeypatch.setattr("completesplat.evaluation.provenance.machine", lambda: {"processor": "any"})
     monkeypatch.setattr("completesplat.rasterizers.selection.FASTER", {})
     for cuda, mps, device in ((True, False, "cuda"), (False, True, "mps"), (False, False, "cpu")):
         monkeypatch.setattr("torch.cuda.is_available", lambda cuda=cuda: cuda)

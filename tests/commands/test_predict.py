@@ -1,17 +1,11 @@
-import re
 from pathlib import Path
 
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 from PIL import Image
 from plyfile import PlyData
 from support import python, strict_json
-
-from completesplat.commands.predict import visible_part
-from completesplat.data.images.photograph import read_photograph
-from completesplat.errors import CompleteSplatError
 
 FEW = ["samples=2", "frames=4", "steps=2", "color_fits=1"]
 UNNEEDED = ["lightning", "matplotlib", "pandas", "torchmetrics", "viser", "wandb"]
@@ -114,16 +108,3 @@ def test_pixels_in_a_box_or_a_mask_have_no_influence(predict, tmp_path):
     whole = predict("skip_weight=0", "video=[]", image=tmp_path / "one/photo.png", out="whole")
     assert splats(masked) == splats(result[0])
     assert not set(splats(masked)) & set(splats(whole))
-
-
-def test_what_hides_nothing_is_refused(tmp_path):
-    Image.new("RGB", (32, 32)).save(tmp_path / "a.png")
-    photograph = read_photograph(tmp_path / "a.png", 32)
-    for hidden, message in (
-        ({"box": [0, 0, 1]}, "box=[0, 0, 1]: give [x0,y0,x1,y1]"),
-        ({"box": [0.5, 0, 0.5, 1]}, "needs 0 <= x0 < x1 <= 1"),
-        ({"mask": "nowhere.png"}, "nowhere.png: no such file"),
-        ({"mask": "nowhere.png", "box": [0.5, 0, 1, 1]}, "not both"),
-    ):
-        with pytest.raises(CompleteSplatError, match=re.escape(message)):
-            visible_part(OmegaConf.create({"box": None, "mask": None} | hidden), tmp_path / "a.png", photograph)

@@ -13,21 +13,21 @@ import torch
 from fake_converter import calls, install
 from PIL import Image
 from rich.progress import Progress
-from support import compose_config, shipped_folders, some_gaussians, strict_json
+from support import compose_config, some_gaussians, strict_json
 
 from completesplat.commands import trained
 from completesplat.commands.inputs import find_images
-from completesplat.commands.predict import output_files, photo_warnings, run, unusual_field_of_view
-from completesplat.data.images.photograph import Photograph
+from completesplat.commands.predict import output_files, run
 from completesplat.errors import CompleteSplatError
 from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.generator import CompleteSplat
+from completesplat.photo.reading import Photograph
 
 QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
 
 
-def draw(model: CompleteSplat, photograph: Photograph, visible: object, **settings: object) -> list[Gaussians]:
+def draw(model: CompleteSplat, photograph: Photograph, **settings: object) -> list[Gaussians]:
     """In place of the networks, which other tests run: a few splats in the photograph's colour."""
     scene = merge_gaussians([some_gaussians(1)[0]] * 10)
     place = torch.linspace(-0.5, 0.5, 20)
@@ -135,10 +135,10 @@ def test_names_that_are_no_utf_8_are_printed_by_a_process_that_prints_utf_8(tmp_
 def test_images_that_fail_are_named_and_do_not_stop_the_others(predict, tmp_path, monkeypatch):
     """One cannot be read, one is not there, and one lets the program fail."""
 
-    def faulty(model, photograph, visible, **settings):
+    def faulty(model, photograph, **settings):
         if photograph.image[1].mean() > 0.4:
             raise ValueError("a fault\nof the program")
-        return draw(model, photograph, visible, **settings)
+        return draw(model, photograph, **settings)
 
     monkeypatch.setattr(CompleteSplat, "forward", faulty)
     save(tmp_path / "x/a.png")
@@ -273,38 +273,19 @@ def test_one_warning_says_that_the_weights_were_not_trained_with_hidden_parts(
     assert (finished.status, finished.out.count(warning)) == (0, times)
 
 
-def test_a_photo_unlike_the_training_images_gets_a_warning_with_nearer_weights(tiny_weights, tmp_path, monkeypatch):
-    model = model_with(tiny_weights, picture_mean=[1.0, 0, 0, 0, 0, 0, 0, 0], picture_std=[0.1] * 8)
-    red, blue = (model.read(save(tmp_path / f"{color}.png", color), 15) for color in ("red", "blue"))
-    fov, unlike, elsewhere = photo_warnings(blue, model, whole=True)
-    assert "field of view is 15" in fov
-    assert unlike.startswith("unlike the training images (5.0 standard deviations, 2 is far): ")
-    assert max(len(unlike), len(elsewhere)) <= 125
-    assert len(photo_warnings(red, model, whole=True)) == len(photo_warnings(blue, model, whole=False)) == 1
-    assert len(photo_warnings(blue, model_with(tiny_weights), whole=True)) == 1  # nothing is known of the training
-    means = {"reds": (0.9, 0, 0), "blues": (0, 0, 1), "greens": (0, 0.5, 0), "unknown": None}
-    folders = shipped_folders(tmp_path, **{name: (24, mean) for name, mean in means.items()})
-    monkeypatch.setattr("completesplat.scene_model.shipped", lambda: folders)
-    assert photo_warnings(blue, model, whole=True)[2] == "weights=blues are nearer (0.0)"
-    monkeypatch.setattr("completesplat.scene_model.shipped", lambda: {"reds": folders["reds"]})
-    near, elsewhere = photo_warnings(blue, model, whole=True)[2].split("; ", 1)
-    assert near == "weights=reds are nearer (4.8)"  # but not near
-    assert all(name in elsewhere for name in ("weights=splatter_image:objaverse", "github.com/apple/ml-sharp"))
-
-
 def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
-    given = {}
+    cut = []
 
-    def read(path, size, fov, default, remove_background, whole_object):
-        given["removed"] = remove_background
-        return Photograph(torch.full((3, size, size), 0.5), default, "default")
+    def without_background(image):
+        cut.append(image)
+        return image.convert("RGBA")
 
-    monkeypatch.setattr("completesplat.scene_model.read_photograph", read)
+    monkeypatch.setattr("completesplat.photo.reading.without_background", without_background)
     for setting, removed in (("background=remove", True), ("background=1", False)):
         done = predict.succeeds(save(tmp_path / "a.png"), setting)
         assert ("a.png: removing the background" in done.out) == removed
         settings = strict_json(tmp_path / "out/a/scene.json")["settings"]
-        assert (given["removed"], settings.get("background")) == (removed, "remove" if removed else None)
+        assert (len(cut), settings.get("background")) == (1, "remove" if removed else None)
 
 
 def test_a_hidden_part_of_the_central_square_does_not_go_with_an_object_that_is_larger_than_it(predict, tmp_path):
@@ -373,17 +354,3 @@ def test_gaussians_that_are_not_finite_reach_no_file(predict, tmp_path, monkeypa
     assert finished.out.count("left out 7 of 20 Gaussians") == 1
     assert strict_json(tmp_path / "out/a/scene.json")["settings"]["gaussians"] == [13]
     assert (tmp_path / "out/a/sample_00.splat").stat().st_size == 13 * 32
-
-
-@pytest.mark.parametrize(
-    ("own", "trained", "message"),
-    [
-        (69.0, 50.0, None),  # tan 34.5 / tan 25 = 1.47
-        (90.0, 2 * 26.565051, "about 2.0 times too flat"),  # tan 45 = 2 tan 26.57
-        (2 * 26.565051, 90.0, "about 2.0 times too deep"),
-        (20.0, 50.0, "the field of view is 20 degrees (from EXIF; fov=DEGREES overrides it), 50 in training"),
-    ],
-)
-def test_a_field_of_view_far_from_trainings_is_told_with_what_it_does(own, trained, message):
-    warning = unusual_field_of_view(Photograph(torch.zeros(3, 8, 8), own, "exif"), trained)
-    assert (warning is None) if message is None else (message in warning)

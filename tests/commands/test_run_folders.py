@@ -154,7 +154,7 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     ):
         with pytest.raises(CompleteSplatError, match=message):
             jobs.is_finished(tmp_path, changed, ["out=R", "optimizer.lr=2", "ckpt_path=last"])
-    jobs._record(tmp_path, ["second"], [], config(max_steps=40))
+    jobs._record(tmp_path, {"command": ["second"]}, config(max_steps=40))
     record = strict_json(tmp_path / "run.json")
     assert (record["started"], record["command"], len(record["continued"])) == ("then", ["second"], 1)
     (earlier,) = record["earlier_ends"]

@@ -13,14 +13,15 @@ from support import call, strict_json
 from written_commands import ROOT, arguments_of, block_commands
 
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.paper_tables import published_tables
+from completesplat.evaluation.records import find_results, flat_scores
+from completesplat.evaluation.scene_files import SceneFiles
+from completesplat.evaluation.scorer import Scorer
+from completesplat.evaluation.tables import as_markdown
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.gaussians import Gaussians
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.results.paper_figures import published_tables
-from completesplat.results.runs import find_results, flat_scores
-from completesplat.results.tables import as_markdown
 from completesplat.scene import SceneBatch
-from completesplat.training.scoring import SceneFiles, Scorer
 
 SAMPLES = 3
 FEW = [f"evaluation.{few}" for few in ("batch=2", "views=1", "spread_views=2", "shown_samples=2")]
@@ -91,7 +92,7 @@ def in_front(count: int = 40, seed: int = 0) -> Gaussians:
 
 def drawn(folder: Path, scenes: SceneBatch, samples: int, frame: str = "opencv", align: str = "none") -> Gaussians:
     stage = SceneFiles(str(folder), frame, align, None, rasterizer=ReferenceRasterizer())
-    stage.find(scenes.names, samples)
+    stage.find_files(scenes.names, samples)
     return stage.draw(scenes, [0], samples)
 
 
@@ -167,7 +168,7 @@ def test_hidden_modes_are_scored_from_files(command, pipeline, model_test, tmp_p
 
 @pytest.mark.slow
 def test_the_lines_of_the_readme_run_as_written(command, tmp_path):
-    document = ROOT / "completesplat/metrics/README.md"
+    document = ROOT / "completesplat/evaluation/README.md"
     (lines,) = re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL)
     making, *commands = [arguments_of(text) for text in block_commands(document) if re.search("HELDOUT|SPLATS", text)]
     command.succeeds(*making, "scenes=20", "frames=8")

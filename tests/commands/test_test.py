@@ -15,8 +15,8 @@ from completesplat.commands.evaluate import scored_data
 from completesplat.data.toy import write_objects
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.results.tables import SSIM_NOTE
-from completesplat.training.scoring import Scorer
+from completesplat.evaluation.scorer import Scorer
+from completesplat.evaluation.tables import SSIM_NOTE
 
 
 @pytest.fixture

@@ -19,9 +19,10 @@ from written_commands import ROOT
 from completesplat.commands.jobs import hold_job_lock
 from completesplat.commands.view import newest_scenes, scenes_in, setting_of_path, show_newest
 from completesplat.errors import CompleteSplatError
+from completesplat.export.description import UP
 from completesplat.export.ply import write_ply
 from completesplat.training.fixed_scenes import write_newest
-from completesplat.viewer.sample import UP, Sample
+from completesplat.viewer.sample import Sample
 
 
 def folder(path, *names: str):

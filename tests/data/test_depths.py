@@ -10,7 +10,6 @@ from completesplat.data.co3d import source
 from completesplat.data.co3d.annotations import CO3DFrame, DepthMap
 from completesplat.data.co3d.category import Filters, read_category
 from completesplat.data.co3d.source import object_placement
-from completesplat.data.images.crop import Square
 from completesplat.data.loading.scenes import LoadedScenes, collate
 from completesplat.data.placement import OBJECT_HALF_SIZE
 from completesplat.data.splits import SeededSplit
@@ -18,6 +17,7 @@ from completesplat.data.toy.data_sets import SUBSET
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.errors import BadImage
 from completesplat.geometry.cameras import Cameras, pinhole, project
+from completesplat.photo.crop import Square
 from completesplat.scene import SceneBatch
 
 

@@ -125,7 +125,7 @@ def test_photos_become_upright_keep_their_focal_length_and_the_unusable_are_name
     assert "left out: 1 file of other formats: notes.txt" in caplog.text
     assert f"left out: {tmp_path / 'cut.jpg'}: cannot be decoded" in caplog.text
     full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
-    monkeypatch.setattr(importing.files, "save_image", full)
+    monkeypatch.setattr(importing.saving, "save_image", full)
     with pytest.raises(OSError, match="No space left"):
         importing._copy_photos(tmp_path, images)
 

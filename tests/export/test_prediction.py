@@ -4,7 +4,6 @@ import dataclasses
 import os
 
 import numpy as np
-import pytest
 import torch
 from fake_converter import install
 from image_sheets import cells
@@ -13,7 +12,9 @@ from support import some_gaussians, strict_json
 
 from completesplat.export import prediction
 from completesplat.export.images import color_depth
+from completesplat.export.placed_scene import PlacedScene
 from completesplat.export.ply import read_ply
+from completesplat.export.scene_files import OutputFiles
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -68,47 +69,16 @@ def test_maps_share_one_scale_of_depth_and_agree_on_what_is_there(tmp_path):
         assert np.abs(normals[8, 8].astype(int) - [128, 128, 255]).max() <= 1
 
 
-def test_the_camera_comes_back_exactly_and_numbers_that_are_not_finite_leave_the_old_file(tmp_path):
-    oblong, path, settings = Cameras(torch.eye(4), pinhole(50.0, 64), (64, 48)), tmp_path / "s.json", {"steps": 50}
-    prediction.write_scene_json(path, oblong, settings, 7, {"splat": "größe.ply"})
-    with pytest.raises(ValueError, match="JSON"):
-        prediction.write_scene_json(path, oblong, {"weight": torch.inf}, 0, {})
-    scene = strict_json(path)
-    stored = scene["reference_camera"]
-    assert torch.equal(torch.tensor(stored["world_to_camera"]), oblong.world_to_camera)
-    assert torch.equal(torch.tensor(stored["intrinsics"]), oblong.intrinsics)
-    assert stored["image_size"] == [64, 48]
-    assert (scene["settings"], scene["seed"], scene["files"]) == (settings, 7, {"splat": "größe.ply"})
-    assert {"axes", "units", "quaternions", "colors"} <= set(scene["conventions"])
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path, monkeypatch):
     program = install(tmp_path / "bin", "splat-transform")
     monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
     bright = dataclasses.replace(scene_at(2, 0.9), colors=torch.tensor([[0.2, 0.4, 1.5], [0.0, 0.5, 1.0]]))
     faint = dataclasses.replace(scene_at(2, 0.9), opacities=torch.tensor([0.9, 1e-4]))
-    wanted = prediction.OutputFiles(formats=("ply", "spz"), videos=())
-    shots, settings = [prediction.Shot(bright, CAMERA), prediction.Shot(faint, CAMERA)], {"seed": 0, "image": "a.png"}
-    prediction.write_prediction(tmp_path / "a", torch.zeros(3, 16, 16), shots, ReferenceRasterizer(), wanted, settings)
+    wanted = OutputFiles(formats=("ply", "spz"), videos=())
+    samples, settings = [PlacedScene(bright, CAMERA), PlacedScene(faint, CAMERA)], {"seed": 0, "image": "a.png"}
+    image = torch.zeros(3, 16, 16)
+    prediction.write_prediction(tmp_path / "a", image, samples, ReferenceRasterizer(), wanted, settings)
     recorded = strict_json(tmp_path / "a/scene.json")["settings"]
     counted = [recorded[name] for name in ("gaussians", "colors_clipped", "left_out_of_spz")]
     assert counted == [[2, 2], [1, 0], [0, 1]]
     assert [read_ply(tmp_path / f"a/sample_{i:02}.spz").count for i in (0, 1)] == [2, 1]
-
-
-@pytest.mark.parametrize(("far", "offset"), [((300.0, -200.0, 100.0), [0, 0, 0]), ((4e5, 5e6, 300.0), [4e5, 5e6, 300])])
-def test_files_have_the_users_coordinates_or_those_less_an_offset_that_scene_json_has(tmp_path, caplog, far, offset):
-    places = torch.tensor([[0.25, 0.5, 2.0], [-0.25, 0, 2.0]])
-    scene = dataclasses.replace(scene_at(2, 0.9), means=places)
-    images = torch.zeros(1, 3, 16, 16)
-    shot = prediction.Shot(scene, CAMERA, units=prediction.FileUnits(0.5, far))  # exact in float32
-    prediction.write_fitted_scene(tmp_path, "a", "a", shot, images, images, 0)
-    recorded = strict_json(tmp_path / "scene.json")
-    assert recorded["settings"].get("offset", [0, 0, 0]) == offset
-    assert caplog.text.count("a: too far from its origin for float32: add offset (400000, 5e+06, 300)") == any(offset)
-    stored = read_ply(tmp_path / "scene.ply").means
-    user = stored.double().numpy() + offset
-    np.testing.assert_allclose(user, 2 * places.double().numpy() + far, rtol=0, atol=1e-12)
-    camera = torch.tensor(recorded["reference_camera"]["world_to_camera"])
-    torch.testing.assert_close(stored @ camera[:3, :3].T + camera[:3, 3], 2 * places)

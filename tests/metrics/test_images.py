@@ -4,10 +4,10 @@ import torch
 from scipy.ndimage import gaussian_filter
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from completesplat.commands.protocol import METRICS
+from completesplat.evaluation.protocol import PACKAGE_METRICS
+from completesplat.evaluation.regions import object_only
+from completesplat.evaluation.tables import SSIM_NOTE
 from completesplat.metrics.images import PSNR_LIMIT, psnr, sharpness, ssim
-from completesplat.metrics.scoring import object_only
-from completesplat.results.tables import SSIM_NOTE
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_ssim_mirrors_images_at_the_border_and_counts_all_pixels(pair):
         assert ours.item() == pytest.approx(similarity.mean(), abs=1e-5)
         theirs = structural_similarity(t.double().numpy(), p.double().numpy(), use_sample_covariance=False, **settings)
         assert similarity[:, 5:-5, 5:-5].mean() == pytest.approx(theirs, abs=1e-9)
-    assert METRICS["completesplat.metrics.images.ssim"]["border"] == "mirrored, counted"
+    assert PACKAGE_METRICS["completesplat.metrics.images.ssim"]["border"] == "mirrored, counted"
     assert "mean over all pixels, images mirrored at their border" in SSIM_NOTE
     assert "skimage leaves 5 pixels out on every side" in SSIM_NOTE
 

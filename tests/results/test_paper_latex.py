@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from completesplat.commands import conf_folder
-from completesplat.results import paper_figures
-from completesplat.results.tables import BLANK, Cell
+from completesplat.evaluation import paper_tables
+from completesplat.evaluation.tables import BLANK, Cell
 
 ENVIRONMENT = re.compile(r"\\begin\{table(\*?)\}.*?\\end\{table\1\}", re.DOTALL)
 COMMENT = re.compile(r"(?<!\\)%.*")
@@ -40,7 +40,7 @@ def figure(cell: str) -> Cell:
     marks = [mark for mark, pattern in MARKED.items() if re.search(pattern, cell)]
     for pattern in (r"~?\\cite\{[^}]*\}", *MARKED.values()):
         cell = re.sub(pattern, "", cell)
-    return paper_figures.parse_cell(" ".join([re.sub(r"[{}]", "", cell).replace(r"\#", "#"), *marks]))
+    return paper_tables.parse_cell(" ".join([re.sub(r"[{}]", "", cell).replace(r"\#", "#"), *marks]))
 
 
 def _body(table: str) -> str:
@@ -80,7 +80,7 @@ def _spread(lines: list[list[tuple[Cell, int, int]]]) -> list[list[Cell]]:
     return rows
 
 
-def differences(table: paper_figures.PublishedTable, paper_text: str) -> list[str]:
+def differences(table: paper_tables.PublishedTable, paper_text: str) -> list[str]:
     """Return the differences of a table from LaTeX: headings, cells with their marks, and phrases."""
     latex = next((m.group() for m in ENVIRONMENT.finditer(paper_text) if rf"\label{{{table.label}}}" in m.group()), "")
     text = " ".join(latex.split())
@@ -88,7 +88,7 @@ def differences(table: paper_figures.PublishedTable, paper_text: str) -> list[st
     printed = grid(latex, "PSNR") if latex else None
     if printed is None:
         return [*wrong, f"{table.name}: the paper has no table of PSNR labelled {table.label}"]
-    typed = [[column.heading for column in table.columns], *paper_figures.printed_rows(table)]
+    typed = [[column.heading for column in table.columns], *paper_tables.printed_rows(table)]
     for row, other in zip_longest(typed, [printed[0], *printed[1]], fillvalue=()):
         pairs = (pair for pair in zip_longest(row, other) if pair[0] != pair[1])
         wrong += [f"{table.name}: {ours}, the paper prints {theirs}" for ours, theirs in pairs]
@@ -101,17 +101,17 @@ PAPER = os.environ.get("COMPLETESPLAT_PAPER")
 @pytest.mark.skipif(PAPER is None, reason="COMPLETESPLAT_PAPER does not name the LaTeX of the paper")
 def test_the_published_figures_are_typed_as_the_paper_prints_them() -> None:
     paper = Path(PAPER or "").read_text(encoding="utf-8")
-    assert [difference for known in paper_figures.read_tables() for difference in differences(known, paper)] == []
+    assert [difference for known in paper_tables.read_tables() for difference in differences(known, paper)] == []
 
 
 def test_every_table_is_complete() -> None:
-    for known in paper_figures.read_tables():
-        assert all(len(row) == len(known.columns) for row in paper_figures.printed_rows(known))
-        assert all(data_set for *_, data_set in paper_figures.score_columns(known))
-        text = " ".join(cell.text for row in paper_figures.printed_rows(known) for cell in row)
-        signs = {name for name, sign in paper_figures.SIGNS.items() if sign in text}
+    for known in paper_tables.read_tables():
+        assert all(len(row) == len(known.columns) for row in paper_tables.printed_rows(known))
+        assert all(data_set for *_, data_set in paper_tables.score_columns(known))
+        text = " ".join(cell.text for row in paper_tables.printed_rows(known) for cell in row)
+        signs = {name for name, sign in paper_tables.SIGNS.items() if sign in text}
         assert signs == set(known.get("legend", {}))
-    assert len({known.place for known in paper_figures.read_tables()}) == len(paper_figures.read_tables()) == 4
+    assert len({known.place for known in paper_tables.read_tables()}) == len(paper_tables.read_tables()) == 4
 
 
 def names(*folders: str) -> set[str]:
@@ -119,7 +119,7 @@ def names(*folders: str) -> set[str]:
 
 
 def test_every_protocol_of_a_table_is_there_and_every_option_of_a_row() -> None:
-    assert {name for known in paper_figures.read_tables() for name in known.evaluations} <= names("evaluation")
-    (ablations,) = (known for known in paper_figures.read_tables() if known.get("options"))
-    assert set(ablations.options.values()) == {row[0].text for row in paper_figures.printed_rows(ablations)}
+    assert {name for known in paper_tables.read_tables() for name in known.evaluations} <= names("evaluation")
+    (ablations,) = (known for known in paper_tables.read_tables() if known.get("options"))
+    assert set(ablations.options.values()) == {row[0].text for row in paper_tables.printed_rows(ablations)}
     assert set(ablations.options) <= names("ablation", "model")

@@ -114,7 +114,7 @@ def test_settings_of_a_sweep_may_be_without_effect_in_one_of_its_jobs(tmp_path):
     (job / "run.json").write_text('{"overrides": ["optimizer.lr=1"]}')
     with pytest.raises(CompleteSplatError, match=r"optimizer\.lr=1: CaptureFit does nothing with it"):
         refuse_without_effect(config, job)
-    (tmp_path / "sweep/multirun.yaml").touch()
+    (job / "run.json").write_text('{"overrides": ["optimizer.lr=1"], "sweep": {"folder": "../..", "job": 0}}')
     refuse_without_effect(config, job)
 
 

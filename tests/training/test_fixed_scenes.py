@@ -16,7 +16,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import pixel_rays
 from completesplat.metrics.images import PSNR_LIMIT
-from completesplat.metrics.scoring import diversity
+from completesplat.metrics.sample_scores import diversity
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch
 from completesplat.training import fixed_scenes

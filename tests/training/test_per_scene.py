@@ -5,7 +5,7 @@ from hydra.utils import instantiate
 from scenes_for_training import quiet_trainer
 from support import SMALL, compose_config, strict_json
 
-from completesplat.training import scoring
+from completesplat.evaluation import scorer
 
 FEW = ["model.fitting.count=300", "model.fitting.steps=60", "data.evaluation_targets=3"]
 
@@ -28,8 +28,8 @@ def test_fitting_the_test_scenes_beats_not_fitting_them(toy_root):
 def test_seconds_are_medians_without_the_first_work_of_each_process(toy_root, monkeypatch):
     """Two processes, of which the first work took nine seconds each."""
     timed = lambda self, name, work, scenes: self.seconds[name].extend([9.0, 1.0, 2.0]) or work()  # noqa: E731
-    monkeypatch.setattr(scoring.Scorer, "timed", timed)
-    monkeypatch.setattr(scoring, "gather_values", lambda values: [values, values])
+    monkeypatch.setattr(scorer.Scorer, "timed", timed)
+    monkeypatch.setattr(scorer, "gather_values", lambda values: [values, values])
     seconds = scored("per_scene", toy_root, "model.fitting.steps=0").test_results()["model"]["seconds"]
     assert set(seconds.values()) == {1.5}
 

@@ -6,8 +6,8 @@ from scenes_for_training import quiet_trainer, scene_batch
 from support import NETWORKS, compose_config
 from torch.utils.data import DataLoader
 
+from completesplat.evaluation.scorer import copy_reference, mirror_reference, repeat_image
 from completesplat.training.callbacks import BadSteps
-from completesplat.training.scoring import copy_reference, mirror_reference, repeat_image
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
 

@@ -5,11 +5,11 @@ import torch
 from viewer_scenes import balls, balls_sample, reference_camera
 
 from completesplat.errors import CompleteSplatError
+from completesplat.export.description import UP, write_scene_json
 from completesplat.export.ply import write_ply
-from completesplat.export.prediction import write_scene_json
 from completesplat.gaussians import merge_gaussians
 from completesplat.geometry.cameras import project
-from completesplat.viewer.sample import UP, Sample, framing_camera, read_scene
+from completesplat.viewer.sample import Sample, framing_camera, read_scene
 
 
 def prediction(folder, count=2, points=1024):

@@ -12,7 +12,7 @@ import os
 import re
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, NamedTuple
@@ -24,11 +24,11 @@ from torch import Tensor, nn
 
 from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
 from completesplat.baselines.splatter_image.network import SongUNet
-from completesplat.data.images.photograph import ImageLike, Photograph, read_photograph
 from completesplat.errors import CompleteSplatError, TensorFileError, WeightsError
 from completesplat.files import SHORT, atomic_path, make_folder, printable, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
+from completesplat.photo.reading import Framing, ImageLike, Photograph
 from completesplat.quantities import Entries, Few, Natural, Range, Width
 from completesplat.scene_model import SceneModel
 from completesplat.settings.schema import violations
@@ -231,11 +231,30 @@ class PublishedModel(SceneModel):
             raise CompleteSplatError(f"{self.network.file}: knows objects; these data do not say where objects are")
         return needed | {"depth_after": self.network.depths.far}
 
-    def read(self, image: ImageLike, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
-        """Read an image at the model's size, on the background that the weights know (`read_photograph`).
+    @property
+    def framing(self) -> Framing:
+        """How photos are framed: on the background that the weights know.
 
         If the weights know only one field of view, the image is taken to have it, and a cut-out object is placed in the
         middle of the image, as large as in training.
+        """
+        known = self.network.fov_degrees
+        background = self.network.background
+        if known is None:
+            return Framing(self.image_size, PHONE_FOV, background=background, training={})
+        return Framing(
+            self.image_size, known, reads_exif=False, background=background, object_share=CUT_OUT_SHARE, training={}
+        )
+
+    def read(
+        self,
+        image: ImageLike,
+        fov_degrees: float | None = None,
+        remove_background: bool = False,
+        mask: ImageLike | None = None,
+        box: Sequence[float] | None = None,
+    ) -> Photograph:
+        """Read an image at the model's size; see `SceneModel.read`.
 
         Raises:
             CompleteSplatError: as `read_photograph`, or a field of view is given, and the weights know only one.
@@ -243,10 +262,7 @@ class PublishedModel(SceneModel):
         known = self.network.fov_degrees
         if known is not None and fov_degrees is not None:
             raise CompleteSplatError(f"fov={fov_degrees:g}: these weights take every image as of {known:.0f} degrees")
-        share = None if known is None else CUT_OUT_SHARE
-        background = self.network.background
-        photo = read_photograph(image, self.image_size, fov_degrees, PHONE_FOV, remove_background, background, share)
-        return photo if known is None else replace(photo, fov_degrees=known, fov_source="default")
+        return super().read(image, fov_degrees, remove_background, mask, box)
 
     def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
         """Return near and far; for weights trained on captures, around the object's estimated distance."""

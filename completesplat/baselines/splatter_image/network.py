@@ -77,8 +77,8 @@ class SongUNet(nn.Module):
 
     Args:
         size: side of the images in pixels, a multiple of 8; levels are named after their sizes.
-        width: channels of the first level; all others have twice as many.
-        blocks: residual blocks per level on the way down; the way up has one more.
+        width: channels of the first level. All others have twice as many.
+        blocks: residual blocks per level on the way down. The way up has one more.
         attention: sizes of levels with attention: in every block on the way down, in the last on the way up.
     """
 

@@ -15,13 +15,13 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from completesplat.data.images import files
-from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, read_exif
 from completesplat.data.sequences import first_names
 from completesplat.data.validation import LARGEST, require_file
 from completesplat.errors import BadAnnotation, BadCamera, BadImage, ImageError, TooFewFrames, errors_at, needing
 from completesplat.files import by_numbers
 from completesplat.geometry.cameras import Cameras
+from completesplat.photo import files
+from completesplat.photo.exif import ORIENTATION, TRANSPOSITIONS, read_exif
 
 if TYPE_CHECKING:
     from pycolmap import Camera

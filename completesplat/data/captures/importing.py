@@ -16,11 +16,11 @@ from rich.progress import Progress, track
 from completesplat.data.captures.captured_frames import FEWEST_FRAMES, import_pycolmap
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.turntable import TurntableSettings, import_turntables
-from completesplat.data.images import files
 from completesplat.data.sequences import first_names
 from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import DataError, refused_to
 from completesplat.files import atomic_folder, by_numbers, counted, folder_names
+from completesplat.photo import files, saving
 from completesplat.quantities import Positive
 
 logger = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ def _copy_photos(folder: Path, images: Path) -> None:
                 upright = upright.convert("RGB")
             lossy = image.format in ("JPEG", "MPO", "HEIF", "WEBP") and upright.mode in ("L", "RGB")
             suffix = ".jpg" if lossy else ".png"
-            files.save_image(upright, place / f"{stem}{suffix}", **options)
+            saving.save_image(upright, place / f"{stem}{suffix}", **options)
 
 
 def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:

@@ -20,9 +20,6 @@ from completesplat.data.captures.captured_frames import (
     in_order,
     warn_of_missing,
 )
-from completesplat.data.images.exif import ORIENTATION, read_exif
-from completesplat.data.images.files import stored_size
-from completesplat.data.images.photograph import read_photograph
 from completesplat.data.validation import (
     field,
     finite_array,
@@ -34,6 +31,9 @@ from completesplat.data.validation import (
 )
 from completesplat.errors import BadAnnotation, BadCamera, CompleteSplatError, TooFewFrames, errors_at
 from completesplat.geometry.cameras import Cameras, crop_resize
+from completesplat.photo.exif import ORIENTATION, read_exif
+from completesplat.photo.files import stored_size
+from completesplat.photo.reading import Framing, read_square
 from completesplat.scene import Views
 from completesplat.tensors import stack
 
@@ -111,7 +111,7 @@ def read_polycam(keyframes: Path) -> Capture:
 
 
 def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
-    """Read photos and their cameras in `transforms.json`. Undistort, crop and resize them as `read_photograph` does.
+    """Read photos and their cameras in `transforms.json`. Undistort, crop and resize them as `read_square` does.
 
     Returns:
         Views [view ...] in the order of the photos, in the world of the first camera and the file's units.
@@ -128,9 +128,9 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
         if frame is None:
             raise CompleteSplatError(f"{image}: {path} has no frame with this image")
         undistorted, _ = frame.read()
-        if ORIENTATION in read_exif(undistorted):  # `read_photograph` would turn it
+        if ORIENTATION in read_exif(undistorted):  # `read_square` would turn it
             undistorted = Image.fromarray(np.array(undistorted))
-        squares.append(read_photograph(undistorted, size).image)
+        squares.append(read_square(undistorted, Framing(size)).image)
         camera = frame.camera()
         height, width = camera.image_size
         side = min(camera.image_size)

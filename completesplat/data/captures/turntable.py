@@ -21,13 +21,13 @@ from rich.progress import track
 
 from completesplat.data.captures.capture_set import SPLITS_FILE, read_splits
 from completesplat.data.captures.turn_checks import Turn, examine, write_sheet
-from completesplat.data.images import files
-from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.photograph import without_background
 from completesplat.data.validation import field, read_json
 from completesplat.errors import BadAnnotation, BadImage, DataError, ImageError, MissingFile, TooFewFrames, refused_to
 from completesplat.files import counted, writing
 from completesplat.geometry.cameras import Cameras, invert_rigid, look_at, mirror
+from completesplat.photo import files, saving
+from completesplat.photo.background import without_background
+from completesplat.photo.crop import Square, cut_square
 from completesplat.quantities import Range
 
 logger = logging.getLogger(__name__)
@@ -166,8 +166,8 @@ def _write_turn(folder: Path, count: int | None, out: Path, settings: TurntableS
     for kind in ("images", "masks"):
         (out / kind).mkdir(parents=True)
     for position, (image, mask) in zip(positions, photos, strict=True):
-        files.save_image(image, out / f"images/{position:05d}.jpg", quality=95, subsampling=0)
-        files.save_image(mask, out / f"masks/{position:05d}.png")
+        saving.save_image(image, out / f"images/{position:05d}.jpg", quality=95, subsampling=0)
+        saving.save_image(mask, out / f"masks/{position:05d}.png")
     return turn
 
 

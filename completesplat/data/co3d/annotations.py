@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from completesplat.data.images.files import MOST_PIXELS
 from completesplat.data.validation import field, finite_array, path_below, read_json, require_rotation
 from completesplat.errors import BadAnnotation, BadCamera, Refuse, errors_at, refused_to
 from completesplat.geometry.cameras import Cameras
+from completesplat.photo.files import MOST_PIXELS
 
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up), and back.
 FLIP = np.diag([-1.0, -1.0, 1.0])

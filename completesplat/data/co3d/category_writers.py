@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from completesplat.data.images.files import save_image, save_jpeg, to_uint8
 from completesplat.errors import DataError
 from completesplat.files import write_bytes, write_text
+from completesplat.photo.saving import save_image, save_jpeg, to_uint8
 from completesplat.ply_files import TYPES, vertex_header
 
 FRAMES_PER_SECOND = 10.0

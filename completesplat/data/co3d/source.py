@@ -13,8 +13,7 @@ from torch import Tensor
 
 from completesplat.data.co3d.annotations import CO3DFrame
 from completesplat.data.co3d.category import SplitMembers
-from completesplat.data.images.crop import Square
-from completesplat.data.images.files import decode_image, read_depth
+from completesplat.data.co3d.depth_maps import read_depth
 from completesplat.data.placement import (
     Axes,
     ObjectFraming,
@@ -29,6 +28,8 @@ from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSou
 from completesplat.data.validation import read_points
 from completesplat.errors import BadImage, DataError, errors_at
 from completesplat.geometry.cameras import pixel_centers, unproject
+from completesplat.photo.crop import Square
+from completesplat.photo.files import decode_image
 
 DEPTH_MAPS = 8
 FOREGROUND = 128  # smallest mask value, of 255

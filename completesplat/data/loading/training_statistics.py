@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from completesplat.data.images.photograph import image_features
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras
+from completesplat.photo.features import image_features
 
 # A mean over all images of RealEstate10K's 66,033 training clips would take hours.
 SEQUENCES = 400

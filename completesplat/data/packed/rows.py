@@ -12,11 +12,11 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.files import image_bytes
 from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.errors import BadAnnotation, BadImage, ChangedFile, errors_at
 from completesplat.geometry.cameras import Cameras, crop_resize
+from completesplat.photo.crop import Square, cut_square
+from completesplat.photo.saving import image_bytes
 
 # Pillow's arguments by codec. BMP is uncompressed: more than twice the bytes of PNG, decoded in a ninth of the time.
 CODECS: dict[str, dict[str, int]] = {"png": {}, "jpeg": {"quality": 95, "subsampling": 0}, "bmp": {}}

@@ -18,8 +18,6 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.files import decode_image, stored_size
 from completesplat.data.validation import LARGEST, ROTATION_TOLERANCE, path_below, read_json, read_text, require_file
 from completesplat.errors import (
     BadAnnotation,
@@ -33,6 +31,8 @@ from completesplat.errors import (
     refused_to,
 )
 from completesplat.geometry.cameras import Cameras
+from completesplat.photo.crop import Square, cut_square
+from completesplat.photo.files import decode_image, stored_size
 from completesplat.weights.checkpoint_reading import read_tensor_file
 
 CAMERA_NUMBERS = 18

@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
-from completesplat.data.images.crop import Square, principal_square
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import EvaluationScenes
 from completesplat.data.loading.view_selection import Choice, ClipViews, GrowingGap
@@ -20,6 +19,7 @@ from completesplat.data.splits import split_by_hash
 from completesplat.data.validation import require_file
 from completesplat.errors import CompleteSplatError, DataError, errors_at, refused_to
 from completesplat.geometry.cameras import crop_resize
+from completesplat.photo.crop import Square, principal_square
 from completesplat.quantities import Natural, Positive, Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of

@@ -21,7 +21,6 @@ from rich.progress import track
 from completesplat.data.co3d import category_writers
 from completesplat.data.co3d.annotations import viewpoint
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.rendered.assets import Asset, BrokenMesh, check_named_files, find_meshes, procedural_objects
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
 from completesplat.data.rendered.random_scenes import PAINTS, RenderSettings, check_surroundings, draw_rendered_scene
@@ -30,6 +29,7 @@ from completesplat.data.validation.processes import share_of, usable_cores
 from completesplat.errors import CompleteSplatError, DataError, UnreadableFile
 from completesplat.files import atomic_folder, counted, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
+from completesplat.photo.saving import save_jpeg, to_uint8
 from completesplat.quantities import Natural, Positive, Range
 
 logger = logging.getLogger(__name__)

@@ -13,7 +13,6 @@ from rich.progress import track
 
 from completesplat.data.co3d import category_writers
 from completesplat.data.co3d.annotations import viewpoint
-from completesplat.data.images.files import save_jpeg, to_uint8
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_mini, draw_object_scene, render_frame
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
 from completesplat.data.toy.shapes import Array
@@ -21,6 +20,7 @@ from completesplat.data.toy.surroundings import WHITE
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError
 from completesplat.files import atomic_folder
+from completesplat.photo.saving import save_jpeg, to_uint8
 from completesplat.quantities import Entries, Natural, Positive, Range, Side
 from completesplat.settings.schema import violations
 

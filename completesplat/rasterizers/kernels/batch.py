@@ -29,6 +29,10 @@ class Parameters(NamedTuple):
     opacities: np.ndarray
     colors: np.ndarray
 
+    def of_scene(self, scene: int) -> "Parameters":
+        """Return the arrays [gaussian ...] of one scene."""
+        return Parameters(*(array[scene] for array in self))
+
 
 class RenderedImages(NamedTuple):
     """Arrays [batch view channel height width] of a `Rendering`, or the gradients with respect to them."""
@@ -87,8 +91,7 @@ class BatchRendering:
 
     def render(self) -> RenderedImages:
         """Project and composite every view."""
-        shapes = [(self.scenes, self.views, channels, self.height, self.width) for channels in (3, 1, 1)]
-        images = RenderedImages(*(np.empty(shape, np.float32) for shape in shapes))
+        images = RenderedImages(self._empty_images(3), self._empty_images(1), self._empty_images(1))
         parallel(self._prepare, self.scenes)
         for start in range(0, self.scenes * self.views, self.held or 1):
             number = min(self.held, self.scenes * self.views - start)
@@ -105,13 +108,16 @@ class BatchRendering:
             empty((self.scenes, self.views, bands, self.lanes), np.int32),
         )
         parallel(partial(self._composite_backward, images, gradients, sums), views * bands)
-        result = Parameters(*(empty(x.shape) for x in self.parameters))
+        result = Parameters(*(empty(array.shape) for array in self.parameters))
         chunks = -(-self.count // CHUNK)
         parallel(partial(self._project_backward, result, sums), self.scenes * chunks)
         return result
 
+    def _empty_images(self, channels: int) -> np.ndarray:
+        return np.empty((self.scenes, self.views, channels, self.height, self.width), np.float32)
+
     def _prepare(self, scene: int) -> None:
-        prepare(*(x[scene] for x in self.parameters), self.log2_min_alpha, self.prepared[scene])
+        prepare(*self.parameters.of_scene(scene), self.log2_min_alpha, self.prepared[scene])
 
     def _project(self, start: int, slot: int) -> None:
         scene, camera = divmod(start + slot, self.views)
@@ -135,8 +141,13 @@ class BatchRendering:
     ) -> None:
         slot, band = divmod(task, len(self.bands))
         scene, view = divmod(slot, self.views)
-        arrays = (*images.view(scene, view), *gradients.view(scene, view))
-        self._run(slot, band, (*arrays, *(x[scene, view, band] for x in sums)))
+        arrays = (
+            *images.view(scene, view),
+            *gradients.view(scene, view),
+            sums.gradients[scene, view, band],
+            sums.places[scene, view, band],
+        )
+        self._run(slot, band, arrays)
 
     def _run(self, slot: int, band: int, arrays: tuple[np.ndarray | None, ...]) -> None:
         first, end = self.bands[band]
@@ -149,8 +160,17 @@ class BatchRendering:
 
     def _project_backward(self, result: Parameters, sums: BandGradients, task: int) -> None:
         scene, chunk = divmod(task, -(-self.count // CHUNK))
+        parameters = self.parameters.of_scene(scene)
         project_backward(
-            *(x[scene] for x in self.parameters[1:4]), self.prepared[scene], self.cameras[scene],
-            float(self.constants.blur), *(x[scene] for x in sums),
-            chunk * CHUNK, min((chunk + 1) * CHUNK, self.count), *(x[scene] for x in result),
-        )  # fmt: skip
+            parameters.quaternions,
+            parameters.scales,
+            parameters.opacities,
+            self.prepared[scene],
+            self.cameras[scene],
+            float(self.constants.blur),
+            sums.gradients[scene],
+            sums.places[scene],
+            chunk * CHUNK,
+            min((chunk + 1) * CHUNK, self.count),
+            *result.of_scene(scene),
+        )

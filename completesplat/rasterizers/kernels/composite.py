@@ -60,7 +60,7 @@ def composite(
         state: scratch [block * 6 * 16], all blocks of the band.
         open_words: scratch [row word] uint64.
         spans: scratch [2 * row + 32] int32.
-        color, depth, alpha: the whole images [3 height width], [height width] twice; the band is written or read.
+        color, depth, alpha: the whole images [3 height width], [height width] twice. The band is written or read.
         grad_color, grad_depth, grad_alpha: gradients of the loss with respect to these images; None to draw.
         gradients, places: [gaussian + 1 16] and [lane], see `array_layout`.
     """

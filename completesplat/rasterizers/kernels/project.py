@@ -177,8 +177,10 @@ def radix_sort(depths, keys, order, count):
 @simd.vector_function(simd.VECTOR)
 def packed_blocks(builder, first, last):
     """Return, as the bits of int32, the block of each first pixel, and that of each last pixel shifted up."""
-    block_shift, half_word = (ir.Constant(simd.INTEGERS_IR, [bits] * simd.LANES) for bits in (layout.BLOCK_SHIFT, 16))
-    low, high = (builder.ashr(builder.fptosi(pixel, simd.INTEGERS_IR), block_shift) for pixel in (first, last))
+    block_shift = ir.Constant(simd.INTEGERS_IR, [layout.BLOCK_SHIFT] * simd.LANES)
+    half_word = ir.Constant(simd.INTEGERS_IR, [16] * simd.LANES)
+    low = builder.ashr(builder.fptosi(first, simd.INTEGERS_IR), block_shift)
+    high = builder.ashr(builder.fptosi(last, simd.INTEGERS_IR), block_shift)
     return builder.bitcast(builder.or_(low, builder.shl(high, half_word)), simd.VECTOR_IR)
 
 

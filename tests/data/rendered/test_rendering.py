@@ -18,7 +18,7 @@ from skimage.feature import corner_peaks
 from support import SMALL, strict_json, waited_for
 
 from completesplat.data.co3d.annotations import read_frames
-from completesplat.data.images.files import read_depth
+from completesplat.data.co3d.depth_maps import read_depth
 from completesplat.data.rendered.random_scenes import PAINTS
 from completesplat.data.rendered.rendering import RenderedDataModule, render
 from completesplat.errors import CompleteSplatError

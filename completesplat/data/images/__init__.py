@@ -1,1 +1,0 @@
-"""Conversion of image files to square tensors: reading, orientation, cropping and hidden regions."""

@@ -1,0 +1,183 @@
+"""Summary of a sweep: a table of its settings over seeds, as in the paper."""
+
+import logging
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+from hydra.core.utils import JobReturn
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+
+from completesplat.evaluation import tables
+from completesplat.evaluation.provenance import machine, shell_command
+from completesplat.evaluation.records import MODEL, UPPER_BOUND, Record
+from completesplat.evaluation.score_tables import Entry, formats_of, group_by_protocol, score_rows
+from completesplat.evaluation.sweep_jobs import SEED, Job, collect
+from completesplat.files import printable
+
+# Hydra imports this file for every run, even to print the help. So torch and rich are imported when a job has ended.
+log = logging.getLogger(__name__)
+
+CAPTION = (
+    "Mean ± sample standard deviation over seeds; PSNR in dB. "
+    f"The best of our rows is in bold, the second best underlined. {tables.SSIM_NOTE}"
+)
+PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
+IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
+
+
+class SweepSummary(Callback):
+    """Hydra callback that rewrites a sweep's summary after every job and prints it after the last.
+
+    Thus a sweep that is killed, or whose jobs fail, has a summary too, although hydra does not call `on_multirun_end`
+    for it. If a summary cannot be written, a warning states the reason, and the sweep continues.
+    """
+
+    def on_job_end(self, config: Any, job_return: JobReturn, **kwargs: object) -> None:
+        """Rewrite the summary, whether the job finished or failed; do nothing outside a sweep."""
+        if config.hydra.mode == RunMode.MULTIRUN:
+            _summarize(config, last=False)
+
+    def on_multirun_end(self, config: Any, **kwargs: object) -> None:
+        """Write the summary again, because jobs that end together may miss each other; print it and its path."""
+        _summarize(config, last=True)
+
+
+def _summarize(config: Any, last: bool) -> None:
+    try:
+        folder = Path(config.hydra.sweep.dir)
+        table = write_summary(folder)
+        if last:
+            tables.show(table, width=160)
+            print(folder / "summary.md")
+    except Exception as error:  # no error of a summary may stop the remaining jobs
+        log.warning("no summary of the sweep: %s: %s", type(error).__name__, error)
+
+
+def sweep_rows(finished: Sequence[Job]) -> list[Entry]:
+    """Return means over seeds for each setting, sorted by label, and then for the naive predictors.
+
+    A score that was not measured in all jobs is left out, because a mean over fewer seeds than the row states would
+    mislead.
+    """
+    settings: dict[frozenset[tuple[str, str]], dict[object, Job]] = {}
+    for job in finished:
+        shared = frozenset((key, value) for key, value in job.overrides.items() if key != SEED)
+        # An extended sweep may repeat the default seed as seed=N.
+        seed = job.overrides.get(SEED, str(job.config.get(SEED)))
+        settings.setdefault(shared, {})[seed] = job
+    ours = []
+    for by_seed in settings.values():
+        jobs = list(by_seed.values())
+        ours.append(_row(jobs[0].label, jobs))
+    naive = dict.fromkeys(predictor for job in finished for predictor in job.test if predictor != MODEL)
+    rows = sorted(ours, key=_order)
+    return [*rows, *(_row(name, [job for job in finished if name in job.test], name) for name in naive)]
+
+
+def _order(row: Entry) -> list[tuple[bool, str]]:
+    """Return a key that sorts labels alphabetically by their parts, the unchanged method last."""
+    return [(part == PROPOSED, part) for part in row.label.split(", ")]
+
+
+def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> Entry:
+    by_job = [job.test.get(predictor, {}) for job in jobs]
+    names = [name for name in by_job[0] if "_novel_" in name or "_reference_" in name]  # of views, not of the run
+    scores = {name: [x[name] for x in by_job] for name in names if all(name in x for x in by_job)}
+    row = Entry(
+        label,
+        {name: fmean(values) for name, values in scores.items()},
+        _common(int(table["scenes"]) for table in by_job if table),
+        predictor,
+        upper_bound=any(table.get(UPPER_BOUND) for table in by_job),
+        protocol=jobs[0].protocol,
+    )
+    if predictor != MODEL:
+        return row
+    deviations = {name: _deviation(values) for name, values in scores.items()} if len(jobs) > 1 else {}
+    return replace(row, seeds=len(jobs), steps=_common(job.steps for job in jobs), deviations=deviations)
+
+
+def _deviation(values: Sequence[float]) -> float:
+    """Return the sample standard deviation; NaN if a value is infinite."""
+    return stdev(values) if all(map(math.isfinite, values)) else math.nan
+
+
+def _common(values: Iterable[int]) -> int | str | None:
+    """Return the number if all are equal, else all different ones, such as `40/38`."""
+    different = list(dict.fromkeys(values))
+    return different[0] if len(different) == 1 else "/".join(map(str, different)) or None
+
+
+def summarize(*folders: Path) -> tuple[list[Entry], tables.Table]:
+    """Return rows and table of the jobs in a sweep's folder, or in its parts on several machines, finished or not.
+
+    One seed has no standard deviation.
+    """
+    jobs = collect(*folders)
+    finished = [job for job in jobs if job.finished]
+    alike = len(group_by_protocol((job, job.protocol) for job in finished if job.protocol)) < 2
+    rows = [row for row in sweep_rows(finished) if alike or row.seeds is not None]
+    formats = formats_of(rows)
+    names = [name for name in tables.shown_scores(formats) if any(name in row.scores for row in rows)]
+    columns = [(name, None) for name in names]
+    body = score_rows(rows, ("method", "seeds", "scenes"), columns, tables.Notes(), marked=alike)
+    headings = [tables.Heading("ablation", figures=False), tables.Heading("seeds"), tables.Heading("scenes")]
+    for name in names:
+        headings.append(tables.score_heading(name, formats[tables.metric_of(name)]))
+    remarks = [CAPTION if rows else "No job of this sweep has finished.", *_progress_remarks(jobs)]
+    if not alike:
+        remarks.append("Not all jobs were tested alike (data, resolution, scenes), and do not compare.")
+    for row in rows:
+        if row.upper_bound:
+            remarks.append(f"{row.label} has seen the views that it is scored on.")
+    remarks += _program_remarks([job.record for job in jobs if job.record])
+    return rows, tables.Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
+
+
+def _progress_remarks(jobs: Sequence[Job]) -> list[str]:
+    unfinished = [printable(job.name) for job in jobs if not job.finished]
+    remarks = [f"{len(jobs) - len(unfinished)} of {len(jobs)} started jobs have finished."]
+    if unfinished:
+        remarks.append(f"Not finished: {'; '.join(unfinished)}.")
+    return remarks
+
+
+def _program_remarks(records: Sequence[Record]) -> list[str]:
+    remarks = []
+    commits = list(dict.fromkeys(record["commit"] or "unknown" for record in records))
+    if set(commits) - {"unknown"}:
+        remarks.append(f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}.")
+    here = machine()
+    gpu = f", {here['gpu']}" if "gpu" in here else ""
+    hardware = f"{here['processor']}, {here['cores']} cores{gpu}"
+    software = f"{here['system']}, Python {here['python']}, torch {here['torch']}"
+    remarks.append(f"Summary of {here['date']}, made on {hardware}, {software}.")
+    for command in dict.fromkeys(shell_command(record["command"]) for record in records):
+        remarks.append(f"Command: {command}")
+    return remarks
+
+
+def write_summary(folder: Path, *parts: Path) -> tables.Table:
+    """Write `summary.csv` (all metrics), `summary.md` and `summary.tex`; return the table.
+
+    `parts` are the folders of one sweep on several machines; the files then cover all of them.
+    """
+    rows, table = summarize(*(parts or [folder]))
+    names = list(dict.fromkeys(name for row in rows for name in row.scores))
+    header = list(IDENTITY)
+    for name in names:
+        header += [f"{name}_mean", f"{name}_deviation"]
+    lines = []
+    for row in rows:
+        line: list[object] = [row.label, row.seeds, row.scenes, row.steps, row.upper_bound]
+        for name in names:
+            line += [row.scores.get(name), row.deviations.get(name)]
+        lines.append(line)
+    tables.write_csv(folder / "summary.csv", header, lines)
+    tables.write_documents([table], folder / "summary")
+    return table

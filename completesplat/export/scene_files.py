@@ -1,0 +1,108 @@
+"""Files of one scene: splats in several formats, and videos."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.export.cleaning import with_screen_space_dilation
+from completesplat.export.formats import suffix as format_suffix
+from completesplat.export.formats import write_format
+from completesplat.export.mesh import check_available
+from completesplat.export.placed_scene import PlacedScene, on_optical_axis
+from completesplat.export.splat_transform import PageView
+from completesplat.export.video import render_views, write_video
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, transform_points
+from completesplat.geometry.trajectories import PATHS
+from completesplat.quantities import CameraPath, Format
+from completesplat.rasterizers import Rasterizer
+
+
+@dataclass(frozen=True)
+class OutputFiles:
+    """Selection of the files that are written for each scene.
+
+    Raises:
+        CompleteSplatError: a format needs a package that is missing.
+
+    Args:
+        formats: scene formats; some need `find_splat_transform`.
+        videos: camera paths; each video has `frames` frames.
+        background: grey value behind the scene.
+        maps: whether a prediction gets the depth, normals and opacity of the photo's view.
+        screen_space_dilation: whether to store Gaussians `with_screen_space_dilation`.
+    """
+
+    formats: Sequence[Format] = ("ply",)
+    videos: Sequence[CameraPath] = ("orbit",)
+    frames: int = 48
+    background: float = 0.5
+    maps: bool = False
+    screen_space_dilation: bool = True
+
+    def __post_init__(self) -> None:
+        if "mesh" in self.formats:
+            check_available()
+
+
+def write_scene(
+    folder: Path,
+    name: str,
+    suffix: str,
+    scene: PlacedScene,
+    rasterizer: Rasterizer,
+    outputs: OutputFiles,
+    comments: Sequence[str],
+    on_file: Callable[[str], None] = lambda name: None,
+) -> dict[str, str]:
+    """Write a scene's splats (`NAME.ply`, ...) in the coordinates of files, and videos (`orbitSUFFIX.mp4`).
+
+    Args:
+        comments: lines of metadata for formats that have them.
+        on_file: called with the name of each file before it is written.
+
+    Returns:
+        File names by purpose.
+    """
+    gaussians = scene.gaussians
+    pivot = pivot_of(scene, rasterizer)
+    dilated = with_screen_space_dilation(gaussians, scene.camera) if outputs.screen_space_dilation else gaussians
+    stored = scene.coordinates.gaussians(dilated)
+    camera = scene.coordinates.camera(scene.camera)
+    view = PageView(camera, scene.coordinates.points(pivot), scene.up, outputs.background)
+    files: dict[str, str] = {}
+    for kind in outputs.formats:
+        on_file(name + format_suffix(kind))
+        files.update(write_format(folder, name, kind, stored, view, comments, rasterizer))
+    for path in outputs.videos:
+        video = f"{path}{suffix}.mp4"
+        on_file(video)
+        cameras = PATHS[path](scene.camera, pivot, scene.up, outputs.frames)
+        frames, _ = render_views(rasterizer, gaussians, cameras, outputs.background)
+        write_video(folder / video, frames)
+        files[f"{path}{suffix}"] = video
+    return files
+
+
+def pivot_of(scene: PlacedScene, rasterizer: Rasterizer) -> Float[Tensor, "3"]:
+    """Return the point around which orbits of a scene turn: the known one, or the `seen_center`."""
+    return seen_center(rasterizer, scene.gaussians, scene.camera) if scene.pivot is None else scene.pivot
+
+
+@torch.no_grad()
+def seen_center(rasterizer: Rasterizer, gaussians: Gaussians, camera: Cameras) -> Float[Tensor, "3"]:
+    """Return the point on the optical axis at the median depth of the image's central ninth.
+
+    If nothing is seen in the central ninth, the median depth of all Gaussians is used.
+    """
+    depth = rasterizer(gaussians[None], camera[None][None]).expected_depth()[0, 0, 0]
+    height, width = depth.shape
+    center = depth[height // 3 : height - height // 3, width // 3 : width - width // 3]
+    seen = center[center > 0]
+    if len(seen) == 0:
+        seen = transform_points(camera.world_to_camera, gaussians.means)[:, 2]
+    return on_optical_axis(camera, seen.median())

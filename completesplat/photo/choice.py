@@ -1,0 +1,107 @@
+"""Choice of the weights in the package that are likeliest for photos."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.errors import ImageError, WeightsError
+from completesplat.files import printable
+from completesplat.photo.features import distance_to_training
+from completesplat.photo.reading import Framing, ImageLike, read_square
+from completesplat.weights import CONFIG_FILE, read_small, shipped
+
+LOOKED_AT = 8  # images of many that weights are chosen by
+SAME_GREY = 0.1  # largest difference of a border's pixel from the background
+BACKGROUND_SHARE = 0.5  # of the border's pixels, at least, if an object lies on the background
+
+
+class Match(NamedTuple):
+    """How an image fits weights: the probability that it is of their kind, and `distance_to_training`."""
+
+    probability: float
+    distance: float
+
+
+def likeliest_weights(images: Sequence[Path], remove_background: bool) -> tuple[str, str]:
+    """Return the name of the likeliest shipped weights for `LOOKED_AT` of the images, and the reason as a clause.
+
+    Without an image, they are those for photos of anything.
+
+    Raises:
+        WeightsError: the package has no weights.
+    """
+    if not shipped():
+        raise WeightsError("weights=auto: this package has no weights; give weights=DIR")
+    sums = Counter[str]()
+    names = list[str]()
+    step = math.ceil(len(images) / LOOKED_AT) or 1
+    for image in images[::step]:
+        with suppress(ImageError, OSError):  # which ends the prediction of this image alone, when its turn comes
+            sums.update({name: match.probability for name, match in match_shipped(image, remove_background).items()})
+            names.append(printable(image.name))
+    if not names:
+        return _without_images(bool(images))
+    shares = [f"{name} {total / len(names):.0%}" for name, total in sums.most_common()]
+    shares += [f"{name} needs a plain background" for name in shipped() if name not in sums]
+    whose = names[0] if len(images) == 1 else f"{len(names)} of {len(images)} images"
+    return sums.most_common(1)[0][0], f"; likeliest for {whose} ({', '.join(shares)})"
+
+
+def _without_images(unreadable: bool) -> tuple[str, str]:
+    name, *others = shipped_configs()
+    why = "no image can be read" if unreadable else "there is no image to choose by"
+    return name, f"; {why} (weights=NAME takes others: {', '.join(others)})"
+
+
+def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str, Match]:
+    """Return how an image fits the weights in the package, the likeliest first.
+
+    Training images are taken as normally distributed, with `log_odds` before the image is seen. Distances depend on the
+    resolution, so the image, which is read once, is resized for each model. Weights of objects on one background are
+    left out if the image's border does not show it.
+
+    Raises:
+        CompleteSplatError: as `read_square`.
+    """
+    configs = shipped_configs()
+    largest = max((config["image_size"] for config in configs.values()), default=1)
+    square = read_square(image, Framing(largest, whole_object=True), remove_background=remove_background).image
+    distances = dict[str, float]()
+    logarithms = list[float]()
+    for name, config in configs.items():
+        training = config["training"]
+        background = training.get("background")
+        if background is not None and not _lies_on(background, square):
+            continue
+        distance = distance_to_training(read_square(square, Framing(config["image_size"])).image, training)
+        if distance is not None:
+            deviations = torch.tensor(training["picture_std"])
+            density = -deviations.log().sum().item() - len(deviations) * distance**2 / 2
+            distances[name] = distance
+            logarithms.append(density + training.get("log_odds", 0.0))
+    probabilities = torch.tensor(logarithms, dtype=torch.float64).softmax(0).tolist()
+    matches = {name: Match(share, distances[name]) for name, share in zip(distances, probabilities, strict=True)}
+    return dict(sorted(matches.items(), key=lambda item: -item[1].probability))
+
+
+def shipped_configs() -> dict[str, Any]:
+    """Return the configs of the weights in the package by name, those for photos of anything first."""
+    configs = {name: json.loads(read_small(folder / CONFIG_FILE)) for name, folder in shipped().items()}
+    return dict(sorted(configs.items(), key=lambda item: "log_odds" in item[1]["training"]))
+
+
+def _lies_on(background: float, square: Float[Tensor, "3 size size"]) -> bool:
+    """Return whether at least half of an image's border has about this grey value."""
+    rows = square[:, [0, -1]].flatten(1)
+    columns = square[:, :, [0, -1]].flatten(1)
+    border = torch.cat([rows, columns], dim=1)
+    same = (border - background).abs().amax(0) < SAME_GREY
+    return same.float().mean().item() >= BACKGROUND_SHARE
