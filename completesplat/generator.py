@@ -11,16 +11,17 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import Features, Images
 from completesplat.autoreconstructor.model import DepthRange, VariationalAutoReconstructor
 from completesplat.baselines.splatter_image.model import PublishedModel, is_published
-from completesplat.diffusion.guidance import Denoise, Latents, allowed_skip_weight, in_bfloat16
+from completesplat.diffusion.guidance import Denoise, Latents, allowed_skip_weight
 from completesplat.diffusion.sampling import (
     PART,
     Sampler,
     draw_noise,
+    in_bfloat16,
     in_parts,
     one_thread_each,
     part_of,
@@ -29,14 +30,16 @@ from completesplat.diffusion.sampling import (
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.parts import PartConfig, build, check_architecture, stored_config
-from completesplat.run_configs import read_run, read_weights
 from completesplat.scene import Views
 from completesplat.scene_model import DEFAULT_SAMPLING, OnScenes, Sampling, SceneModel, Visible
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import concatenate, in_float32
-from completesplat.weights import WEIGHTS_FILE, first_line, locate
+from completesplat.weights import first_line
+from completesplat.weights.allowed import PartConfig, check_architecture, class_of, stored_config
 from completesplat.weights.checkpoint_reading import mismatch, not_finite
+from completesplat.weights.opening import StoredModel, read_model
+
+NETWORKS = ("autoreconstructor", "conditioning", "denoiser", "network")  # parts of models that have weights
 
 
 class CompleteSplat(SceneModel):
@@ -48,10 +51,10 @@ class CompleteSplat(SceneModel):
     Args:
         autoreconstructor, conditioning, denoiser, sampler: configs of the parts.
         image_size: side of the square images, in pixels.
-        training: facts about the training images (`completesplat.parts.TrainingImages`).
+        training: facts about the training images (`completesplat.weights.allowed.TrainingImages`).
 
     Raises:
-        WeightsError: a config has a part or an option that weights may not name (`completesplat.parts`).
+        WeightsError: a config has a part or an option that weights may not name (`completesplat.weights.allowed`).
     """
 
     latent_mean: Tensor
@@ -161,7 +164,7 @@ class CompleteSplat(SceneModel):
 
         Raises:
             WeightsError: files are missing, unreadable, changed, not finite, do not belong together, or name parts that
-                `completesplat.run_configs.check_names` does not allow; or the run's model makes no scene from a photo.
+                `completesplat.weights.allowed` does not list; or the run's model makes no scene from a photo.
         """
         try:
             model = _opened(path, trust)
@@ -272,20 +275,46 @@ def _architecture(
     parts: Mapping[str, PartConfig], image_size: int, training: Mapping[str, object] | None
 ) -> dict[str, Any]:
     """Return a model's config as weights store it; raise WeightsError for parts that weights may not name."""
-    config: dict[str, Any] = {name: stored_config(part) for name, part in parts.items()} | {"image_size": image_size}
-    config |= {} if training is None else {"training": dict(training)}
+    config: dict[str, Any] = {name: stored_config(part) for name, part in parts.items()}
+    config["image_size"] = image_size
+    if training is not None:
+        config["training"] = dict(training)
     check_architecture(config)
     return config
 
 
-def _opened(path: Path | str, trust: bool) -> SceneModel:
-    if is_published(path):
-        return PublishedModel(str(path))
-    file = locate(path)
-    architecture, tensors = (read_weights if file.name == WEIGHTS_FILE else read_run)(file, trust)
-    model: SceneModel = (DeterministicModel if "network" in architecture else CompleteSplat)(**architecture)
-    if (difference := mismatch(model.state_dict(), tensors)) is not None:
+def build(part: Any) -> Any:
+    """Build a part, and the parts in it, from a config that `check_architecture` has accepted."""
+    if isinstance(part, list):
+        return [build(value) for value in part]
+    if not isinstance(part, Mapping):
+        return part
+    settings = {name: build(value) for name, value in part.items() if name != "_target_"}
+    return class_of(part)(**settings) if "_target_" in part else settings
+
+
+def _opened(weights: Path | str, trust: bool) -> SceneModel:
+    if is_published(weights):
+        return PublishedModel(str(weights))
+    stored = read_model(weights, trust)
+    _check_sizes(stored)
+    kind = DeterministicModel if "network" in stored.architecture else CompleteSplat
+    model: SceneModel = kind(**stored.architecture)
+    difference = mismatch(model.state_dict(), stored.tensors)
+    if difference is not None:
         raise ValueError(difference)
-    model.load_state_dict(tensors)
-    model.file = file
+    model.load_state_dict(stored.tensors)
+    model.file = stored.tensor_file
     return model
+
+
+def _check_sizes(stored: StoredModel) -> None:
+    """Raise WeightsError, before the networks take memory, if a tensor of theirs is missing or has another size."""
+    with torch.device("meta"):  # tensors with sizes but without memory
+        parts = {name: build(stored.architecture[name]) for name in NETWORKS if name in stored.architecture}
+        networks = nn.ModuleDict(parts)
+    for name, value in networks.state_dict().items():
+        actual = list(stored.tensors[name].shape) if name in stored.tensors else "missing"
+        if actual != list(value.shape):
+            places = f"in {stored.tensor_file.name} and {list(value.shape)} by {stored.config_file.name}"
+            raise WeightsError(f"{name} is {actual} {places}")

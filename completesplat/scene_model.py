@@ -261,7 +261,7 @@ class SceneModel(nn.Module):
 
     @property
     def framing(self) -> Framing:
-        """How photos are framed for this model, which is how its training images were.
+        """Return how photos are framed for this model, which is how its training images were.
 
         The central square is enlarged where a cut-out or transparent object reaches beyond it. A model of objects on a
         background gets such an object on it, as large as in training. It takes every image as of its training's field
@@ -310,11 +310,3 @@ class SceneModel(nn.Module):
         write_bytes(folder / WEIGHTS_FILE, save(weights))  # safetensors' own files are readable by their owner alone
         write_text(folder / CONFIG_FILE, json.dumps(self.architecture, indent=2) + "\n")
         write_sums(folder)
-
-
-def camera_tensors(camera: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return a training set's typical camera as tensors of a `SceneModel`; raise WeightsError if one is not known."""
-    try:
-        return {name: torch.tensor(camera[name], dtype=torch.float32) for name in ("fov_degrees", "depth_range", "up")}
-    except (KeyError, TypeError, ValueError) as error:
-        raise WeightsError("the training set's typical camera is not known") from error

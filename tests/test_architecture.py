@@ -23,7 +23,7 @@ TREES = {path: ast.parse(text, path) for path, text in FILES.items()}
 LAYERS = """
     imports version errors quantities signals files settings ply_files weights tensors
     geometry gaussians splatter_image scene rasterizers
-    photo data autoreconstructor diffusion losses metrics scene_model baselines parts run_configs generator export
+    photo data autoreconstructor diffusion losses metrics scene_model baselines generator export
     evaluation training viewer commands cli
     benchmarks
 """

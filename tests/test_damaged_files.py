@@ -92,13 +92,8 @@ Y = "config_hydrants.yaml"
 P = "model_hydrants.pth"
 CALL = b"model: !!python/object/apply:pathlib.Path.touch [called]"
 PUBLISHED = [
-    Refused(published(data={"input_images": 2}), WeightsError, Y, "data.input_images is 2"),
-    Refused(published(cam_embd={"embedding": "pose"}), WeightsError, Y, "cam_embd.embedding is pose"),
-    Refused(published(model={"name": "TwoUNets"}), WeightsError, Y, "model.name is TwoUNets"),
-    Refused(published(model={"max_sh_degree": 0}), WeightsError, Y, "model.max_sh_degree is 0"),
     Refused(published(model={"base_dim": 10**6}), WeightsError, Y, "model.base_dim is 1000000"),
     Refused(published(data={"training_resolution": None}), WeightsError, Y, "data.training_resolution is None"),
-    Refused(published(data={"znear": 5.0}), WeightsError, Y, "data.znear must be below data.zfar"),
     Refused(content(Y, CALL), WeightsError, Y, "not readable as YAML"),
     Refused(content(Y, b"a: &a [1, 2]\nb: [*a, *a]"), WeightsError, Y, "has aliases"),
     Refused(content(Y, b"just text"), WeightsError, Y, "data.training_resolution is None"),

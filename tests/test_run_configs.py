@@ -13,9 +13,12 @@ from support import compose_config
 from completesplat.commands import conf_folder
 from completesplat.commands.jobs import use_working_folder
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.run_configs import GROUPS, config_of_run
-from completesplat.settings.checks import start_weights
+from completesplat.settings.checks import START_WEIGHTS
 from completesplat.settings.schema import arguments_of
+from completesplat.weights.allowed import GROUPS_OF_RUNS, GROUPS_OF_WEIGHTS, listed_parts
+from completesplat.weights.runs import config_of_run
+
+GROUPS = {*GROUPS_OF_RUNS, *GROUPS_OF_WEIGHTS}
 
 MINE = """
 import json
@@ -166,17 +169,19 @@ def test_parts_that_have_moved_are_found_by_their_names(run, elsewhere):
         with pytest.raises(WeightsError, match=f"names {target}, "):
             configuration(run)
     targets = {path for group in GROUPS for file in (conf_folder() / group).glob("*.yaml") for path in named_in(file)}
-    assert len({path.rpartition(".")[2] for path in targets}) == len(targets) > 40
+    assert {part.path for part in listed_parts().values()} == targets
+    assert len(listed_parts()) == len(targets) > 40
 
 
 def named_in(file):
     return re.findall(r"_target_: (\w[\w.]+)", file.read_text())
 
 
-def test_settings_of_weights_to_start_from_are_declared_by_their_classes():
+def test_settings_of_weights_to_start_from_have_the_same_names_in_all_parts():
+    settings = set()
     for kind in {get_object(path) for file in conf_folder().glob("*/*.yaml") for path in named_in(file)}:
-        settings = {name for name in arguments_of(kind)[0] if name == "pretrained" or name.endswith("checkpoint")}
-        assert settings == start_weights(kind).keys(), kind
+        settings |= {name for name in arguments_of(kind)[0] if name == "pretrained" or name.endswith("checkpoint")}
+    assert settings == START_WEIGHTS.keys()
 
 
 def test_what_the_user_changes_may_name_anything_and_what_the_package_offers_needs_no_trust(run, elsewhere):

@@ -51,9 +51,6 @@ class Encoder(nn.Module):
             noise of standard deviation 1 hides what the latents encode at first.
     """
 
-    halves_images = True
-    """Whether each level of `channels` but the last halves the sides of what the network gets."""
-
     def __init__(
         self,
         channels: Widths = (128, 256, 512, 512),

@@ -1,8 +1,6 @@
 """Variational AutoReconstructor as one module."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -37,9 +35,6 @@ class ReconstructionModel(nn.Module):
     sees_views = False
     """Whether the posterior depends on views other than the reference."""
 
-    start_weights: ClassVar[Mapping[str, str]] = {}
-    """Settings of the weights that training starts from, each with an example."""
-
 
 class VariationalAutoReconstructor(ReconstructionModel):
     """Encoder and reconstructor (paper, Section 3.2 and Figure 3).
@@ -60,8 +55,6 @@ class VariationalAutoReconstructor(ReconstructionModel):
     Raises:
         WeightsError: the pretrained weights are missing, damaged or of another size.
     """
-
-    start_weights: ClassVar = {"pretrained": "CompVis/stable-diffusion-v1-4, or null for random weights"}
 
     def __init__(
         self,

@@ -33,8 +33,6 @@ class SplatterImageUNet(ReconstructionModel):
         gradient_checkpointing: recompute the residual blocks' activations in the backward pass.
     """
 
-    halves_images = True
-
     def __init__(
         self,
         parameterization: Parameterization,

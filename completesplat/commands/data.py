@@ -103,10 +103,10 @@ def latents(
     from lightning import Fabric
 
     from completesplat.autoreconstructor.model import VariationalAutoReconstructor
-    from completesplat.run_configs import config_of_run
     from completesplat.training.encoding import FrameEncoder, encode_training_set
     from completesplat.training.stopping import stopped_together
     from completesplat.weights.checkpoint_reading import load_part
+    from completesplat.weights.runs import config_of_run
 
     ckpt = Path(ckpt, RUN_CHECKPOINT) if Path(ckpt).is_dir() else Path(ckpt)
     run_config = config_of_run(ckpt, list(overrides), trust)

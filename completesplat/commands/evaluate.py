@@ -16,7 +16,7 @@ from rich.progress import track
 
 from completesplat.commands import quieten
 from completesplat.commands.jobs import CONFIG, METRICS
-from completesplat.commands.trained import TrainedModel
+from completesplat.commands.trained import GivenScenes, RunCheckpoint, trained_model
 from completesplat.evaluation.mode_benchmark import (
     HiddenModesEvaluation,
     describe_mode_test,
@@ -54,7 +54,7 @@ def run(
     Args:
         evaluation, trainer, logger: configs of the protocol, the trainer (without precision), loggers by name.
     """
-    tested = TrainedModel(**trained)
+    tested = trained_model(**trained)
     run_config = tested.configuration()
     quieten()
     seed_everything(tested.seed, verbose=False)
@@ -71,20 +71,21 @@ def run(
         described = describe_test(evaluation, module, data, scores, out) | tested.facts()
         results = {PROTOCOL: described, **scores}
         write_json(out / METRICS, results)
-    show(evaluation_table(results, MODEL if tested.scenes is None else module.method), width=160)
+    label = module.method if isinstance(tested, GivenScenes) else MODEL
+    show(evaluation_table(results, label), width=160)
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")
-    left_out = metrics_left_out(tested.ckpt, evaluation)
+    left_out = metrics_left_out(tested.checkpoint if isinstance(tested, RunCheckpoint) else None, evaluation)
     if left_out:
         print(f"metrics of the run are left out; give them again: {shlex.join(left_out)}")
 
 
-def metrics_left_out(ckpt: str | None, evaluation: Config) -> list[str]:
+def metrics_left_out(checkpoint: Path | None, evaluation: Config) -> list[str]:
     """Return the overrides by which a checkpoint's run was given metrics that the evaluation lacks."""
-    if ckpt is None:
+    if checkpoint is None:
         return []
     overrides = []
-    for override in map(printable, read_record(Path(ckpt).absolute().parents[1]).get("overrides", [])):
+    for override in map(printable, read_record(checkpoint.absolute().parents[1]).get("overrides", [])):
         named = METRIC.match(override)
         if named is not None and named[1] not in evaluation["metrics"]:
             overrides.append(override)
@@ -103,7 +104,7 @@ def run_hidden_modes(
     Args:
         trainer: only its `accelerator` has an effect; "cpu" leaves a GPU alone.
     """
-    tested = TrainedModel(**trained)
+    tested = trained_model(**trained)
     quieten()
     module, data = tested.open()
     data.prepare_data()
@@ -122,6 +123,7 @@ def run_hidden_modes(
         for each in loggers:
             each.log_metrics(scores, step=0)
             each.save()
-    show(mode_results_table(results, MODEL if tested.scenes is None else module.method), width=140)
+    label = module.method if isinstance(tested, GivenScenes) else MODEL
+    show(mode_results_table(results, label), width=140)
     if measured.skipped:
         print(f"{counted(len(measured.skipped), 'scene')} skipped; the first: {measured.skipped[0]}")

@@ -27,7 +27,6 @@ from completesplat.evaluation.scorer import Scorer
 from completesplat.evaluation.tables import show
 from completesplat.files import counted, write_json
 from completesplat.settings import checks
-from completesplat.settings.schema import start_weights
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.stage import Stage
@@ -151,9 +150,7 @@ def refuse_without_effect(config: DictConfig, out: Path) -> None:
 
 def refuse_missing(config: DictConfig) -> None:
     """Raise CompleteSplatError, with an example, for a setting of data or model that is missing or an empty text."""
-    examples = {"root": "DIR"}
-    for _, kind in checks.each_part(config.model):
-        examples |= start_weights(kind)
+    examples = {"root": "DIR"} | checks.START_WEIGHTS
     missing = [key for part in (config.data, config.model) for key in sorted(OmegaConf.missing_keys(part))]
     missing += [f"model.{key}" for key in sorted(examples) if config.model.get(key) == ""]
     for key in missing[:1]:

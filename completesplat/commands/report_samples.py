@@ -1,19 +1,19 @@
 """`completesplat report`: studies of a trained model's samples.
 
-Each study raises the errors of `TrainedModel.open`, `diffusion_of`, `first_scenes` and the functions of its module in
-`completesplat.evaluation.studies`.
+Each study raises the errors of `trained_model`, `TrainedModel.open`, `diffusion_of`, `first_scenes` and the functions
+of its module in `completesplat.evaluation.studies`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, NotRequired, Unpack
+from typing import Annotated, Any, NotRequired, Unpack
 
 import torch
 from rich.console import Console
 
 from completesplat.commands import quieten
-from completesplat.commands.trained import TrainedModel, diffusion_of
+from completesplat.commands.trained import diffusion_of, trained_model
 from completesplat.evaluation.studies.calibration import calibration_rows, plot_calibration
 from completesplat.evaluation.studies.controls import OnProgress, controls_rows, controls_strips, grid, plot_controls
 from completesplat.evaluation.studies.depth import depth_rows, depth_strips
@@ -30,7 +30,7 @@ Weights = Annotated[Sequence[Share], Entries(1)]
 
 
 class Run(ModelSettings):
-    """Arguments of `TrainedModel`, number of test scenes (the first ones), and number of samples of each scene."""
+    """Arguments of `trained_model`, number of test scenes (the first ones), and number of samples of each scene."""
 
     data: NotRequired[Mapping[str, object]]
     rasterizer: Mapping[str, object]
@@ -108,8 +108,8 @@ def _report(path: Path, title: str, rows: Sequence[Mapping[str, object]], run: R
 def _opened(run: Run) -> Iterator[tuple[SampleRenderer, list[SceneBatch], OnProgress]]:
     """Yield renderer and first test scenes (on a GPU if there is one), and a status."""
     quieten()
-    model = run["ckpt"], run["overrides"], run["trust"], run["weights"]
-    stage, data = TrainedModel(*model, data=run.get("data"), rasterizer=run["rasterizer"], seed=run["seed"]).open()
+    settings: Any = {name: value for name, value in run.items() if name not in ("scenes", "samples")}
+    stage, data = trained_model(**settings).open()
     stage = stage.to("cuda" if torch.cuda.is_available() else "cpu").eval()
     scenes = [scene.to(stage.device) for scene in first_scenes(data, run["scenes"])]
     renderer = SampleRenderer(diffusion_of(stage), stage.rasterizer, stage.background, run["samples"], run["seed"])

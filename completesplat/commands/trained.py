@@ -1,11 +1,12 @@
 """Models for commands, from a run's checkpoint, from weights or from files of scenes, and the data to use with them."""
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -15,12 +16,13 @@ from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.provenance import checkpoint_facts
 from completesplat.generator import CompleteSplat
 from completesplat.photo.choice import likeliest_weights
-from completesplat.run_configs import config_of_run
 from completesplat.scene_model import SceneModel
 from completesplat.settings.checks import REMOVE
+from completesplat.settings.schema import TestSettings
 from completesplat.tensors import used_device
 from completesplat.weights import AUTO, RUN_CHECKPOINT, sha256_of, shipped
 from completesplat.weights.checkpoint_reading import load_part
+from completesplat.weights.runs import config_of_run
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
@@ -31,106 +33,206 @@ logger = logging.getLogger(__name__)
 WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no effect"
 
 
-@dataclass(frozen=True)
-class TrainedModel:
-    """A model with its data: a run's checkpoint, weights, or files of scenes that any program wrote.
+class TrainedModel(ABC):
+    """A model to test, with the data to test it on.
 
-    `conf/test.yaml` explains the arguments; with `ckpt`, those of its run replace `data` and `rasterizer`.
-    `check_names` explains what configs of runs and weights may name, and when they need `trust`.
+    Its kinds: the checkpoint of a run (`RunCheckpoint`), weights (`GivenWeights`), and files of scenes that any program
+    wrote (`GivenScenes`). `trained_model` chooses one of them.
     """
 
-    ckpt: str | None
-    overrides: Sequence[str] = ()
-    trust: bool = False
-    weights: str | None = None
-    scenes: str | None = None
-    frame: str = "opencv"
-    align: str = "none"
-    method: str | None = None
-    data: Mapping[str, object] | None = None
-    rasterizer: Mapping[str, object] | None = None
-    sampler: Mapping[str, object] | None = None
-    seed: int = 0
+    seed: int
+    sampler: Mapping[str, object] | None
 
-    def __post_init__(self) -> None:
-        if self.ckpt is not None and Path(self.ckpt).is_dir():
-            object.__setattr__(self, "ckpt", str(Path(self.ckpt, RUN_CHECKPOINT)))
-
-    @cached_property
-    def model(self) -> SceneModel:
-        return CompleteSplat.from_pretrained(str(self.weights), self.trust)
-
-    @cached_property
-    def files(self) -> "SceneFiles":
-        from completesplat.evaluation.scene_files import SceneFiles
-
-        rendering = self._rendering((self.data or {}).get("background"))
-        return SceneFiles(str(self.scenes), self.frame, self.align, self.method, **rendering)
-
+    @abstractmethod
     def configuration(self) -> Any:
-        """Return the config of the data, and with `ckpt` also of the model.
+        """Return the config of the data, and for a run also of the model.
 
         Raises:
             WeightsError: the checkpoint, its run's config or the weights are missing or not trusted.
-            CompleteSplatError: not exactly one of them is given, or data are missing, superfluous or unsuitable.
+            CompleteSplatError: the data are unsuitable.
         """
-        check_one_model(self.ckpt, self.weights, self.scenes)
-        if self.scenes is None and (self.frame, self.align, self.method) != ("opencv", "none", None):
-            raise CompleteSplatError("frame, align, method: these apply to files only; give scenes=DIR")
-        if self.ckpt is None and self.overrides:
-            raise CompleteSplatError("overrides change a run's settings: give ckpt=FILE, or else data.KEY=VALUE")
-        if self.ckpt is not None and self.data is not None:
-            raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
-        if self.ckpt is not None:
-            config = config_of_run(Path(self.ckpt), list(self.overrides), self.trust)
-            if "scene_folder" in config.model:
-                config.model.scene_folder = None  # the run's own, whose scene stays as it is
-            return config
-        if self.data is None:
-            raise CompleteSplatError("weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR")
-        config = OmegaConf.create({"seed": self.seed, "data": self.data})
-        if self.weights is not None:
-            config.data.update(self.model.needed_of_data(config.data))
-        return config
+
+    @abstractmethod
+    def scorer(self, configuration: Any) -> "Scorer":
+        """Return the scorer with its weights; raise WeightsError if they do not fit."""
+
+    @abstractmethod
+    def facts(self) -> dict[str, object]:
+        """Return path, checksum and training steps of what is tested, as in `checkpoint_facts`."""
+
+    def open_module(self, configuration: Any) -> "Scorer":
+        """Return the scorer with its weights and sampler (if given); raise CompleteSplatError if one does not fit."""
+        scorer = self.scorer(configuration)
+        if self.sampler is not None:
+            diffusion_of(scorer).replace_sampler(self.sampler)
+        return scorer
 
     def open(self) -> "tuple[Scorer, SceneDataModule]":
         """Return the model and the data module; raise the errors of `configuration` and `open_module`."""
         configuration = self.configuration()
         return self.open_module(configuration), instantiate(configuration.data, _convert_="all")
 
-    def open_module(self, configuration: Any) -> "Scorer":
-        """Return the scorer with its weights and sampler (if given); raise CompleteSplatError if one does not fit."""
-        scorer = self._scorer() if self.ckpt is None else instantiate(configuration.model, _convert_="all")
-        if self.ckpt is not None:
-            load_part(scorer, self.ckpt, prefix="")
-        if self.sampler is not None:
-            diffusion_of(scorer).replace_sampler(self.sampler)
+
+@dataclass(frozen=True)
+class RunCheckpoint(TrainedModel):
+    """A checkpoint of a run, with the run's own model, rasterizer and data.
+
+    Args:
+        checkpoint: the file.
+        overrides: changes of the run's settings, as on the command line.
+        trust: the run may name modules of the user's own.
+    """
+
+    checkpoint: Path
+    overrides: Sequence[str]
+    trust: bool
+    sampler: Mapping[str, object] | None
+    seed: int
+
+    def configuration(self) -> Any:
+        """See `TrainedModel`; raise CompleteSplatError if `fit` would refuse an override."""
+        config = config_of_run(self.checkpoint, list(self.overrides), self.trust)
+        if "scene_folder" in config.model:
+            config.model.scene_folder = None  # the run's own, whose scene stays as it is
+        return config
+
+    def scorer(self, configuration: Any) -> "Scorer":
+        """See `TrainedModel`."""
+        scorer: Scorer = instantiate(configuration.model, _convert_="all")
+        load_part(scorer, self.checkpoint, prefix="")
         return scorer
 
     def facts(self) -> dict[str, object]:
-        """Return `checkpoint_facts`; for weights and files of scenes, path and checksum without facts of training."""
-        if self.ckpt is not None:
-            return checkpoint_facts(Path(self.ckpt))
-        if self.scenes is not None:
-            return self.files.facts()
-        assert self.model.file is not None
-        facts = {"path": self.weights, "sha256": sha256_of(self.model.file), "step": None}
-        return {"checkpoint": facts, "ema": None}
+        """See `TrainedModel`."""
+        return checkpoint_facts(self.checkpoint)
 
-    def _rendering(self, background: object) -> dict[str, Any]:
-        known = {} if background is None else {"background": background}
-        return {"rasterizer": instantiate(self.rasterizer, _convert_="all")} | known
 
-    def _scorer(self) -> "Scorer":
-        if self.scenes is not None:
-            return self.files
+@dataclass(frozen=True)
+class GivenWeights(TrainedModel):
+    """Weights, with data and rasterizer that the user gives.
+
+    Args:
+        weights, trust: see `CompleteSplat.from_pretrained`.
+        data, rasterizer, sampler: configs of these parts.
+    """
+
+    weights: str
+    trust: bool
+    data: Mapping[str, object]
+    rasterizer: Mapping[str, object]
+    sampler: Mapping[str, object] | None
+    seed: int
+
+    @cached_property
+    def model(self) -> SceneModel:
+        return CompleteSplat.from_pretrained(self.weights, self.trust)
+
+    def configuration(self) -> Any:
+        """Return the config of the data, with image size and background as the weights need them."""
+        config = _given_data(self.data, self.seed)
+        config.data.update(self.model.needed_of_data(config.data))
+        return config
+
+    def scorer(self, configuration: Any) -> "Scorer":
+        """See `TrainedModel`."""
         from completesplat.training.latent_diffusion import DiffusionScorer
         from completesplat.training.reconstruction import ReconstructionScorer
 
-        rendering = self._rendering(self.model.background)
+        rendering = _rendering(self.rasterizer, self.model.background)
         if isinstance(self.model, CompleteSplat):
             return DiffusionScorer(self.model, **rendering)
         return ReconstructionScorer(self.model.reconstruction_model, **rendering)
+
+    def facts(self) -> dict[str, object]:
+        """Return path and checksum of the weights; facts of their training are not known."""
+        assert self.model.file is not None
+        checkpoint = {"path": self.weights, "sha256": sha256_of(self.model.file), "step": None}
+        return {"checkpoint": checkpoint, "ema": None}
+
+
+@dataclass(frozen=True)
+class GivenScenes(TrainedModel):
+    """Files of scenes that any program wrote, with data and rasterizer that the user gives.
+
+    Args:
+        scenes, frame, align, method: as in `conf/test.yaml`.
+        data, rasterizer, sampler: configs of these parts.
+    """
+
+    scenes: str
+    frame: str
+    align: str
+    method: str | None
+    data: Mapping[str, object]
+    rasterizer: Mapping[str, object]
+    sampler: Mapping[str, object] | None
+    seed: int
+
+    @cached_property
+    def files(self) -> "SceneFiles":
+        from completesplat.evaluation.scene_files import SceneFiles
+
+        rendering = _rendering(self.rasterizer, self.data.get("background"))
+        return SceneFiles(self.scenes, self.frame, self.align, self.method, **rendering)
+
+    def configuration(self) -> Any:
+        """Return the config of the data."""
+        return _given_data(self.data, self.seed)
+
+    def scorer(self, configuration: Any) -> "Scorer":
+        """Return the scorer of the files; raise CompleteSplatError if there is no such folder."""
+        return self.files
+
+    def facts(self) -> dict[str, object]:
+        """Return path and checksum of the files."""
+        return self.files.facts()
+
+
+def trained_model(**settings: Unpack[TestSettings]) -> TrainedModel:
+    """Return the model that the settings of `completesplat test` choose; `conf/test.yaml` explains them.
+
+    Raises:
+        CompleteSplatError: not exactly one of `ckpt`, `weights` and `scenes` is given, data are missing or superfluous,
+            or a setting belongs to another of the three.
+    """
+    ckpt = settings["ckpt"]
+    weights = settings["weights"]
+    scenes = settings.get("scenes")
+    overrides = settings["overrides"]
+    frame = settings.get("frame", "opencv")
+    align = settings.get("align", "none")
+    method = settings.get("method")
+    data = settings.get("data")
+    sampler = settings.get("sampler")
+    seed = settings["seed"]
+    check_one_model(ckpt, weights, scenes)
+    if scenes is None and (frame, align, method) != ("opencv", "none", None):
+        raise CompleteSplatError("frame, align, method: these apply to files only; give scenes=DIR")
+    if ckpt is not None:
+        if data is not None:
+            raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
+        checkpoint = Path(ckpt, RUN_CHECKPOINT) if Path(ckpt).is_dir() else Path(ckpt)
+        return RunCheckpoint(checkpoint, overrides, settings["trust"], sampler, seed)
+    if overrides:
+        raise CompleteSplatError("overrides change a run's settings: give ckpt=FILE, or else data.KEY=VALUE")
+    if data is None:
+        raise CompleteSplatError("weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR")
+    rasterizer = settings["rasterizer"]
+    if weights is not None:
+        return GivenWeights(weights, settings["trust"], data, rasterizer, sampler, seed)
+    return GivenScenes(str(scenes), frame, align, method, data, rasterizer, sampler, seed)
+
+
+def _given_data(data: Mapping[str, object], seed: int) -> Any:
+    return OmegaConf.create({"seed": seed, "data": data})  # configs of data refer to the seed
+
+
+def _rendering(rasterizer: Mapping[str, object], background: object) -> dict[str, Any]:
+    """Return the settings of a scorer's renders, without a background if that is not known."""
+    settings = {"rasterizer": instantiate(rasterizer, _convert_="all")}
+    if background is not None:
+        settings["background"] = background
+    return settings
 
 
 def open_generator(config: Any, images: Sequence[Path], announced: bool = True) -> SceneModel:

@@ -6,7 +6,6 @@ here is a reader.
     sequences, tolerance: posed image sequences, the common form of all data sets; what may be unreadable
     splits: training, validation and test
     validation: checks of files, names and numbers; audit of a whole data set
-    images: image files and photos
     placement: square images and a common object size
     packed: store of prepared sequences
     loading: scenes, views, augmentation, loaders and data modules

@@ -3,8 +3,6 @@
 `frozen` says whether an encoder is constant in training, so that its features can be computed once and stored.
 """
 
-from typing import ClassVar
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -60,7 +58,6 @@ class StableDiffusionConditioning(nn.Module):
     """
 
     frozen = True
-    start_weights: ClassVar = {"pretrained": "CompVis/stable-diffusion-v1-4, or null for random weights"}
 
     def __init__(
         self,

@@ -33,8 +33,6 @@ class ConditionalUNet(nn.Module):
         attention_settings: further arguments of the network.
     """
 
-    halves_images = True
-
     def __init__(
         self,
         kind: Any,

@@ -60,9 +60,3 @@ def guided_noise(
     both = denoise(noisy_latent.repeat(2, 1, 1, 1), timestep.repeat(2), torch.cat([conditioning, nothing]))
     conditional, unconditional = both.chunk(2)
     return (1 - weight) * conditional + weight * unconditional
-
-
-def in_bfloat16(denoise: Denoise, *inputs: Tensor) -> Latents:
-    """Call a denoiser whose matrix products and convolutions are computed in bfloat16."""
-    with torch.autocast(inputs[0].device.type, torch.bfloat16):
-        return denoise(*inputs)

@@ -196,6 +196,12 @@ def part_of(count: int) -> int:
     return min(max(count // 2, PART), LARGEST_PART)
 
 
+def in_bfloat16(denoise: Denoise, *inputs: Tensor) -> Latents:
+    """Call a denoiser whose matrix products and convolutions are computed in bfloat16."""
+    with torch.autocast(inputs[0].device.type, torch.bfloat16):
+        return denoise(*inputs)
+
+
 def in_parts(draw: Callable[[slice], T], count: int, most: int | None = None, threads: int = 0) -> list[T]:
     """Call `draw` for all of `count` samples in order, at most `most` at a time (None: all at once).
 

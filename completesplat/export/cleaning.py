@@ -21,7 +21,8 @@ log = logging.getLogger(__name__)
 
 def bounded(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:
     """Return a mask of Gaussians with finite values of at most 1e18."""
-    return gaussians.map(lambda values: values.where(values.abs() <= LARGEST, torch.inf)).finite()
+    limited = {name: values.where(values.abs() <= LARGEST, torch.inf) for name, values in vars(gaussians).items()}
+    return replace(gaussians, **limited).finite()
 
 
 def storable(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:

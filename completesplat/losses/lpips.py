@@ -144,9 +144,6 @@ class PerceptualTerm:
     The network is not part of the trained module, so no checkpoint holds it.
     """
 
-    only_for_training = True
-    """Whether a run is opened without this term, because its network's weights may be elsewhere."""
-
     distance: PerceptualDistance
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:

@@ -46,7 +46,7 @@ def fit_front(
     with torch.inference_mode(False), torch.enable_grad():
         # Autograd cannot use tensors that were made in inference mode, but it can use copies.
         fixed = gaussians.map(torch.clone).detach()
-        views = cameras.map(lambda x: x[:, None].clone())
+        views = cameras[:, None].map(torch.clone)
         image = images[:, None].clone()
         mask = torch.ones_like(image) if visible is None else visible[:, None].expand_as(image).clone()
         moves = [torch.zeros_like(getattr(fixed, name), requires_grad=True) for name in RATES]

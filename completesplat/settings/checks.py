@@ -12,12 +12,20 @@ from omegaconf.errors import OmegaConfBaseException
 
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.options import did_you_mean
-from completesplat.settings.schema import VERBS, arguments_of, check_settings, check_value, start_weights
+from completesplat.settings.schema import VERBS, arguments_of, check_settings, check_value
 
 Container = DictConfig | ListConfig
 
 REFERENCE = re.compile(r"\$\{(\w[\w.]*)\}")
 REMOVE = "remove"
+# Settings of weights that training starts from, in all parts, with examples.
+START_WEIGHTS = {
+    "pretrained": "CompVis/stable-diffusion-v1-4, or null for random weights",
+    "autoreconstructor_checkpoint": "RUN/checkpoints/last.ckpt of stage 1",
+    "checkpoint": "RUN/checkpoints/last.ckpt",
+}
+# Settings that are networks each of whose `channels` but the last halves the sides of images.
+HALVING_NETWORKS = ("encoder", "denoiser", "model")
 HYDRA_KEYS = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 
 
@@ -81,8 +89,8 @@ def each_part(config: object) -> Iterator[tuple[DictConfig, Any]]:
 
 def remove_start_weights(config: DictConfig) -> None:
     """Set all weights that training starts from to null, in all parts of a config, also where they are missing."""
-    for part, kind in each_part(config):
-        part.update(dict.fromkeys(part.keys() & start_weights(kind)))
+    for part, _ in each_part(config):
+        part.update(dict.fromkeys(part.keys() & START_WEIGHTS.keys()))
 
 
 def part_arguments(config: Container) -> tuple[Mapping[str, object], bool]:
@@ -108,13 +116,23 @@ def _origin(config: Container, name: Any, place: str) -> str:
 
 def check_image_size(config: DictConfig) -> None:
     """Raise CompleteSplatError if training images cannot be halved as often as the networks halve them."""
-    halving = [part for part, kind in each_part(config.get("model")) if getattr(kind, "halves_images", False)]
-    multiple = 2 ** sum(len(part.channels) - 1 for part in halving if "channels" in part)
+    multiple = 2 ** _halvings("model", config.get("model"))
     size = config.data.get("image_size")
     if size is not None and size % multiple:
         near = max(multiple, round(size / multiple) * multiple)
         message = f"must be a multiple of {multiple} for the levels of these networks, such as {near}"
         raise CompleteSplatError(f"data.image_size={size}: {message}")
+
+
+def _halvings(setting: str, config: object) -> int:
+    """Return how often the networks in the config of a setting halve the sides of images."""
+    if not isinstance(config, DictConfig):
+        return 0
+    count = len(config.channels) - 1 if setting in HALVING_NETWORKS and "channels" in config else 0
+    for name in [name for name in config if not OmegaConf.is_missing(config, name)]:
+        with suppress(OmegaConfBaseException):  # it refers to something that is missing
+            count += _halvings(str(name), config[name])
+    return count
 
 
 def check_optimizer(config: DictConfig | None) -> None:

@@ -119,7 +119,7 @@ class ModelSettings(TypedDict):
 
 
 class TestSettings(ModelSettings, total=False):
-    """Settings of `completesplat test`, all of which `TrainedModel` takes."""
+    """Settings of `completesplat test`, all of which `trained_model` takes."""
 
     scenes: str | None
     frame: Literal["opencv", "opengl"]
@@ -220,11 +220,6 @@ def _named_arguments(function: Callable[..., object]) -> tuple[dict[str, object]
     annotations.pop("self", None)
     annotations.pop("return", None)
     return annotations, takes_any
-
-
-def start_weights(kind: object) -> Mapping[str, str]:
-    """Return the settings of weights that training starts from, with examples, as a part's class declares them."""
-    return getattr(kind, "start_weights", {})
 
 
 def violations(annotation: object, value: object) -> list[Violation]:

@@ -249,17 +249,24 @@ def _encoded_batches(
     for first in track(range(0, len(batches), count), "encoding", disable=not progress or rank > 0):
         result: tuple[Rows, Sums] | DataError | None = None
         if first + rank < len(batches):
-            try:
-                rows = encode(_scenes(next(loaded)))
-                _refuse_not_finite(rows, references, batches[first + rank])
-                result = rows, moment_sums(rows["mean"], rows["log_variance"])
-            except DataError as error:  # all processes raise it below
-                result = error
+            result = _encoded_batch(next(loaded), references, encode, batches[first + rank])
         for rank_result in gather_values(result):
             if isinstance(rank_result, DataError):
                 raise rank_result
             if rank_result is not None:
                 yield rank_result
+
+
+def _encoded_batch(
+    loaded: LoadedScenes, references: References, encode: FrameEncoder, batch: Sequence[int]
+) -> tuple[Rows, Sums] | DataError:
+    """Return a batch's rows and sums, or an error, which all processes will raise together."""
+    try:
+        rows = encode(_scenes(loaded))
+        _refuse_not_finite(rows, references, batch)
+    except DataError as error:
+        return error
+    return rows, moment_sums(rows["mean"], rows["log_variance"])
 
 
 def _check_space(frames: int, sequences: int, bytes_per_frame: int, out: Path) -> None:

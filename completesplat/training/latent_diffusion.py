@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
@@ -98,11 +98,6 @@ class LatentDiffusion(DiffusionScorer, Stage):
     Raises:
         WeightsError: a checkpoint is unusable, or both are given.
     """
-
-    start_weights: ClassVar = {
-        "autoreconstructor_checkpoint": "RUN/checkpoints/last.ckpt of stage 1",
-        "checkpoint": "RUN/checkpoints/last.ckpt",
-    }
 
     def __init__(
         self,

@@ -4,7 +4,7 @@ import logging
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -20,11 +20,11 @@ from completesplat.generator import DeterministicModel
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch, Views
-from completesplat.scene_model import camera_tensors
 from completesplat.splatter_image import SplatterImage
 from completesplat.training.stage import Compile, Stage, prepare_network
 from completesplat.weights import CAMERA
 from completesplat.weights.checkpoint_reading import load_part
+from completesplat.weights.opening import camera_tensors
 
 logger = logging.getLogger(__name__)
 
@@ -67,8 +67,6 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         channels_last, compile: see `prepare_network`.
         **rendering_and_optimization: see `Stage`.
     """
-
-    start_weights: ClassVar = {"checkpoint": "RUN/checkpoints/last.ckpt"}
 
     def __init__(
         self,

@@ -24,9 +24,9 @@ from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
 from completesplat.quantities import Share
 from completesplat.rasterizers import Rasterizer
-from completesplat.run_configs import check_names, without_training
 from completesplat.scene import Batch, SceneBatch
-from completesplat.weights.checkpoint_reading import load_part, read_checkpoint
+from completesplat.weights.checkpoint_reading import load_tensors, read_checkpoint
+from completesplat.weights.runs import CONFIG, config_of_checkpoint, without_training
 
 # "cudagraphs" also records a call's operations on a GPU, to start them at once.
 Compile = Literal[False, True, "cudagraphs"]
@@ -98,17 +98,15 @@ class Stage(Scorer):
             trust: the checkpoint names your own modules, and you trust its author; not needed below the working folder.
 
         Raises:
-            WeightsError: the checkpoint is damaged, missing, of another class, has no config, or `check_names` fails.
+            WeightsError: the checkpoint is missing, damaged or of another class, or `config_of_checkpoint` refuses it.
         """
         path = Path(checkpoint_path)
-        config = read_checkpoint(path).get("hyper_parameters")
-        if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
-            raise WeightsError(f"{path}: has no config; train with `fit`, or with what completesplat.instantiate gives")
-        config = check_names(config, path, path.resolve().parent.parent, trust)
+        contents = read_checkpoint(path)
+        config = config_of_checkpoint(path, contents, trust)
         module = instantiate(without_training(OmegaConf.create(config)).model, _convert_="all")
         if not isinstance(module, cls):
             raise WeightsError(f"{path}: holds a {type(module).__name__}, which is no {cls.__name__}")
-        load_part(module, path, prefix="")
+        load_tensors(module, contents["state_dict"], path)
         module.config = config
         return module if map_location is None else module.to(map_location)
 
@@ -120,7 +118,7 @@ class Stage(Scorer):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the config, which `load_from_checkpoint` reads."""
         if self.config is not None:
-            checkpoint["hyper_parameters"] = dict(self.config)
+            checkpoint[CONFIG] = dict(self.config)
 
     def refuse_average(self) -> None:
         """Raise CompleteSplatError if weights are averaged, for a model whose number of weights changes in a run."""

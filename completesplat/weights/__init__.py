@@ -126,8 +126,9 @@ def from_hub(
     try:
         return Path(snapshot_download(hub_id, allow_patterns=list(names)))
     except Exception as error:  # from the hub, its HTTP library or the file system
-        reason = f"no folder here, and not to be had from the hub ({first_line(error).split('. ')[0]})"
-        raise WeightsError("; ".join(filter(None, [f"{hub_id}: {reason}", advice]))) from error
+        cause = first_line(error).split(". ")[0]
+        ending = "" if advice is None else f"; {advice}"
+        raise WeightsError(f"{hub_id}: no folder here, and not to be had from the hub ({cause}){ending}") from error
 
 
 def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: str) -> Path:
@@ -157,7 +158,10 @@ def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: st
             raise WeightsError(f"{weights} {reason}; elsewhere, {advice}") from error
     if not path.is_file():
         raise WeightsError(f"{path}: no such file; {advice}")
-    if expected is not None and not (actual := sha256_of(path)).startswith(expected):
+    if expected is None:
+        return path
+    actual = sha256_of(path)
+    if not actual.startswith(expected):
         meant = f"if that file is meant, {hash_setting}={actual}"
         raise WeightsError(f"{path}: SHA-256 {actual}, not {sha256}; {advice} ({meant})")
     return path

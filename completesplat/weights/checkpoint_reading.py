@@ -1,8 +1,8 @@
 """Reading of checkpoints and other `torch.save` files: plain tensors, in no more memory than the file has bytes.
 
-`torch.load(weights_only=True)` runs no code of a file, but the calls that it allows can turn a few bytes into much
-memory, and its tensors may repeat numbers. Therefore a dry run first adds up what the calls would make.
-None of this needs Lightning.
+`torch.load(weights_only=True)` runs no code of a file, but even with `mmap=True` it takes 2 GB for a file of 500 bytes
+that calls `bytearray(2**31)`. Therefore a dry run first adds up what the calls of a file would make, and what its
+tensors would repeat. None of this needs Lightning.
 """
 
 import io
@@ -62,7 +62,11 @@ def _refusing_damage() -> Iterator[None]:
 
 
 def _checked_pickle(path: Path, sums: bool) -> bytes:
-    """Return the pickle in an archive whose records are whole; `sums`: compare their CRC-32, which torch does not."""
+    """Return the pickle in an archive whose records are whole.
+
+    Args:
+        sums: compare the records' checksums (CRC-32), which torch does not.
+    """
     with path.open("rb") as file, zipfile.ZipFile(file) as records:
         # If a file starts with other bytes, torch reads an older format, even if an archive follows.
         file.seek(0)
@@ -91,9 +95,10 @@ class _Made:
 
 
 class _DryRun(pickle._Unpickler):
-    """Reading of a pickle without making tensors; TensorFileError if that would take more than `most` bytes.
+    """Reading of a pickle that makes no tensors but counts their bytes.
 
-    The unpickler in C is not used, because it reserves memory for any index that a file names.
+    It raises TensorFileError if there are more than `most`. The unpickler in C is not used, because it reserves memory
+    for any index that a file names.
     """
 
     # Later operations reserve memory for any length, and torch.save does not write them.
@@ -206,6 +211,12 @@ def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:
     """Load a checkpoint's weights below `prefix` into a module; raise WeightsError unless all are present and fit."""
     weights = read_checkpoint(path)["state_dict"]
     part = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
-    if (difference := mismatch(module.state_dict(), part)) is not None:
+    load_tensors(module, part, path)
+
+
+def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | Path) -> None:
+    """Load the tensors of a file into a module; raise WeightsError, naming the file, unless all are present and fit."""
+    difference = mismatch(module.state_dict(), tensors)
+    if difference is not None:
         raise WeightsError(f"{path}: weights of another architecture: {difference}")
-    module.load_state_dict(part)
+    module.load_state_dict(tensors)

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from support import SMALL, compose_config, strict_json
 
-from completesplat.commands.trained import TrainedModel
+from completesplat.commands.trained import RunCheckpoint
 from completesplat.commands.view import setting_of_path
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
@@ -53,7 +53,8 @@ def test_scenes_of_stage_one_are_those_that_its_test_scores(pipeline, run):
     model = CompleteSplat.from_pretrained(run)
     assert isinstance(model, DeterministicModel)
     assert not model.draws_samples
-    module, data = TrainedModel(str(run / "checkpoints/last.ckpt"), [f"data.root={pipeline.toy}"], trust=True).open()
+    checkpoint = run / "checkpoints/last.ckpt"
+    module, data = RunCheckpoint(checkpoint, [f"data.root={pipeline.toy}"], trust=True, sampler=None, seed=0).open()
     data.setup("test")
     batch = next(iter(data.test_dataloader()))
     with torch.no_grad():

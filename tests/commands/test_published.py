@@ -9,7 +9,7 @@ from published_weights import write_published
 from support import SMALL, compose_config, strict_json
 
 from completesplat.baselines.splatter_image.model import PublishedModel
-from completesplat.commands.trained import TrainedModel
+from completesplat.commands.trained import trained_model
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
 from completesplat.gaussians import DirectionalGaussians
@@ -115,8 +115,8 @@ def test_a_test_sees_objects_only_at_their_depths_and_its_figures_stand_apart(co
     assert metrics["protocol"]["checkpoint"]["path"] == str(weights)
     assert metrics["model"]["full"]["novel"]["psnr"] > 0
     config = compose_config("test", *given)
-    trained = TrainedModel(None, weights=str(weights), data=config.data, rasterizer=config.rasterizer)
-    module, data = trained.open()
+    names = ("ckpt", "weights", "overrides", "seed", "trust", "data", "rasterizer")
+    module, data = trained_model(**{name: config[name] for name in names}).open()
     assert not isinstance(module, Stage)  # nothing is trained, so there is no optimizer
     data.prepare_data()
     data.setup("test")

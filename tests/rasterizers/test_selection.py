@@ -20,7 +20,7 @@ from completesplat.rasterizers import Rendering, RenderingConstants, cuda, selec
 from completesplat.rasterizers.kernels import compilation
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.tiled import TiledRasterizer
-from completesplat.run_configs import config_of_run
+from completesplat.weights.runs import config_of_run
 
 
 @pytest.fixture(autouse=True)

@@ -14,8 +14,7 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import NoneType
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 import yaml
@@ -55,7 +54,7 @@ GENERAL = "objaverse"
 GENERAL_FILE = "model_latest.pth"
 MODEL_FILE = re.compile(r"model_(\w+)\.pth")
 
-# Options that are read, by section. All published weights for one image have the literal values.
+# Options that are read, by section. Networks that other options describe have other tensors, which loading shows.
 SECTIONS: dict[str, dict[str, object]] = {
     "data": {
         "training_resolution": Annotated[int, Range(8, 1024)],
@@ -63,18 +62,12 @@ SECTIONS: dict[str, dict[str, object]] = {
         "zfar": Annotated[float, Range(-1e6, 1e6)],
         "white_background": bool,
         "origin_distances": bool,
-        "input_images": Literal[1],
     },
     "model": {
-        "name": Literal["SingleUNet"],
         "base_dim": Width,
         "num_blocks": Few,
         "attention_resolutions": Annotated[Sequence[Natural], Entries(most=8)],
-        "max_sh_degree": Literal[1],
-        "network_with_offset": Literal[True],
-        "isotropic": Literal[False],
     },
-    "cam_embd": {"embedding": NoneType},  # models of two images embed their cameras
 }
 
 
@@ -141,8 +134,6 @@ class PublishedSplatterImage(ReconstructionModel):
         size = self.image_size = data["training_resolution"]
         self.background = float(data["white_background"])
         self.depths = DepthBounds(data["znear"], data["zfar"], data["origin_distances"])
-        if size % 8 or model["base_dim"] % 4:
-            raise WeightsError(f"{file}: a size of {size}, {model['base_dim']} wide: neither fits the network")
         with torch.device("meta"):  # tensors have sizes but take no memory
             network = SongUNet(size, 3, OUTPUTS, model["base_dim"], model["num_blocks"], model["attention_resolutions"])
             last = nn.Conv2d(OUTPUTS, OUTPUTS, 1)
@@ -233,7 +224,7 @@ class PublishedModel(SceneModel):
 
     @property
     def framing(self) -> Framing:
-        """How photos are framed: on the background that the weights know.
+        """Return how photos are framed: on the background that the weights know.
 
         If the weights know only one field of view, the image is taken to have it, and a cut-out object is placed in the
         middle of the image, as large as in training.
@@ -327,10 +318,9 @@ def _models_in(folder: Path) -> list[Path]:
 def _config_beside(model: Path) -> Path:
     if model.name == GENERAL_FILE:
         name = GENERAL
-    elif match := MODEL_FILE.fullmatch(model.name):
-        name = match[1]
     else:
-        name = "NAME"
+        match = MODEL_FILE.fullmatch(model.name)
+        name = "NAME" if match is None else match[1]
     return model.with_name(f"config_{name}.yaml")
 
 
@@ -360,7 +350,7 @@ def _download(name: str) -> Path:
 
 
 def _read_config(path: Path) -> dict[str, dict[str, Any]]:
-    """Read the options in `SECTIONS`; a missing option counts as null, a missing `input_images` as 1."""
+    """Read the options in `SECTIONS`; raise WeightsError if one is missing or of another type."""
     text = read_small(path)
     try:
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
@@ -371,11 +361,10 @@ def _read_config(path: Path) -> dict[str, dict[str, Any]]:
     sections: dict[str, dict[str, Any]] = {}
     for section, hints in SECTIONS.items():
         options = config.get(section) if isinstance(config, Mapping) else None
-        options = {"input_images": 1, **options} if isinstance(options, Mapping) else {}
+        if not isinstance(options, Mapping):
+            raise WeightsError(f"{path}: no section {section}; only Splatter Image's own files are read")
         sections[section] = {name: options.get(name) for name in hints}
         _check_section(path, section, sections[section])
-    if not sections["data"]["znear"] < sections["data"]["zfar"]:
-        raise WeightsError(f"{path}: data.znear must be below data.zfar")
     return sections
 
 
@@ -383,4 +372,4 @@ def _check_section(path: Path, section: str, options: Mapping[str, object]) -> N
     for name, hint in SECTIONS[section].items():
         for place, value, reason in violations(hint, options[name]):
             message = f"{path}: {section}.{name}{place} is {printable(value, SHORT)}: {reason}"
-            raise WeightsError(f"{message}; only Splatter Image's weights for one image, as published, are read")
+            raise WeightsError(f"{message}; only Splatter Image's own files are read")

@@ -189,7 +189,7 @@ class SceneDataModule(SceneDataSet, LightningDataModule):
         logger.warning("%s: %s", self.root, message)
 
     def training_facts(self) -> dict[str, float | list[float]]:
-        """Return the facts about training images that weights store (`completesplat.parts.TrainingImages`)."""
+        """Return the facts about training images that weights store (`TrainingImages`)."""
         boxes = self.augmentation.box_masks
         facts: dict[str, float | list[float]] = {"box_masks": 0.0 if boxes is None else boxes.probability}
         if self.background is not None:

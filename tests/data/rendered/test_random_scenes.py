@@ -8,11 +8,11 @@ import meshes
 import numpy as np
 import pytest
 import torch
-from completesplat.data.rendered.assets import BrokenMesh, check_named_files, find_meshes
 from support import change_json, write_capture
 
 from completesplat.data.captures.transforms_json import read_cameras, read_transforms
 from completesplat.data.rendered import rendering
+from completesplat.data.rendered.assets import BrokenMesh, check_named_files, find_meshes
 from completesplat.data.rendered.random_scenes import (
     PAINTS,
     draw_back,

@@ -14,11 +14,21 @@ import torch
 from support import compose_config
 
 from completesplat.errors import WeightsError
-from completesplat.generator import CompleteSplat
-from completesplat.parts import CHOICES, PARTS, build, check_architecture, settings_of
-from completesplat.run_configs import check_names
+from completesplat.generator import CompleteSplat, build
 from completesplat.settings.schema import violations
+from completesplat.splatter_image import Parameterization
 from completesplat.weights import CONFIG_FILE, LARGEST_TEXT, SHIPPED, SUMS_FILE
+from completesplat.weights.allowed import (
+    SAMPLING_PARTS,
+    ConfigOrigin,
+    check_architecture,
+    check_names,
+    choices,
+    class_of,
+    listed_parts,
+    names_for_weights,
+    settings_of,
+)
 
 ENCODER = "autoreconstructor.encoder"
 SCHEDULER = "sampler.scheduler"
@@ -111,9 +121,11 @@ def targets(part: dict) -> list[str]:
 
 
 def test_weights_name_classes_by_name_and_their_paths_in_other_versions_count_too(folder):
-    assert set(targets(json.loads((folder / CONFIG_FILE).read_text()))) <= PARTS.keys()
+    assert set(targets(json.loads((folder / CONFIG_FILE).read_text()))) <= set(names_for_weights())
     assert any("completesplat.autoreconstructor." in path for path in targets(SHIPPED_CONFIG))
-    assert all(check_names({"_target_": name}, folder, folder, trust=False)["_target_"] for name in PARTS)
+    origin = ConfigOrigin(folder, folder, trust=False)
+    for name, part in listed_parts().items():
+        assert check_names({"_target_": name}, origin) == {"_target_": part.path}
     before = CompleteSplat.from_pretrained(folder)
     for place in ("denoiser", ENCODER, SCHEDULER):
         part = reduce(dict.__getitem__, place.split("."), before.architecture)
@@ -151,7 +163,7 @@ def test_a_part_of_the_users_own_takes_plain_values_and_parts_in_any_place(tmp_p
     built = build(part)
     held = built.held["held"][0]
     assert (type(built).__name__, built.network, held["b"]) == ("Holder", 3, [None])
-    assert type(held["a"]) is PARTS["Parameterization"]
+    assert type(held["a"]) is Parameterization
     for name, value, reason in (
         ("first_depth", "x", "network.held.0.a.first_depth=x: must be a number"),
         ("_partial_", True, "network.held.0.a._partial_: there is no such setting"),
@@ -193,9 +205,9 @@ def test_any_value_in_any_place_is_refused_as_weights_are_or_is_of_the_settings_
 
 
 def test_every_setting_of_every_class_is_checked():
-    for kind in PARTS.values():
-        for name, hint in settings_of(kind).items():
-            assert name in CHOICES or violations(hint, object()), (kind, name)
+    for part in names_for_weights():
+        for name, hint in settings_of(class_of({"_target_": part})).items():
+            assert choices(name) or violations(hint, object()), (part, name)
 
 
 @pytest.mark.parametrize(
@@ -210,4 +222,17 @@ def test_every_setting_of_every_class_is_checked():
 def test_what_the_configuration_tree_offers_may_be_saved_and_loaded(chosen):
     config = compose_config("fit", "model=latent_diffusion", "autoreconstructor.pretrained=null", *chosen)
     config = config.model.completesplat
-    check_architecture({name: config[name] for name in (*CHOICES.keys() & config.keys(), "image_size")})
+    check_architecture({name: config[name] for name in (*SAMPLING_PARTS, "image_size")})
+
+
+def test_each_part_of_a_model_has_the_classes_that_the_configuration_tree_offers_for_it():
+    """Whoever adds a denoiser with an option in `conf/` can store it."""
+    assert {name: choices(name) for name in ("autoreconstructor", "network", "denoiser", "encoder")} == {
+        "autoreconstructor": ["VariationalAutoReconstructor"],
+        "network": ["SplatterImageUNet", "VariationalAutoReconstructor"],
+        "denoiser": ["Denoiser", "TextlessStableDiffusion"],
+        "encoder": ["Encoder"],
+    }
+    assert len(choices("scheduler")) == 4
+    assert not choices("loss")
+    assert not choices("data")

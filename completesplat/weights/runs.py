@@ -1,0 +1,103 @@
+"""Configs of runs of `fit`, from their folders and checkpoints, after `check_names` has held them to the list."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.settings import checks
+from completesplat.settings.schema import check_value
+from completesplat.weights import RUN_CONFIG_FILE, first_line, read_small
+from completesplat.weights.allowed import ConfigOrigin, check_names
+
+SECTIONS = ["model", "data"]  # sections of a run's config that are read
+CONFIG = "hyper_parameters"  # Lightning's name for the config in a checkpoint
+# Loss terms with networks of their own, whose weights may be elsewhere.
+PERCEPTUAL_TERMS = ("LearnedPerceptualSimilarity", "EfficientNetDistance")
+
+
+def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -> Any:
+    """Return `model` and `data` of the config of a checkpoint's run, with `overrides`, which `fit` must accept.
+
+    The config may come from anyone, so `check_names` limits what it names. The overrides may name anything.
+
+    Raises:
+        WeightsError: the checkpoint or its config is missing or unreadable, or `check_names` refuses the config.
+        CompleteSplatError: the overrides cannot be read, or `fit` would refuse them, too.
+    """
+    if not checkpoint.is_file():
+        raise WeightsError(f"{checkpoint}: no such checkpoint")
+    path, config = read_run_config(checkpoint)
+    allowed = OmegaConf.create(check_names(config, ConfigOrigin(path, path.resolve().parent, trust)))
+    return without_training(_changed(allowed, overrides))
+
+
+def config_of_checkpoint(checkpoint: Path, contents: Mapping[str, Any], trust: bool) -> dict[str, Any]:
+    """Return the config of the model in the contents of a checkpoint; raise WeightsError if `check_names` refuses it.
+
+    The run's folder is the one above the checkpoint's.
+    """
+    config = contents.get(CONFIG)
+    if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
+        reason = "has no config; train with `fit`, or with what completesplat.instantiate gives"
+        raise WeightsError(f"{checkpoint}: {reason}")
+    allowed: dict[str, Any] = check_names(config, ConfigOrigin(checkpoint, checkpoint.resolve().parent.parent, trust))
+    return allowed
+
+
+def read_run_config(checkpoint: Path) -> tuple[Path, dict[str, Any]]:
+    """Return the path of the config of a checkpoint's run, and its sections `model` and `data` as plain containers.
+
+    Raises:
+        WeightsError: the config is missing, unreadable, or not that of a run of `fit`.
+    """
+    path = checkpoint.absolute().parent.parent / RUN_CONFIG_FILE
+    if not path.is_file():
+        raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
+    text = read_small(path)
+    try:
+        config = OmegaConf.masked_copy(OmegaConf.create(text), SECTIONS)  # type: ignore[arg-type]
+    except Exception as error:  # YAML and OmegaConf raise errors of many types
+        raise WeightsError(f"{path}: not a run's configuration ({type(error).__name__})") from error
+    plain = dict(OmegaConf.to_container(config, resolve=False))  # type: ignore[arg-type]
+    if not all(isinstance(plain.get(section), Mapping) for section in SECTIONS):
+        raise WeightsError(f"{path}: not the configuration of a run of fit, which has {' and '.join(SECTIONS)}")
+    return path, plain
+
+
+def _changed(config: Any, overrides: list[str]) -> Any:
+    try:
+        changes = OmegaConf.from_dotlist(overrides)
+        others = [str(key) for key in changes if key not in SECTIONS]
+        if others:
+            raise CompleteSplatError(f"{others[0]}: no setting of a run's model or data, which overrides= changes")
+        changed: Any = OmegaConf.merge(config, changes)
+    except (OmegaConfBaseException, YAMLError, ValueError) as error:
+        raise CompleteSplatError(f"overrides={overrides}: cannot be applied: {first_line(error)}") from error
+    for section in SECTIONS:
+        check_value(section, Mapping[str, object], changed[section])
+    if overrides:
+        checks.check_parts(changed)
+        checks.check_image_size(changed)
+        checks.check_optimizer(changed.model.get("optimizer"))
+    return changed
+
+
+def without_training(config: Any) -> Any:
+    """Remove from a config what only training needs: weights to start from, loss terms with networks, and a GPU.
+
+    `rasterizer=cuda` becomes `auto`, which is the same where there is a GPU.
+    """
+    checks.remove_start_weights(config)
+    terms = OmegaConf.select(config, "model.loss.terms") or {}
+    for name in list(terms):
+        targets = [str(part._target_) for part, _ in checks.each_part(terms[name])]
+        if any(target.endswith(PERCEPTUAL_TERMS) for target in targets):
+            terms[name] = None
+    if OmegaConf.select(config, "model.rasterizer._target_") == "completesplat.rasterizers.selection.cuda":
+        config.model.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
+    return config
