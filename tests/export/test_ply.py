@@ -1,5 +1,4 @@
 import dataclasses
-import re
 from unittest.mock import Mock
 
 import numpy as np
@@ -105,15 +104,7 @@ def test_gaussians_that_cannot_be_stored_are_left_out(tmp_path, caplog):
     assert write_ply(tmp_path / "a.ply", good[:0]) == read_ply(tmp_path / "a.ply").count == 0
 
 
-def test_broken_files_are_refused_in_one_line_with_their_name(tmp_path, written):
-    path = tmp_path / "bad.ply"
-    good = written[1]
-    without_property = good.replace(b"property float rot_3\n", b"property float rot_9\n")
-    for data in (b"", without_property):
-        path.write_bytes(data)
-        with pytest.raises(PlyError, match=re.escape(str(path))) as caught:
-            read_ply(path)
-        assert "\n" not in str(caught.value)
+def test_a_folder_is_no_file(tmp_path):
     with pytest.raises(PlyError, match="no such file"):
         read_ply(tmp_path)
 
