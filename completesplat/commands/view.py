@@ -116,10 +116,6 @@ def holds_scene(folder: Path) -> bool:
 
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     """Create a server's page and fill it with the scenes or the model that the settings name."""
-    import completesplat.commands.trained
-    import completesplat.viewer.completion
-    import completesplat.viewer.page  # noqa: F401
-
     check_parts(config)
     if config.watch is not None:
         note, samples, up = newest_scenes(Path(config.watch))
