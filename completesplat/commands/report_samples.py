@@ -79,7 +79,7 @@ def depth(
 
 
 def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Unpack[Run]) -> None:
-    """Write `calibration.json` and its figure, and print the table. `CompleteSplat.generate` explains both weights."""
+    """Write `calibration.json` and its figure, and print the table. `Sampling` explains both weights."""
     weights = {"skip_weight": skip_weight, "guidance_weight": guidance_weight}
     with _opened(run) as (renderer, scenes, tick):
         rows = calibration_rows(renderer, scenes, tick, **weights)

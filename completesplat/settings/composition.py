@@ -84,6 +84,8 @@ def nearest_names(verb: str) -> Iterator[None]:
     except MissingConfigException as error:
         group, _, option = (error.missing_cfg_file or "").strip("/").rpartition("/")
         known = options(group)
+        if not known:
+            raise
         message = f"no {group} {option!r}: there are {', '.join(known)}{did_you_mean(option, known)}"
         raise CompleteSplatError(message) from error
     except HydraException as error:
@@ -93,7 +95,9 @@ def nearest_names(verb: str) -> Iterator[None]:
         names = {*setting_names(_composed(verb)), *groups()}
         message = f"{unknown[0]}{did_you_mean(unknown[1], names)}"
         raise CompleteSplatError(message) from error
-    except ValueError as error:  # Hydra's, for `group=null`
+    except ValueError as error:
+        if not str(error).startswith("Config group override must be"):  # `group=null`
+            raise
         raise CompleteSplatError(str(error)) from error
 
 
