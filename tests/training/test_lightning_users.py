@@ -52,7 +52,8 @@ def test_validation_and_prediction_are_lightnings_own(pipeline):
 def test_overfit_batches_trains_and_validates_on_the_same_scenes_in_all_epochs(toy_root):
     class Seen(Callback):
         def __init__(self):
-            self.training, self.validation = [], []
+            self.training = []
+            self.validation = []
 
         def on_train_batch_start(self, trainer, model, batch, index):
             self.training.append(batch)
@@ -119,7 +120,8 @@ class Quadratic(Stage):
 def test_lightnings_search_for_a_learning_rate_sets_that_of_the_optimizer_and_its_schedule(tmp_path):
     batches = torch.utils.data.DataLoader([scene_batch(1, size=8)] * 200, batch_size=None, collate_fn=lambda x: x)
     run = {"max_steps": 4, "default_root_dir": tmp_path}
-    module, finder = Quadratic(), LearningRateFinder(num_training_steps=40)
+    module = Quadratic()
+    finder = LearningRateFinder(num_training_steps=40)
     quiet_trainer(callbacks=[finder], **run).fit(module, batches)
     found = finder.optimal_lr.suggestion()
     assert found > 1e-5
