@@ -131,7 +131,7 @@ def test_several_images_with_known_cameras_become_one_scene(completesplat: Run, 
 @pytest.mark.skipif(find_spec("viser") is None, reason="the extra completesplat[view] is not installed")
 def test_a_photograph_is_viewed_on_a_page_until_it_is_interrupted(folder: Path, installed) -> None:
     shutil.copy(FRUIT, folder / "photo.jpg")
-    program = [installed.environment / "bin/completesplat", "view", "photo.jpg", "port=0"]
+    program = [installed.environment / "bin/completesplat", "view", "photo.jpg"]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     environment |= {"PYTHONUNBUFFERED": "1"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
