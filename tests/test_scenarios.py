@@ -165,7 +165,7 @@ def test_the_lines_with_lightning_train_score_and_save(completesplat: Run, pytho
     small = ", ".join(f"'{setting}'" for setting in ["data.root=DATA", *TRAINING])
     trainer = "Trainer(max_steps=20)", "Trainer(max_steps=2, accelerator='cpu')"
     lines = replaced(python_block("With Lightning"), ('"data.root=DATA"', small), trainer)
-    lines += "\nimport pathlib\nprint(scores['test/full/novel/psnr'])\nbest.save_weights(pathlib.Path('W'))\n"
+    lines += "\nimport pathlib\nmodel.save_weights(pathlib.Path('W'))\nprint(scores['test/full/novel/psnr'])\n"
     assert 0 < float(python("-c", lines).splitlines()[-1]) < 100
     photo = next(folder.glob("DATA/*/*/images/*.jpg"))
     completesplat("predict", f"image={photo}", "weights=W", "video=[]", "out=SCENES")
