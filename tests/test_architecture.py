@@ -70,7 +70,8 @@ def module_name(path: str) -> str:
 
 
 def upward_imports(trees: Mapping[str, ast.AST]) -> list[str]:
-    result, known = [], {module_name(path) for path in FILES}
+    result = []
+    known = {module_name(path) for path in FILES}
     for path, tree in trees.items():
         own = floor(path)
         for module in imported_files(tree, path, known):

@@ -96,7 +96,7 @@ PUBLISHED = [
     Refused(published(data={"training_resolution": None}), WeightsError, Y, "data.training_resolution is None"),
     Refused(content(Y, CALL), WeightsError, Y, "not readable as YAML"),
     Refused(content(Y, b"a: &a [1, 2]\nb: [*a, *a]"), WeightsError, Y, "has aliases"),
-    Refused(content(Y, b"just text"), WeightsError, Y, "no section data"),
+    Refused(content(Y, b"just text"), WeightsError, Y, "data.training_resolution is None"),
     Refused(gone(Y), WeightsError, P, f"{Y} is missing beside it"),
     Refused(gone(P), WeightsError, P, "no such file"),
     Refused(cut(P, 0), WeightsError, P, "damaged"),

@@ -131,7 +131,7 @@ def test_several_images_with_known_cameras_become_one_scene(completesplat: Run, 
 @pytest.mark.skipif(find_spec("viser") is None, reason="the extra completesplat[view] is not installed")
 def test_a_photograph_is_viewed_on_a_page_until_it_is_interrupted(folder: Path, installed) -> None:
     shutil.copy(FRUIT, folder / "photo.jpg")
-    program = [installed.environment / "bin/completesplat", "view", "photo.jpg", "port=0"]
+    program = [installed.environment / "bin/completesplat", "view", "photo.jpg"]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     environment |= {"PYTHONUNBUFFERED": "1"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
@@ -149,9 +149,8 @@ def test_a_photograph_is_viewed_on_a_page_until_it_is_interrupted(folder: Path, 
 
 
 def test_doctor_lists_what_this_machine_has(completesplat: Run) -> None:
-    printed = completesplat("doctor")
-    for name in ("torch", "Node.js", "Blender"):
-        assert name in printed
+    named = {line.split()[0] for line in completesplat("doctor").splitlines() if line.strip()}
+    assert {"torch", "rasterizer", "extra", "node", "blender"} <= named
 
 
 def test_the_lines_of_python_write_a_scene(python: Run, folder: Path) -> None:
@@ -166,7 +165,7 @@ def test_the_lines_with_lightning_train_score_and_save(completesplat: Run, pytho
     small = ", ".join(f"'{setting}'" for setting in ["data.root=DATA", *TRAINING])
     trainer = "Trainer(max_steps=20)", "Trainer(max_steps=2, accelerator='cpu')"
     lines = replaced(python_block("With Lightning"), ('"data.root=DATA"', small), trainer)
-    lines += "\nimport pathlib\nprint(scores['test/full/novel/psnr'])\nbest.save_weights(pathlib.Path('W'))\n"
+    lines += "\nimport pathlib\nmodel.save_weights(pathlib.Path('W'))\nprint(scores['test/full/novel/psnr'])\n"
     assert 0 < float(python("-c", lines).splitlines()[-1]) < 100
     photo = next(folder.glob("DATA/*/*/images/*.jpg"))
     completesplat("predict", f"image={photo}", "weights=W", "video=[]", "out=SCENES")
