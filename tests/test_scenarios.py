@@ -233,4 +233,4 @@ def test_without_data_toys_are_made_on_first_use(completesplat: Run, folder: Pat
 def test_a_part_of_ones_own_comes_with_a_test_that_passes(completesplat: Run, python: Run, folder: Path) -> None:
     completesplat("new", "loss", "edges")
     assert (folder / "conf/loss/edges.yaml").is_file()
-    assert "1 passed" in python("-m", "pytest", "-q", "test_loss_edges.py")
+    assert " passed in " in python("-m", "pytest", "-q", "test_loss_edges.py")
