@@ -183,6 +183,6 @@ def test_the_system_may_take_large_free_memory() -> None:
 @pytest.mark.processes
 def test_memory_that_is_in_use_when_the_interpreter_ends() -> None:
     """Python clears the kernels' module before the main one, which holds the array."""
-    code = "from completesplat.rasterizers.kernels import drawing; array = runtime.empty((3,))"
+    code = "from completesplat.rasterizers.kernels import runtime; array = runtime.empty((3,))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT)
     assert (result.returncode, result.stderr) == (0, "")
