@@ -4,7 +4,6 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from signal import SIGINT
 from typing import Any
 
 from omegaconf import DictConfig
@@ -13,7 +12,6 @@ from completesplat.commands.locks import is_running
 from completesplat.errors import CompleteSplatError, needing
 from completesplat.files import SPLATS, printable
 from completesplat.settings.checks import REMOVE, check_parts
-from completesplat.signals import Interrupted
 from completesplat.weights import AUTO, CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, shipped
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
@@ -55,9 +53,6 @@ def run(config: DictConfig, out: Path) -> None:
             time.sleep(PAUSE)
             if config.watch is not None:
                 step = show_newest(page, Path(config.watch), step)
-    except Interrupted as stop:
-        if stop.signal != SIGINT:
-            raise
     finally:
         stop_server(server) if page is None else page.close()
 
