@@ -10,8 +10,6 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from completesplat.imports import importing
-
 if TYPE_CHECKING:
     from completesplat.export.ply import read_ply as read_ply
     from completesplat.export.ply import write_ply as write_ply
@@ -25,17 +23,24 @@ if TYPE_CHECKING:
 if "torch" not in sys.modules:
     os.environ.setdefault("GOMP_SPINCOUNT", "1500")
 
-_PLACES = {"CompleteSplat": "generator", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
-_PLACES |= {"compose": "settings.composition", "instantiate": "commands.fit", "__version__": "version"}
-_PLACES |= {"LatentDiffusion": "training.latent_diffusion", "ReconstructionModule": "training.reconstruction"}
+_PLACES = {
+    "CompleteSplat": "generator",
+    "Gaussians": "gaussians",
+    "LatentDiffusion": "training.latent_diffusion",
+    "ReconstructionModule": "training.reconstruction",
+    "__version__": "version",
+    "compose": "settings.composition",
+    "instantiate": "commands.fit",
+    "read_ply": "export.ply",
+    "write_ply": "export.ply",
+}
 
 
 def __getattr__(name: str) -> object:
     """Import a public name when it is first used, so that importing the package does not import torch."""
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    with importing():
-        return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -8,7 +8,10 @@ VERBS = ("data", "plan", "fit", "test", "predict", "view", "report", "new", "ben
 
 
 def main() -> None:
-    """Run the command; exit with status 0 only if everything worked, 2 for a refused input, 1 for other failures."""
+    """Run the command.
+
+    The exit status is 0 only if everything worked, 2 for a refused input, 1 for other failures.
+    """
     try:
         try:
             _run()
@@ -16,13 +19,19 @@ def main() -> None:
             if sys.stdout is not None:
                 sys.stdout.flush()
     except OSError:
-        try:
-            os.write(sys.stdout.fileno(), b"\n")
-        except OSError as error:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            closed = isinstance(error, BrokenPipeError)  # by the reader of the output (`head`, say)
-            sys.exit(1 if closed else _refuse(f"standard output: cannot be written: {error.strerror}", 1))
+        _check_output()
         raise
+
+
+def _check_output() -> None:
+    """Exit with status 1 if standard output cannot be written, in silence if its reader (`head`, say) has closed it."""
+    try:
+        os.write(sys.stdout.fileno(), b"\n")
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more is written when Python ends
+        if not isinstance(error, BrokenPipeError):
+            _refuse(f"standard output: cannot be written: {error.strerror}")
+        sys.exit(1)
 
 
 def _run() -> None:
@@ -60,12 +69,11 @@ def _run() -> None:
 
 def _help() -> None:
     """Print the verbs with their descriptions in `conf/`."""
-    from completesplat.settings.options import read_conf_file
+    from completesplat.settings.help import describe
 
     print("usage: completesplat VERB [key=value ...]      completesplat VERB --help\n")
     for verb in VERBS:
-        descriptions = {setting.key: setting.value for setting in read_conf_file(verb).settings}
-        print(f"  {verb:9} {descriptions['description']}")
+        print(f"  {verb:9} {describe(verb)}")
 
 
 def _refuse(message: str, status: int = 2) -> int:

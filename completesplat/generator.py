@@ -16,12 +16,12 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.encoder import Features, Images
 from completesplat.autoreconstructor.model import DepthRange, VariationalAutoReconstructor
 from completesplat.baselines.splatter_image.model import PublishedModel, is_published
-from completesplat.diffusion.guidance import Denoise, Latents, allowed_skip_weight
+from completesplat.diffusion.denoiser import Denoise, Latents
+from completesplat.diffusion.guidance import allowed_skip_weight, in_bfloat16
 from completesplat.diffusion.sampling import (
     PART,
     Sampler,
     draw_noise,
-    in_bfloat16,
     in_parts,
     one_thread_each,
     part_of,

@@ -18,6 +18,8 @@ ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
 
 _received: int | None = None
 _kept = False
+_handled: list[signal.Signals] = []
+"""Signals that `ended_by_signals` handles now."""
 
 
 class Interrupted(SystemExit):
@@ -37,19 +39,28 @@ def ended_by_signals() -> Iterator[None]:
     global _received, _kept
     plain = (signal.SIG_DFL, signal.default_int_handler)
     ours = [number for number in ENDING if signal.getsignal(number) in plain]
-    if threading.current_thread() is not threading.main_thread():
-        ours = []
+    if not ours or threading.current_thread() is not threading.main_thread():
+        yield
+        return
     before = {number: signal.signal(number, _first) for number in ours}
+    _handled.extend(ours)
     try:
         yield
-        if ours and _received is not None:
+        if _received is not None:
             raise Interrupted(_received)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        if ours:
-            _received = None
-            _kept = False
+        _handled.clear()
+        _received = None
+        _kept = False
+
+
+def restore_handlers() -> None:
+    """Put the handlers of `ended_by_signals` back where another library has set its own."""
+    if _received is None:
+        for number in _handled:
+            signal.signal(number, _first)
 
 
 def received() -> int | None:

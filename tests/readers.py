@@ -26,6 +26,8 @@ from completesplat.data.rendered.rendering import render
 from completesplat.data.sequences import SequenceSource
 from completesplat.errors import DataError, refused_to
 from completesplat.export.ply import write_ply
+from completesplat.export.reading import read_gaussians
+from completesplat.gaussians import Gaussians
 from completesplat.ply_files import read_vertices
 from completesplat.training.encoding import FrameEncoder, encode_training_set
 from completesplat.viewer.sample import read_newest, read_scene
@@ -141,6 +143,11 @@ def write_prediction(folder: Path) -> None:
     (folder / "scenes.json").write_text(json.dumps({"step": 3, "up": UP, "scenes": rows}))
 
 
+def read_only_file(folder: Path) -> Gaussians:
+    (path,) = folder.iterdir()
+    return read_gaussians(path)
+
+
 def write_meshes(folder: Path) -> None:
     """Write a triangle in a folder of meshes, private files beside it, and a program that stands in for Blender."""
     (folder / "outside").mkdir()
@@ -173,6 +180,7 @@ READERS = {
     "ply": Reader(
         lambda folder: write_ply(folder / "a.ply", some_gaussians(1)[0]), lambda f: read_vertices(f / "a.ply", "xyz")
     ),
+    "splats": Reader(lambda folder: write_ply(folder / "a.ply", SCENE), read_only_file),
     "meshes": Reader(write_meshes, read_meshes),
 }
 

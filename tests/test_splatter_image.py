@@ -58,7 +58,8 @@ def test_each_gaussian_projects_onto_its_own_pixel():
 
 
 def test_offset_is_linear_in_the_cameras_frame_and_color_the_zeroth_harmonic_cut_at_black():
-    offset, raw = torch.tensor([0.3, -0.2, 0.1]), torch.tensor([1.0, -5.0, 0.0])
+    offset = torch.tensor([0.3, -0.2, 0.1])
+    raw = torch.tensor([1.0, -5.0, 0.0])
     changed = image_of(offset=offset.view(1, 1, 3, 1, 1), color=raw.view(1, 1, 3, 1, 1)).gaussians(CAMERA, RANGE)
     torch.testing.assert_close(changed.means - image_of().gaussians(CAMERA, RANGE).means, offset.expand(1, 72, 3))
     torch.testing.assert_close(changed.colors[0, 0], torch.tensor([0.5 + 1 / (2 * math.sqrt(math.pi)), 0.0, 0.5]))
@@ -147,7 +148,8 @@ def test_gaussians_in_front_of_the_depth_range_can_be_left_out(back, drawn):
 
 @pytest.mark.parametrize("degree", [1, 2])
 def test_harmonics_add_raw_values_at_the_end_of_a_layer_and_hardly_matter_at_first(degree):
-    plain, further = Parameterization(), Parameterization(harmonics=degree)
+    plain = Parameterization()
+    further = Parameterization(harmonics=degree)
     count = 3 * ((degree + 1) ** 2 - 1)
     assert further.channels == plain.channels + 2 * count
     torch.manual_seed(0)

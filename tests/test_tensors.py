@@ -29,7 +29,8 @@ class Outer(TensorDataclass):
 
 
 def make(index: int = 0) -> Outer:
-    floats, integers = torch.arange(6.0).reshape(2, 3) + index, torch.arange(2) + 2**40 + index
+    floats = torch.arange(6.0).reshape(2, 3) + index
+    integers = torch.arange(2) + 2**40 + index
     inner = Inner(torch.full((2, 5), float(index)))
     return Outer(floats, integers, torch.tensor([True, False]), inner, f"scene{index}")
 

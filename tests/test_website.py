@@ -56,7 +56,8 @@ def test_relative_links_of_the_source_lead_to_its_files(tree):
 
 
 def test_the_page_of_weights_has_the_scores_of_each_card_and_the_gallery_each_sample(tree):
-    weights, gallery = (tree / "weights.md").read_text(), (tree / "gallery.md").read_text()
+    weights = (tree / "weights.md").read_text()
+    gallery = (tree / "gallery.md").read_text()
     for card in CARDS:
         rows = re.findall(r"^\|.*\|$", card.read_text().split("## Scores")[1].split("## ")[0], re.MULTILINE)
         assert len(rows) > 3

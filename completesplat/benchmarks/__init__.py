@@ -1,1 +1,1 @@
-"""Benchmarks of speed, with baselines that run side by side in one process. Nothing else imports this package."""
+"""Benchmark of the rasterizers, side by side in one process. Nothing else imports this package."""

@@ -12,10 +12,12 @@ import torch
 from hydra.utils import instantiate
 from rich.console import Console
 
-from completesplat.benchmarks.measuring import Row, report
 from completesplat.commands import quieten
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.provenance import machine
 from completesplat.evaluation.scorer import synchronized_time
+from completesplat.evaluation.tables import records_table, show
+from completesplat.files import write_json
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unproject
 from completesplat.quantities import Entries, Positive
@@ -24,6 +26,7 @@ from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.selection import FASTER, failure
 from completesplat.training.steps import DISTANCE, FOV_DEGREES, cameras_on_orbit, peak_megabytes
 
+Row = dict[str, object]  # of the table; its values can be written as JSON
 Sizes = Annotated[Sequence[Positive], Entries(1)]
 
 BACKENDS = {"reference": ReferenceRasterizer, **FASTER}
@@ -66,7 +69,12 @@ def run(
         quieten()
         tick = lambda text: status.update(f"timing {text}")  # noqa: E731
         rows = speed_rows(working, sizes, views, repeats, tick)
-    report(out / "rasterizers.json", {"not_measured": absent, "rows": rows}, {"Speed": rows})
+    here = machine()
+    write_json(out / "rasterizers.json", {"machine": here, "not_measured": absent, "rows": rows})
+    print(f"{here['processor']}, {here['threads']} threads, torch {here['torch']}, {here['date']}")
+    show(records_table("Speed", rows), width=140)
+    for name, reason in absent.items():
+        print(f"{name}: not measured, because {reason}")
 
 
 def working_backends(names: Sequence[str], constants: RenderingConstants) -> tuple[list[Backend], dict[str, str]]:

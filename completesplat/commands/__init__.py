@@ -17,10 +17,11 @@ from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryV
 from yaml import YAMLError
 
 from completesplat.commands import jobs, new
+from completesplat.commands.locks import hold_job_lock, one_of_several
 from completesplat.errors import CompleteSplatError
 from completesplat.files import file_refusal
 from completesplat.settings import composition, help
-from completesplat.settings.arguments import SWEEP, behind_dashes, for_hydra
+from completesplat.settings.arguments import SWEEP, for_hydra
 from completesplat.settings.options import conf_folder
 from completesplat.signals import end_with, ended_by_signals
 
@@ -42,10 +43,7 @@ def launch(verb: str, arguments: list[str]) -> None:
     # Lightning starts a further process of the job for each device.
     if arguments and arguments[0].startswith(jobs.PROCESS_OF_JOB):
         return _join_job(verb, arguments[0])
-    program = sys.argv[0]
-    original = arguments
-    arguments = behind_dashes(arguments)
-    if any(flag in arguments for flag in help.FLAGS) or (verb == "bench" and not arguments):
+    if any(flag in arguments for flag in help.FLAGS):
         return print(help.help_page(verb, arguments))
     if verb == "new":  # its files are the user's, and it has no folder for a job
         return new.run(composition.compose(verb, *arguments))
@@ -53,53 +51,56 @@ def launch(verb: str, arguments: list[str]) -> None:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     # Logging stays silent on a full disk, because the next file that is written reports it in one line.
     logging.raiseExceptions = False
-    arguments = for_hydra(verb, arguments)
-    if verb == "fit" and _shows_config(arguments):
-        return None
-    sweep = any(flag in arguments for flag in SWEEP)
-    _check_together(arguments, sweep)
-    sys.argv = [f"completesplat {verb}", *arguments, *(composition.sweep_arguments(verb, arguments) if sweep else [])]
+    program = sys.argv[0]
+    overrides = for_hydra(verb, arguments)
+    _check_start(overrides)
+    if is_sweep(overrides):
+        overrides += composition.sweep_arguments(verb, overrides)
+    sys.argv = [f"completesplat {verb}", *overrides]
     failures: list[Exception] = []
 
     def job(config: DictConfig) -> float | None:
         try:
-            with jobs.hold_job_lock(*jobs.job_folders(config)):
-                return jobs.run_job(verb, config, program, original)
+            with hold_job_lock(*jobs.job_folders(config)):
+                return jobs.run_job(verb, config, program, arguments)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # Hydra names the job, runs the others, and raises at the end
             failures.append(error)
             return None
 
-    with composition.nearest_names(verb, arguments):
+    with composition.nearest_names(verb):
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=verb)(job)()
     if failures:
         raise failures[0]
 
 
-def _shows_config(arguments: Sequence[str]) -> bool:
-    """Print the settings of `fit` for `--cfg job`, without parts that its stage does not use; return whether it did."""
-    flags = [text for text in arguments if text.startswith("-")]
-    asked = flags in (["--cfg=job"], ["-c=job"])
-    if asked:
-        config = composition.compose("fit", *(text for text in arguments if text not in flags))
-        print(OmegaConf.to_yaml(composition.without_unused_parts(config)))
-    return asked
+def is_sweep(overrides: Sequence[str]) -> bool:
+    """Return whether Hydra's flag for several jobs is among the arguments."""
+    return any(flag in overrides for flag in SWEEP)
 
 
-def _check_together(arguments: Sequence[str], sweep: bool) -> None:
-    """Raise CompleteSplatError if a sweep or a launcher of processes does not go with the arguments."""
-    if sweep and any(argument.startswith(("--cfg=", "-c=", "--info=", "-i=")) for argument in arguments):
-        raise CompleteSplatError("--cfg and --info show the settings of one run: leave out -m")
-    if jobs.one_of_several() and sweep:
+def _check_start(overrides: Sequence[str]) -> None:
+    """Raise CompleteSplatError for an empty `out`, and if a sweep or several processes do not go with the arguments."""
+    for empty in ("out=", "out=''", "out=null"):
+        if empty in overrides:
+            raise CompleteSplatError(f"{empty}: names no folder; give out=DIR")
+    if is_sweep(overrides) and any(argument.startswith("--cfg=") for argument in overrides):
+        raise CompleteSplatError("--cfg shows the settings of one run: leave out -m")
+    if not one_of_several():
+        return
+    if is_sweep(overrides):
         message = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
         raise CompleteSplatError(message)
-    if jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):
+    if not any(argument.startswith("out=") for argument in overrides):
         raise CompleteSplatError("torchrun or srun started several processes of this run: give them one out=DIR")
 
 
 def _join_job(verb: str, argument: str) -> None:
-    """Work on a job whose first process has started; end when that one ends."""
+    """Work on a job whose first process has started.
+
+    This process ends when that one ends.
+    """
     starter, _, out = argument.partition("=")[2].partition(":")
     end_with(int(starter))
     with ended_by_signals():
@@ -122,18 +123,28 @@ def quieten() -> None:
 def refusal(error: BaseException) -> str | None:
     """Return one line for an error that the user can put right, None for a fault of the program."""
     message: str | None = None
-    if (own_error := _own_error(error)) is not None:
+    own_error = _own_error(error)
+    if own_error is not None:
         message = str(own_error)
     elif isinstance(error, MissingMandatoryValue | InterpolationToMissingValueError):
-        named = str(error).partition("Missing mandatory value: ")[2].split()  # OmegaConf has it nowhere else
-        key = error.full_key if isinstance(error, MissingMandatoryValue) else named[0]
-        key = (key or "").removeprefix("task.")  # whose settings are given without
+        key = _missing_key(error)
         message = f"{key} is needed: give {key}=VALUE"
     elif isinstance(error, InstantiationException):
         message = _of_a_part(error)
     elif isinstance(error, HydraException | OmegaConfBaseException | YAMLError):
         message = str(error)
     return None if message is None else " ".join(message.split())
+
+
+def _missing_key(error: MissingMandatoryValue | InterpolationToMissingValueError) -> str:
+    """Return the setting without a value.
+
+    Those of a task are given without `task.`
+    """
+    key = error.full_key or ""
+    if isinstance(error, InterpolationToMissingValueError):  # whose key is that of the setting that refers to it
+        key = str(error).partition("Missing mandatory value: ")[2].split()[0]
+    return key.removeprefix("task.")
 
 
 def _of_a_part(error: InstantiationException) -> str | None:

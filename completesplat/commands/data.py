@@ -18,7 +18,10 @@ SplitNames = Annotated[Sequence[SplitName], Entries(1)]
 
 
 def check(data: Any, splits: SplitNames, workers: Positive | None, out: Path) -> None:
-    """Read everything once and write `check.json`; exit with status 1 when no sequence is usable."""
+    """Read everything once and write `check.json`.
+
+    The exit status is 1 when no sequence is usable.
+    """
     from completesplat.data.validation import audit
 
     try:
@@ -71,7 +74,10 @@ def prepare(
     on_bad: Literal["raise", "skip"],
     max_bad_fraction: float,
 ) -> None:
-    """Write packed data into `out`; see `completesplat.data.packed.preparation.prepare`."""
+    """Write packed data into `out`.
+
+    See `completesplat.data.packed.preparation.prepare`.
+    """
     from completesplat.data.packed import manifest, preparation
     from completesplat.data.tolerance import ErrorTolerance
 
@@ -98,7 +104,10 @@ def latents(
     num_nodes: Positive,
     conditioning: Any = None,
 ) -> None:
-    """Encode the training set of a stage-1 run into `out`; see `completesplat.training.encoding`."""
+    """Encode the training set of a stage-1 run into `out`.
+
+    See `completesplat.training.encoding`.
+    """
     from hydra.utils import instantiate
     from lightning import Fabric
 
@@ -125,7 +134,10 @@ def latents(
 
 
 def _sources(data: Any, splits: Sequence[str], tolerance: Any = None) -> dict[str, Any]:
-    """Return the sources of the splits that exist; by default each collects the errors in its files."""
+    """Return the sources of the splits that exist.
+
+    By default each collects the errors in its files.
+    """
     from completesplat.data.tolerance import SKIP_ALL
 
     data.tolerance = tolerance or SKIP_ALL

@@ -63,7 +63,10 @@ def instantiate(config: DictConfig) -> tuple[SceneDataModule, Scorer]:
 
 @stopped_together()
 def run(config: DictConfig, out: Path) -> None:
-    """Train and test; write `metrics.csv`, checkpoints and at the end `metrics.json` into the run directory."""
+    """Train and test.
+
+    Write `metrics.csv`, checkpoints and at the end `metrics.json` into the run directory.
+    """
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
     refuse_without_effect(config, out)
@@ -73,21 +76,19 @@ def run(config: DictConfig, out: Path) -> None:
     tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
     callbacks = built_parts(config.get("callbacks"))
     loggers = built_parts(config.get("logger"))
-    trainer = build(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
+    trainer: Trainer = build(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if tested is not None:
         tested.check_test()
     if trainer.is_global_zero:
-        # The last column and line count floating-point operations, which are 0 before the first step.
-        rows = str(ModelSummary(module, max_depth=2)).splitlines()
-        print("\n".join(row.rpartition("|")[0] or row for row in rows if not row.endswith("Total Flops")))
+        _print_layers(module)
         logger.info("batch: %s a step, data.batch_per_process=%d", counted(data.batch_size, "scene"), share)
     metrics = {}
     with wandb_runs(loggers, config):
         if isinstance(module, Stage):
-            metrics = _train(trainer, module, data, checkpoint, out)
+            metrics.update(_train(trainer, module, data, checkpoint, out))
         if tested is not None:
-            metrics |= _test(config, module, tested)
+            metrics.update(_test(config, module, tested))
         for run_logger in loggers:  # a run shorter than the logging interval has its figures too
             run_logger.log_metrics(metrics, step=trainer.global_step)
             run_logger.save()
@@ -98,13 +99,28 @@ def run(config: DictConfig, out: Path) -> None:
         if tested is not None and scores is not None:
             evaluation: Any = OmegaConf.to_container(config.evaluation, resolve=True)
             described = describe_test(evaluation, module, tested, scores, out) | _facts(trainer, out)
-            results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
-            show(evaluation_table({"protocol": described} | scores), width=160)
+            test = {"protocol": described, **scores}
+            results["upper_bound"] = module.upper_bound
+            results["test"] = test
+            show(evaluation_table(test), width=160)
         write_json(out / METRICS, results)  # the last file, because it means that the job is done
 
 
+def _print_layers(module: Scorer) -> None:
+    """Print the parts of a module with their sizes."""
+    for row in str(ModelSummary(module, max_depth=2)).splitlines():
+        # The last column and line count floating-point operations, which are 0 before the first step.
+        if not row.endswith("Total Flops"):
+            print(row.rpartition("|")[0] or row)
+
+
 def _train(trainer: Trainer, module: Stage, data: SceneDataModule, resumed: str | None, out: Path) -> dict[str, float]:
-    """Train, save the weights, and return all logged figures; refuse a checkpoint of another model."""
+    """Train, save the weights, and return all logged figures.
+
+    Raises:
+        WeightsError: the checkpoint to continue from is of another model.
+        CompleteSplatError: Lightning refuses a setting of its trainer.
+    """
     try:
         trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
     except MisconfigurationException as error:
@@ -121,15 +137,21 @@ def _train(trainer: Trainer, module: Stage, data: SceneDataModule, resumed: str 
 
 def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
     """Return the checkpoint that the run continues from, if any, and remove other weights from the config."""
-    path = newest_whole(out / LAST) if config.ckpt_path == "last" else config.ckpt_path
-    if path is None:
-        if config.ckpt_path == "last":
-            logger.info("ckpt_path=last: there is no checkpoint in %s, so the training begins", out)
+    if config.ckpt_path is None:
         return None
-    path = Path(path, LAST) if Path(path).is_dir() else path
-    if not Path(path).is_file():
+    if config.ckpt_path == "last":
+        newest = newest_whole(out / LAST)
+        if newest is None:
+            logger.info("ckpt_path=last: there is no checkpoint in %s, so the training begins", out)
+            return None
+        path = Path(newest)
+    else:
+        path = Path(config.ckpt_path)
+    if path.is_dir():
+        path = path / LAST
+    if not path.is_file():
         raise WeightsError(f"{path}: no such checkpoint")
-    check_whole(Path(path))  # now, because data may be made first
+    check_whole(path)  # now, because data may be made first
     checks.remove_start_weights(config.model)
     return str(path)
 
@@ -150,11 +172,14 @@ def refuse_without_effect(config: DictConfig, out: Path) -> None:
 
 def refuse_missing(config: DictConfig) -> None:
     """Raise CompleteSplatError, with an example, for a setting of data or model that is missing or an empty text."""
-    examples = {"root": "DIR"} | checks.START_WEIGHTS
-    missing = [key for part in (config.data, config.model) for key in sorted(OmegaConf.missing_keys(part))]
-    missing += [f"model.{key}" for key in sorted(examples) if config.model.get(key) == ""]
-    for key in missing[:1]:
-        raise CompleteSplatError(f"{key} is needed: give {key}={examples.get(key.rpartition('.')[2], 'VALUE')}")
+    examples = {"root": "DIR", **checks.START_WEIGHTS}
+    missing = sorted(OmegaConf.missing_keys(config.data)) + sorted(OmegaConf.missing_keys(config.model))
+    for key in sorted(examples):
+        if config.model.get(key) == "":
+            missing.append(f"model.{key}")
+    if missing:
+        example = examples.get(missing[0].rpartition(".")[2], "VALUE")
+        raise CompleteSplatError(f"{missing[0]} is needed: give {missing[0]}={example}")
 
 
 def _logged(trainer: Trainer) -> dict[str, float]:
@@ -164,8 +189,14 @@ def _logged(trainer: Trainer) -> dict[str, float]:
 def _test(config: DictConfig, module: Scorer, data: SceneDataModule) -> dict[str, float]:
     """Score as `completesplat test` does, in the protocol's precision, and return all logged figures."""
     progress = build(OmegaConf.select(config, "callbacks.progress"), _convert_="all")
-    settings = {"callbacks": [] if progress is None else [progress], "logger": False, "enable_checkpointing": False}
-    trainer = build(config.trainer, precision=config.evaluation.precision, **settings, _convert_="all")
+    trainer = build(
+        config.trainer,
+        precision=config.evaluation.precision,
+        callbacks=[] if progress is None else [progress],
+        logger=False,
+        enable_checkpointing=False,
+        _convert_="all",
+    )
     trainer.test(module, datamodule=data, verbose=False)
     return _logged(trainer)
 

@@ -1,9 +1,9 @@
-"""Jobs, single or of a sweep: their folders, locks and records, and how they continue."""
+"""Jobs, single or of a sweep: their folders and records, and how they continue."""
 
+import gc
 import json
 import logging
 import os
-import platform
 import shlex
 import sys
 import time
@@ -14,18 +14,17 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
 
-from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from completesplat.commands.inputs import check_inputs
+from completesplat.commands.locks import LOCK, is_first_process
 from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.provenance import git_commit
 from completesplat.evaluation.records import job_entries, read_mapping
-from completesplat.files import UNFINISHED, atomic_path, write_bytes, write_json, writing
-from completesplat.imports import importing, postponing
+from completesplat.files import atomic_path, write_bytes, write_json
 from completesplat.settings.checks import check_parts_of_verb, check_values
 from completesplat.settings.composition import shard_folder, use_working_folder
 from completesplat.settings.options import did_you_mean
@@ -37,23 +36,13 @@ CONFIG = "config.yaml"
 RECORD = "run.json"
 METRICS = "metrics.json"
 LAST = RUN_CHECKPOINT
-LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
 OF_MACHINES = ("trainer.devices", "trainer.num_nodes", "trainer.strategy")
-MAY_CHANGE = ("ckpt_path", "data.allow_changed", "optimized_metric", "test", *OF_MACHINES)
+SCORES_CLASS = "evaluation.scoring._target_"  # named otherwise in earlier versions, and not part of the training
+MAY_CHANGE = ("ckpt_path", "data.allow_changed", "optimized_metric", "test", SCORES_CLASS, *OF_MACHINES)
 """Settings that may differ when a run continues, with all settings below them; also its end (`ENDS`)."""
 ENDS = ("trainer.max_steps", "trainer.max_epochs", "trainer.max_time")
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
-
-
-def one_of_several() -> bool:
-    """Return whether torchrun (`LOCAL_RANK`) or srun (`SLURM_STEP_NUM_TASKS`) started several of this process."""
-    return "LOCAL_RANK" in os.environ or int(os.environ.get("SLURM_STEP_NUM_TASKS", 1)) > 1
-
-
-def is_first_process() -> bool:
-    """Return whether this process is alone, or the first that torchrun (`RANK`) or srun (`SLURM_PROCID`) started."""
-    return int(os.environ.get("RANK", os.environ.get("SLURM_PROCID", 0))) == 0
 
 
 class LogFile(logging.FileHandler):
@@ -69,61 +58,6 @@ def job_folders(config: DictConfig) -> tuple[Path, Path]:
     """Return the folder of a job's record, and that of its results, which jobs that are its shards share."""
     folder = HydraConfig.get().runtime.output_dir
     return Path(folder), Path(folder.removesuffix(shard_folder(config)))
-
-
-@contextmanager
-def hold_job_lock(folder: Path, out: Path) -> Iterator[None]:
-    """Hold the lock of a job's folder in the job's first process; the lock file names process and computer.
-
-    The operating system releases the lock when the process ends, for whatever reason. The unfinished files of a killed
-    process are removed, except below the folders of other jobs.
-
-    Raises:
-        CompleteSplatError: another process holds the lock, or its path is a link or a folder; or a job that is no shard
-            and one that is would write into `out` at the same time.
-    """
-    path = folder / LOCK
-    if not is_first_process():
-        yield
-        return
-    if path.is_symlink() or path.is_dir():
-        raise CompleteSplatError(f"{path}: is a link or a folder, and the lock is a file; remove it")
-    try:
-        with writing(path):
-            lock = FileLock(path).acquire(blocking=False)
-    except Timeout:
-        raise _busy(folder) from None
-    with lock:
-        for other in out.glob("shard-*") if folder == out else [out]:
-            if is_running(other):
-                raise _busy(other)
-        with writing(path):
-            path.write_text(f"{os.getpid()}\n{platform.node()}\n")
-        for place, folders, names in os.walk(folder):
-            folders[:] = [name for name in folders if not Path(place, name, LOCK).exists()]
-            for name in filter(UNFINISHED.fullmatch, names):
-                Path(place, name).unlink(missing_ok=True)
-        yield
-
-
-def _busy(folder: Path) -> CompleteSplatError:
-    holder = (folder / LOCK).read_text().split()
-    named = f"process {holder[0]} on {holder[1]}" if len(holder) > 1 else "another process"
-    return CompleteSplatError(f"{folder}: {named} is at work in it: wait for it or end it, or choose another out=DIR")
-
-
-def is_running(out: Path) -> bool:
-    """Return whether a process of this computer holds the lock of a job's directory."""
-    path = out / LOCK
-    if not path.is_file():
-        return False
-    try:
-        with FileLock(path).acquire(timeout=0.2):  # for which another process may look, too
-            return False
-    except PermissionError:  # another user's run, which a lock cannot tell about
-        return False
-    except (Timeout, OSError):
-        return True
 
 
 def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> float | None:
@@ -142,50 +76,75 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
         print(f"{out}: finished before, not repeated")
         return optimized(config.get("optimized_metric"), out)
     first = is_first_process()
+    recorded = _recorded(folder, job_entries(verb, given, folder), resolved) if first else nullcontext()
+    others = _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{folder}"])
     try:
-        recorded = folder, job_entries(verb, given, folder), resolved
-        with ended_by_signals(), _recorded(*recorded) if first else nullcontext():
-            for key in ("checkpoint", "autoreconstructor_checkpoint"):
-                # The path may refer to the job's choices (`hydra:runtime.choices`), which `start` cannot resolve.
-                if path := OmegaConf.select(config, f"model.{key}"):
-                    config.model[key] = str(Path(path, LAST)) if Path(path).is_dir() else path
-            with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{folder}"]):
+        with ended_by_signals(), recorded:
+            _resolve_start_weights(config)
+            with others:
                 result = start(verb, config, out)
     except Interrupted as stop:
         if first:
             print(_how_to_continue(stop, verb, given, out), file=sys.stderr)
         raise
-    print(out, *([result] if isinstance(result, str) else []), sep="\n")
+    print(out)
+    if isinstance(result, str):
+        print(result)
     return optimized(config.get("optimized_metric"), out)
 
 
+def _resolve_start_weights(config: DictConfig) -> None:
+    """Replace the folders of runs that a training starts from by their checkpoints.
+
+    Their paths may refer to the job's choices (`hydra:runtime.choices`), which other processes cannot resolve.
+    """
+    for key in ("checkpoint", "autoreconstructor_checkpoint"):
+        path = OmegaConf.select(config, f"model.{key}")
+        if path:
+            config.model[key] = str(Path(path, LAST)) if Path(path).is_dir() else path
+
+
 def optimized(metric: str | None, out: Path) -> float | None:
-    """Return a job's metric for sweepers (NaN: not finite, None: not asked); raise CompleteSplatError if absent."""
+    """Return a job's metric for sweepers (NaN: not finite, None: not asked).
+
+    Raises:
+        CompleteSplatError: the job has no such metric.
+    """
     if metric is None:
         return None
-    known = {name: value for name, value in read_mapping(out / METRICS).items() if isinstance(value, float)}
-    if metric not in known:
-        available = f"there are {', '.join(known)}{did_you_mean(metric, known)}"
+    figures = {name: value for name, value in read_mapping(out / METRICS).items() if isinstance(value, float)}
+    if metric not in figures:
+        available = f"there are {', '.join(figures)}{did_you_mean(metric, figures)}"
         raise CompleteSplatError(f"optimized_metric={metric}: no figure in {out / METRICS}, {available}")
-    return known[metric]
+    return figures[metric]
 
 
 def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) -> str:
     """Return one line: the signal that ended a job, its checkpoint, and the command to continue the job or sweep."""
     hydra_config = HydraConfig.get()
-    begun = (out / LAST).is_file()
     sweep = hydra_config.mode == RunMode.MULTIRUN
-    replaced = ("out=", "ckpt_path=") if begun and not sweep else ("out=",)
-    again = ["completesplat", verb, *(argument for argument in given if not argument.lstrip("-").startswith(replaced))]
-    again += ["ckpt_path=last"] if begun and not sweep else []
-    again.append(f"out={hydra_config.sweep.dir if sweep else out}")
-    checkpoint = f"; the checkpoint is {out / LAST}" if begun else ""
-    return f"ended by {stop.signal.name}{checkpoint}; {'go on' if begun else 'start again'} with: {shlex.join(again)}"
+    begun = (out / LAST).is_file()
+    goes_on = begun and not sweep
+    replaced = ("out=", "ckpt_path=") if goes_on else ("out=",)
+    command = ["completesplat", verb]
+    command += [argument for argument in given if not argument.startswith(replaced)]
+    if goes_on:
+        command.append("ckpt_path=last")
+    command.append(f"out={hydra_config.sweep.dir if sweep else out}")
+    if begun:
+        return f"ended by {stop.signal.name}; the checkpoint is {out / LAST}; go on with: {shlex.join(command)}"
+    return f"ended by {stop.signal.name}; start again with: {shlex.join(command)}"
 
 
 def start(verb: str, config: DictConfig, out: Path) -> object:
-    """Check the settings and call the config's task or else the verb's `run`; return its result (a text is printed)."""
-    with importing(), postponing() if verb == "predict" else nullcontext():
+    """Check the settings and call the config's task or else the verb's `run`.
+
+    Returns:
+        The result of `run` or of the task. A text is printed.
+    """
+    first = "torch" not in sys.modules
+    gc.disable()  # it takes a third of a prediction's time to examine all that is imported again and again
+    try:
         check_values(verb, config)
         check_inputs(verb, config)
         check_parts_of_verb(verb, config)
@@ -193,6 +152,10 @@ def start(verb: str, config: DictConfig, out: Path) -> object:
             run = partial(import_module(f"completesplat.commands.{verb}").run, config, out)
         else:
             run = partial(instantiate, config.task, out=out, _convert_="all")
+    finally:
+        if first:
+            gc.freeze()
+        gc.enable()
     return run()
 
 
@@ -202,36 +165,42 @@ def is_finished(out: Path, config: Mapping[str, object], overrides: Sequence[str
     Raises:
         CompleteSplatError: the directory holds a run that would be lost, or that had other settings.
     """
-    begun = (out / METRICS).is_file() or any((out / LAST).parent.glob("*.ckpt"))
+    finished = (out / METRICS).is_file()
+    begun = finished or any((out / LAST).parent.glob("*.ckpt"))
     if "ckpt_path" not in config or not begun or not (out / CONFIG).is_file():
         return False
     if config["ckpt_path"] != "last":
         raise CompleteSplatError(f"{out} holds a run: continue it with ckpt_path=last, or choose another out=DIR")
     earlier = OmegaConf.load(out / CONFIG)
     _refuse_another_run(out, config, earlier, overrides)
-    finished = (out / METRICS).is_file()
-    if finished and _ends(config) != _ends(earlier):
+    if not finished:
+        return False
+    if _ends(config) != _ends(earlier):
         _refuse_earlier_end(out, _ends(config), _ends(earlier))
         return False
-    if finished and config.get("test") and not OmegaConf.select(earlier, "test", default=True):
+    if config.get("test") and not OmegaConf.select(earlier, "test", default=True):
         raise CompleteSplatError(f"{out} is finished, without a test: completesplat test ckpt={out}")
-    return finished
+    return True
 
 
 def _refuse_another_run(out: Path, config: Mapping[str, object], earlier: object, overrides: Sequence[str]) -> None:
     """Raise CompleteSplatError if a directory's run had settings that a run cannot continue with."""
     before = cast(dict[str, object], OmegaConf.to_container(earlier))
-    different = _differences(before, config, (str(before.get("out") or "/nowhere"), str(config.get("out"))))
+    moved = str(before.get("out") or "/nowhere"), str(config.get("out"))
+    different = _differences(before, config, moved)
     others = {key for key in different if not key.startswith((*MAY_CHANGE, *ENDS))}
     if not others:
         return
-    other_model = "model._target_" in others
-    # `model` repeats settings from outside it.
-    keys = [key for key in others if not key.startswith("model.") or key.removeprefix("model.") not in others]
-    names = ["model"] if other_model else sorted(keys, key=lambda key: (key.count("."), key))
-    listed = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
     advice = "choose another out=DIR"
-    if (out / LAST).is_file() and not other_model:
+    if "model._target_" in others:
+        raise CompleteSplatError(f"{out} holds a run with another model: {advice}")
+    # `model` repeats settings from outside it.
+    names = [key for key in others if key.removeprefix("model.") not in others - {key}]
+    names.sort(key=lambda key: (key.count("."), key))
+    listed = ", ".join(names[:3])
+    if len(names) > 3:
+        listed += f" and {len(names) - 3} more"
+    if (out / LAST).is_file():
         same = [argument for argument in overrides if not argument.startswith(("out=", "ckpt_path="))]
         again = shlex.join(["completesplat", "fit", *same, f"ckpt_path={out / LAST}", "out=MORE"])
         advice = f"give all settings of {out / RECORD} again, or continue in another folder: {again}"
@@ -254,17 +223,23 @@ def _refuse_earlier_end(out: Path, ends: Mapping[str, Any], earlier: Mapping[str
 
 def _differences(first: object, second: object, moved: tuple[str, str], key: str = "") -> set[str]:
     """Return the keys of settings that differ by more than the folder's move."""
-    if not isinstance(first, dict) or not isinstance(second, dict):
-        if isinstance(first, str) and f"{first}/".startswith(f"{moved[0]}/"):
-            first = moved[1] + first.removeprefix(moved[0])
-        return set() if first == second else {key}
-    parts = [(f"{key}.{part}".lstrip("."), part) for part in first.keys() | second.keys()]
-    return {name for place, part in parts for name in _differences(first.get(part), second.get(part), moved, place)}
+    if isinstance(first, dict) and isinstance(second, dict):
+        names: set[str] = set()
+        for part in first.keys() | second.keys():
+            place = f"{key}.{part}" if key else part
+            names |= _differences(first.get(part), second.get(part), moved, place)
+        return names
+    if isinstance(first, str) and f"{first}/".startswith(f"{moved[0]}/"):
+        first = moved[1] + first.removeprefix(moved[0])
+    return set() if first == second else {key}
 
 
 @contextmanager
 def _recorded(out: Path, job: Mapping[str, object], config: Mapping[str, object]) -> Iterator[None]:
-    """Record a job and its config; restore those of an earlier job if this one ends before it has written a file."""
+    """Record a job and its config.
+
+    Those of an earlier job are restored if this one ends before it has written a file.
+    """
     earlier = {path: path.read_bytes() for path in (out / RECORD, out / CONFIG) if path.is_file()}
     before = _written(out)
     renamed = _record(out, job, config)
@@ -283,27 +258,51 @@ def _recorded(out: Path, job: Mapping[str, object], config: Mapping[str, object]
 
 def _written(out: Path) -> set[tuple[int, int]]:
     """Return inode and time of change of each file of a job but its lock, record, config, log and W&B's files."""
-    paths = [path for path in out.rglob("*") if path.name not in (LOCK, RECORD, CONFIG, "wandb_id")]
-    paths = [path for path in paths if path.suffix != ".log" and "wandb" not in path.relative_to(out).parts]
-    return {(path.stat().st_ino, path.stat().st_mtime_ns) for path in paths if path.is_file()}
+    files = set()
+    for path in out.rglob("*"):
+        is_record = path.name in (LOCK, RECORD, CONFIG, "wandb_id") or path.suffix == ".log"
+        if is_record or "wandb" in path.relative_to(out).parts or not path.is_file():
+            continue
+        status = path.stat()
+        files.add((status.st_ino, status.st_mtime_ns))
+    return files
 
 
 def _record(out: Path, job: Mapping[str, object], config: Mapping[str, object]) -> Path | None:
-    """Write `run.json` with `job_entries`, times and earlier ends; rename earlier results and return their new name."""
+    """Write `run.json` with `job_entries`, times and earlier ends.
+
+    Returns:
+        The new name of earlier results, if there were any.
+    """
     path = out / RECORD
     now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
     record: dict[str, Any] = {"version": __version__, "commit": git_commit(), **job, "started": now}
     renamed = None
     if path.is_file() and (out / LAST).is_file():
         earlier = json.loads(path.read_text())
-        record |= {"started": earlier["started"], "continued": [*earlier.get("continued", []), now]}
-        record |= {"earlier_ends": earlier.get("earlier_ends", [])}
-        if "ckpt_path" in config and (before := _ends(OmegaConf.load(out / CONFIG))) != _ends(config):
-            record["earlier_ends"] += [{"until": now, "command": earlier["command"], **before}]
-            if (results := out / METRICS).is_file():
-                renamed = results.rename(out / f"metrics_{json.loads(results.read_text())['steps']}_steps.json")
+        record["started"] = earlier["started"]
+        record["continued"] = [*earlier.get("continued", []), now]
+        record["earlier_ends"] = earlier.get("earlier_ends", [])
+        if "ckpt_path" in config:
+            ends = _ends(OmegaConf.load(out / CONFIG))
+            if ends != _ends(config):
+                record["earlier_ends"].append({"until": now, "command": earlier["command"], **ends})
+                renamed = _rename_results(out)
     write_json(path, record)
     return renamed
+
+
+def _rename_results(out: Path) -> Path | None:
+    """Name the results of a run that goes on after their number of steps.
+
+    Returns:
+        The new path, or None if there are no results.
+    """
+    results = out / METRICS
+    if not results.is_file():
+        return None
+    steps = json.loads(results.read_text())["steps"]
+    return results.rename(out / f"metrics_{steps}_steps.json")
 
 
 def _ends(config: object) -> dict[str, Any]:

@@ -20,7 +20,10 @@ FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)  # line of a template that name
 
 
 def run(config: DictConfig) -> None:
-    """Write the part's files into the working folder; print their names and the commands that test and use them."""
+    """Write the part's files into the working folder.
+
+    Print their names and the commands that test and use them.
+    """
     kind = str(config.kind)
     name = str(config.name)
     files = new_files(kind, name)
@@ -35,16 +38,16 @@ def run(config: DictConfig) -> None:
 
 
 def new_files(kind: str, name: str) -> dict[Path, str]:
-    """Return a new part's files by path; raise CompleteSplatError if kind or name is unfit, or a file exists."""
+    """Return a new part's files by path.
+
+    Raises:
+        CompleteSplatError: kind or name is unfit, or a file exists.
+    """
     if kind not in KINDS:
         raise CompleteSplatError(f"kind={kind}: choose one of {', '.join(KINDS)}")
     if not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
         raise CompleteSplatError(f"name={name}: must be a Python name: letters, digits and underscores")
-    classes = "".join(word.capitalize() for word in name.split("_"))
-    text = (TEMPLATES / f"{kind}.txt").read_text().replace("@opened@\n", (TEMPLATES / "_opened.txt").read_text())
-    text = text.replace("@name@", name).replace("@Name@", classes)
-    _, *parts = FILE.split(text)
-    files = {Path(path): body.strip("\n") + "\n" for path, body in zip(parts[::2], parts[1::2], strict=True)}
+    files = filled_template(kind, name)
     for path in files:
         if path.exists():
             raise CompleteSplatError(f"{path}: exists already; choose another name")
@@ -53,4 +56,17 @@ def new_files(kind: str, name: str) -> dict[Path, str]:
     # Python searches the working folder last, so it would import the other module of this name.
     if Path(f"{name}.py") in files and find_spec(name) is not None:
         raise CompleteSplatError(f"name={name}: a module has this name; choose another name")
+    return files
+
+
+def filled_template(kind: str, name: str) -> dict[Path, str]:
+    """Return the files of a kind's template by path, with the part's name in them."""
+    text = (TEMPLATES / f"{kind}.txt").read_text()
+    text = text.replace("@opened@\n", (TEMPLATES / "_opened.txt").read_text())
+    class_name = "".join(word.capitalize() for word in name.split("_"))
+    text = text.replace("@name@", name).replace("@Name@", class_name)
+    _, *parts = FILE.split(text)  # paths and contents in turn
+    files = {}
+    for path, content in zip(parts[::2], parts[1::2], strict=True):
+        files[Path(path)] = content.strip("\n") + "\n"
     return files

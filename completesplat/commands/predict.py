@@ -91,7 +91,7 @@ def predict_on_device(
 def predict_share(
     config: DictConfig, images: Sequence[Path], outputs: OutputFiles, out: Path, process: int
 ) -> tuple[int, list[str]]:
-    """Predict every N-th image, from this process' first on, unless it is finished; N processes do all.
+    """Predict every N-th image, from this process' first on, unless it is finished. N processes do all.
 
     Returns:
         The number of images that were predicted, and the names of those that failed.
@@ -158,7 +158,7 @@ def predict_photo(
     rasterizer: Rasterizer,
     begin: Callable[..., None],
 ) -> None:
-    """Read one photo, generate its scenes and write their files; `begin` is told each step."""
+    """Read one photo, generate its scenes and write their files. `begin` is called with the name of each step."""
     remove = config.background == REMOVE
     if remove:
         begin("removing the background", advance=0)
@@ -230,7 +230,7 @@ def digest_of(config: DictConfig, model: SceneModel, image: Path) -> str:
 
 
 def report_failure(error: Exception, image: Path, is_only: bool) -> None:
-    """Print the error of one of several images; raise that of the only one."""
+    """Print the error of one of several images, or raise that of the only one."""
     is_fault = not isinstance(error, CompleteSplatError | OSError)
     if is_only and is_fault:
         raise error
@@ -280,7 +280,11 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], outputs: Outp
 
 
 def output_files(config: DictConfig) -> OutputFiles:
-    """Return the outputs for each image; raise CompleteSplatError for none, or a missing program."""
+    """Return the selected files for each image.
+
+    Raises:
+        CompleteSplatError: nothing is selected, or a program is missing.
+    """
     formats = _names(config.formats)
     videos = _names(config.video)
     if not formats and not videos:

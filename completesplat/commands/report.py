@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 
 
 def tables(runs: str | None, out: Path) -> None:
-    """Write `tables.md`, `.csv` and `.tex` of the results below `runs` (None: the published figures); print them."""
+    """Write `tables.md`, `.csv` and `.tex` of the results below `runs` (None: the published figures) and print them."""
     tree = None if runs is None else find_results(Path(runs))
     made = published_tables(tree)
     write_tables(made, out)
@@ -24,7 +24,7 @@ def tables(runs: str | None, out: Path) -> None:
 
 
 def summary(sweeps: Sequence[str], out: Path) -> None:
-    """Write and print the summary of a sweep in several folders; raise CompleteSplatError if a folder is missing."""
+    """Write and print the summary of a sweep in several folders, or raise CompleteSplatError if a folder is missing."""
     folders = [Path(sweep) for sweep in sweeps]
     for folder in folders:
         if not folder.is_dir():

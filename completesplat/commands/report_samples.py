@@ -66,7 +66,7 @@ def depth(
     out: Path,
     **run: Unpack[Run],
 ) -> None:
-    """Write `depth.json` and `depth.png`, and print the table; `conf/report_task/depth.yaml` explains the settings."""
+    """Write `depth.json` and `depth.png`, and print the table. `conf/report_task/depth.yaml` explains the settings."""
     weights = grid([skip_weight], [guidance_weight])
     with _opened(run) as (renderer, scenes, tick):
         rows = depth_rows(renderer, weights, scenes, far_degrees, tick)
@@ -79,7 +79,7 @@ def depth(
 
 
 def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Unpack[Run]) -> None:
-    """Write `calibration.json` and its figure, and print the table; `CompleteSplat.generate` explains both weights."""
+    """Write `calibration.json` and its figure, and print the table. `Sampling` explains both weights."""
     weights = {"skip_weight": skip_weight, "guidance_weight": guidance_weight}
     with _opened(run) as (renderer, scenes, tick):
         rows = calibration_rows(renderer, scenes, tick, **weights)
@@ -90,7 +90,7 @@ def calibration(skip_weight: Share, guidance_weight: Share, out: Path, **run: Un
 
 
 def ladder(fits: Positive, out: Path, **run: Unpack[Run]) -> None:
-    """Write `ladder.json`, and print the table; `ladder_rows` explains its rows."""
+    """Write `ladder.json`, and print the table. `ladder_rows` explains its rows."""
     with _opened(run) as (renderer, scenes, tick):
         rows = ladder_rows(renderer, scenes, fits, tick)
     title = f"Where quality is lost: all views and those from behind, PSNR (dB), {counted(len(scenes), 'scene')}"

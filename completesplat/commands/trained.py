@@ -26,7 +26,7 @@ from completesplat.weights.runs import config_of_run
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
-    from completesplat.evaluation.scene_files import SceneFiles
+    from completesplat.evaluation.ply_samples import PlySamples
     from completesplat.evaluation.scorer import Scorer
 
 logger = logging.getLogger(__name__)
@@ -169,11 +169,11 @@ class GivenScenes(TrainedModel):
     seed: int
 
     @cached_property
-    def files(self) -> "SceneFiles":
-        from completesplat.evaluation.scene_files import SceneFiles
+    def files(self) -> "PlySamples":
+        from completesplat.evaluation.ply_samples import PlySamples
 
         rendering = _rendering(self.rasterizer, self.data.get("background"))
-        return SceneFiles(self.scenes, self.frame, self.align, self.method, **rendering)
+        return PlySamples(self.scenes, self.frame, self.align, self.method, **rendering)
 
     def configuration(self) -> Any:
         """Return the config of the data."""

@@ -4,17 +4,14 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from signal import SIGINT
 from typing import Any
 
 from omegaconf import DictConfig
 
-from completesplat.commands.jobs import is_running
+from completesplat.commands.locks import is_running
 from completesplat.errors import CompleteSplatError, needing
 from completesplat.files import SPLATS, printable
-from completesplat.imports import importing, postponing
 from completesplat.settings.checks import REMOVE, check_parts
-from completesplat.signals import Interrupted
 from completesplat.weights import AUTO, CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, shipped
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
@@ -25,7 +22,7 @@ AT_STEP = "step {} of the training"
 
 
 def run(config: DictConfig, out: Path) -> None:
-    """Open the page, fill it and stay until Ctrl-C; with `export`, write it to a file instead.
+    """Open the page, fill it and stay until Ctrl-C, or write it to a file with `export`.
 
     The page first says that it is loading, because importing torch takes a second and loading the model longer. The
     address of a page with the user's own files is printed when they are read, because they may be refused.
@@ -56,9 +53,6 @@ def run(config: DictConfig, out: Path) -> None:
             time.sleep(PAUSE)
             if config.watch is not None:
                 step = show_newest(page, Path(config.watch), step)
-    except Interrupted as stop:
-        if stop.signal != SIGINT:
-            raise
     finally:
         stop_server(server) if page is None else page.close()
 
@@ -73,7 +67,7 @@ def check_asked(config: DictConfig) -> None:
 
 
 def setting_of_path(path: Path) -> dict[str, str]:
-    """Return the setting (`scene`, `image`, `weights`, `watch`) for a path; raise CompleteSplatError if none fits."""
+    """Return the setting (`scene`, `image`, `weights`, `watch`) for a path, or raise CompleteSplatError."""
     if path.is_file():
         return {setting_of_file(path): str(path)}
     if not path.is_dir():
@@ -117,12 +111,7 @@ def holds_scene(folder: Path) -> bool:
 
 def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     """Create a server's page and fill it with the scenes or the model that the settings name."""
-    with importing(), postponing():
-        import completesplat.commands.trained
-        import completesplat.viewer.completion
-        import completesplat.viewer.page  # noqa: F401
-
-        check_parts(config)
+    check_parts(config)
     if config.watch is not None:
         note, samples, up = newest_scenes(Path(config.watch))
         page = empty_page(server, config, out, up)
@@ -194,7 +183,11 @@ def empty_page(
 
 
 def newest_scenes(run: Path) -> tuple[str, Sequence[Any], Sequence[float]]:
-    """Wait for a run's fixed scenes; return a note on their step, scenes and up, or raise CompleteSplatError."""
+    """Wait for a run's fixed scenes, and return a note on their step, the scenes and the direction up.
+
+    Raises:
+        CompleteSplatError: the run draws no fixed scenes.
+    """
     from completesplat.viewer.sample import NEWEST_FILE, read_newest
 
     folder = run / NEWEST
@@ -209,7 +202,7 @@ def newest_scenes(run: Path) -> tuple[str, Sequence[Any], Sequence[float]]:
 
 
 def show_newest(page: Any, run: Path, newest: int | None) -> int | None:
-    """Show what the run has written after step `newest` (None: after the page was made); return its newest step."""
+    """Show what the run has written after step `newest`, and return its newest step. None: after the page was made."""
     from completesplat.viewer.sample import read_newest
 
     try:
@@ -222,7 +215,7 @@ def show_newest(page: Any, run: Path, newest: int | None) -> int | None:
 
 
 def export(page: Any, path: Path) -> None:
-    """Write the page to a file when its work is done; raise CompleteSplatError if the page shows no scene."""
+    """Write the page to a file when its work is done, or raise CompleteSplatError if it shows no scene."""
     from completesplat.viewer.page import write_viewer_page
 
     page.worker.wait()

@@ -1,16 +1,21 @@
 """Denoisers eps_theta(h_t, phi_ref, t): Stable Diffusion's UNet on [conditioning, noisy latent]."""
 
+from collections.abc import Callable
 from typing import Any, TypedDict, Unpack
 
 import torch
 from diffusers import UNet2DConditionModel, UNet2DModel
 from diffusers.models.attention import BasicTransformerBlock
 from diffusers.models.attention_processor import Attention, AttnProcessor2_0
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from completesplat.diffusion.guidance import Conditioning, Latents
 from completesplat.quantities import Few, Levels, Width, Widths
+
+Latents = Float[Tensor, "batch channel height width"]
+Conditioning = Float[Tensor, "batch feature height width"]
+Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Denoiser: (noisy latent, timestep, conditioning) -> predicted noise."""
 
 
 class Sizes(TypedDict, total=False):

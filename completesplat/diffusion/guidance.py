@@ -4,18 +4,12 @@ Guidance has the paper's meaning: a weight w mixes in the unconditional predicti
 visible content.
 """
 
-from collections.abc import Callable
-
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
+from completesplat.diffusion.denoiser import Conditioning, Denoise, Latents
 from completesplat.errors import CompleteSplatError
-
-Latents = Float[Tensor, "batch channel height width"]
-Conditioning = Float[Tensor, "batch feature height width"]
-Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Denoiser: (noisy latent, timestep, conditioning) -> predicted noise."""
 
 
 def allowed_skip_weight(given: float | None, visible: Tensor | None = None) -> float:
@@ -60,3 +54,9 @@ def guided_noise(
     both = denoise(noisy_latent.repeat(2, 1, 1, 1), timestep.repeat(2), torch.cat([conditioning, nothing]))
     conditional, unconditional = both.chunk(2)
     return (1 - weight) * conditional + weight * unconditional
+
+
+def in_bfloat16(denoise: Denoise, *inputs: Tensor) -> Latents:
+    """Call a denoiser whose matrix products and convolutions are computed in bfloat16."""
+    with torch.autocast(inputs[0].device.type, torch.bfloat16):
+        return denoise(*inputs)

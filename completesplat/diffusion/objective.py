@@ -16,7 +16,7 @@ from diffusers.configuration_utils import ConfigMixin
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from completesplat.diffusion.guidance import Latents
+from completesplat.diffusion.denoiser import Latents
 from completesplat.errors import CompleteSplatError
 
 PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")

@@ -14,7 +14,8 @@ from diffusers import DDIMScheduler
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from completesplat.diffusion.guidance import Conditioning, Denoise, Latents, guided_noise
+from completesplat.diffusion.denoiser import Conditioning, Denoise, Latents
+from completesplat.diffusion.guidance import guided_noise
 from completesplat.diffusion.objective import clean_estimate, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
 from completesplat.quantities import Range
@@ -194,12 +195,6 @@ def one_thread_each(denoiser: nn.Module, device: torch.device) -> Iterator[int]:
 def part_of(count: int) -> int:
     """Return how many of `count` samples a thread draws at a time: half of them, as large parts take less time each."""
     return min(max(count // 2, PART), LARGEST_PART)
-
-
-def in_bfloat16(denoise: Denoise, *inputs: Tensor) -> Latents:
-    """Call a denoiser whose matrix products and convolutions are computed in bfloat16."""
-    with torch.autocast(inputs[0].device.type, torch.bfloat16):
-        return denoise(*inputs)
 
 
 def in_parts(draw: Callable[[slice], T], count: int, most: int | None = None, threads: int = 0) -> list[T]:

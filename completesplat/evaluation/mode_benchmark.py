@@ -13,10 +13,10 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.evaluation.mode_predictors import OTHER_SCENE, Predictor, Renders, predictors
+from completesplat.evaluation.ply_samples import PlySamples
 from completesplat.evaluation.protocol import sampler_settings
 from completesplat.evaluation.provenance import provenance
 from completesplat.evaluation.records import MODEL
-from completesplat.evaluation.scene_files import SceneFiles
 from completesplat.evaluation.scorer import Scorer
 from completesplat.evaluation.studies.samples import mean_over_scenes
 from completesplat.export.images import Sheet, SheetCell, image_sheet, write_png
@@ -27,7 +27,7 @@ from completesplat.quantities import Natural, Positive, Range
 
 
 class HiddenModesEvaluation(TypedDict):
-    """Numbers of samples, scenes and views; `conf/evaluation/hidden_modes.yaml` explains each."""
+    """Numbers of samples, scenes and views. `conf/evaluation/hidden_modes.yaml` explains each."""
 
     name: str
     samples: Annotated[int, Range(2)]
@@ -88,7 +88,7 @@ class ModeMeasurements:
         self.rows.append(row)
 
     def results(self, samples: int) -> dict[str, dict[str, float]]:
-        """Return means over the scenes by method; an energy score without pixels is 0."""
+        """Return means over the scenes by method. An energy score without pixels is 0."""
         results: dict[str, dict[str, float]] = {}
         for method, scene_scores in self.scores.items():
             means = mean_over_scenes(scene_scores)
@@ -139,7 +139,7 @@ def measure(
     shown_samples: int,
     progress: Progress = iter,
 ) -> ModeMeasurements:
-    """Score all predictors on all scenes; the seed of a scene is that of the scene before it plus one.
+    """Score all predictors on all scenes. The seed of a scene is that of the scene before it plus one.
 
     Two predictors that know all modes are added: `true_sampler` draws by their probabilities, `mean_predictor` repeats
     their mean. The other scene for a predictor is the previous one (for the first, the last). The figure shows `model`.
@@ -187,7 +187,7 @@ def score_hidden_modes(
     samples = evaluation["samples"]
     candidates = data.hidden_modes(evaluation["views"], evaluation["spread_views"])
     scenes, skipped = usable_scenes(candidates, evaluation["scenes"])
-    if isinstance(module, SceneFiles):
+    if isinstance(module, PlySamples):
         module.find_files([scene.scene.names[0] for scene in scenes], samples)
     measured = measure(
         predictors(module, samples, evaluation["batch"]),

@@ -26,7 +26,7 @@ MODES_EXPLAINED = (
 
 
 def mode_results_table(results: Mapping[str, Mapping[str, object]], model: str = MODEL) -> Table:
-    """Return a row for each method of one test on hidden modes; `model` is the label of the tested one."""
+    """Return a row for each method of one test on hidden modes. `model` is the label of the tested one."""
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
     records = [{"method": model if name == MODEL else name, **scores} for name, scores in results.items()]
     return records_table(title, records, MODE_COLUMNS)

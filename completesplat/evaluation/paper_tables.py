@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from completesplat.errors import CompleteSplatError
 from completesplat.evaluation import score_tables, tables
 from completesplat.evaluation.mode_tables import mode_tables
-from completesplat.evaluation.records import HOW, MODES, SCORES, RunTree
+from completesplat.evaluation.records import BEST_BY_METRIC, BEST_OF_K, HOW, MODES, SCORES, RunTree
 from completesplat.evaluation.sweep_jobs import Job, collect
 from completesplat.evaluation.sweep_summary import sweep_rows
 from completesplat.files import printable
@@ -54,7 +54,7 @@ def score_columns(table: PublishedTable) -> list[tuple[int, Any, str]]:
 
 
 def parse_cell(cell: str) -> tables.Cell:
-    """Convert `17.93 best` to the text `17.93` with the mark `best`; dagger and star become signs behind the text."""
+    """Convert `17.93 best` to the text `17.93` with the mark `best`. Dagger and star become signs behind the text."""
     words = cell.split()
     text = " ".join(word for word in words if word not in (tables.BEST, tables.SECOND, *SIGNS)) or tables.BLANK
     signs = [SIGNS[word] for word in words if word in SIGNS]
@@ -120,7 +120,7 @@ def is_comparable(table: PublishedTable, entry: score_tables.Entry) -> bool:
     wanted = table.evaluations.get(str(protocol.get("name")))
     if wanted is None:
         return False
-    is_oracle = entry.predictor in (score_tables.BEST_OF_K, score_tables.BEST_BY_METRIC)
+    is_oracle = entry.predictor in (BEST_OF_K, BEST_BY_METRIC)
     differences = (
         entry.upper_bound,
         protocol.get("skipped"),

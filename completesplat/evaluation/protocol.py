@@ -12,7 +12,8 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.provenance import provenance
-from completesplat.evaluation.scene_scores import BEST_RULES, MODEL
+from completesplat.evaluation.records import MODEL
+from completesplat.evaluation.scene_scores import BEST_RULES
 from completesplat.evaluation.scorer import Scorer
 from completesplat.metrics import MetricFormat
 
@@ -76,7 +77,7 @@ def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
 
 
 def set_metrics(module: Scorer, evaluation: Config) -> None:
-    """Give a model the protocol's metrics; raise CompleteSplatError if it cannot draw several samples."""
+    """Give a model the protocol's metrics, or raise CompleteSplatError if it cannot draw several samples."""
     module.evaluation = instantiate(evaluation["scoring"], _convert_="all")
     if module.evaluation.samples > 1 and not module.draws_samples:
         raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")

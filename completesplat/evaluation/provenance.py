@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def git_commit() -> str | None:
-    """Return the commit of the source, with `-dirty` if files have changed since; None without a repository."""
+    """Return the commit of the source, with `-dirty` if files have changed since, or None without a repository."""
 
     def git(*arguments: str) -> str:
         command = ["git", "--no-optional-locks", "-C", str(Path(__file__).parent), *arguments]
@@ -72,7 +72,7 @@ def provenance(data: "SceneDataModule", out: Path) -> dict[str, object]:
 
 
 def shell_command(command: Sequence[str]) -> str:
-    """Return a command as it could be typed; its first part is the program and its verb."""
+    """Return a command as it could be typed. Its first part is the program and its verb."""
     return " ".join([*command[:1], *map(shlex.quote, command[1:])])
 
 

@@ -19,9 +19,13 @@ MODES = "hidden_modes.json"
 RECORD = "run.json"
 CONFIG = "config.yaml"
 PROTOCOL = "protocol"
-"""Key of the entry that says how results were measured; the others are predictors."""
+"""Key of the entry that says how results were measured. The others are predictors."""
 MODEL = "model"
-"""Name of the predictor that is the run's model."""
+"""Name of the predictor that is the run's model. With several samples, it scores the first."""
+BEST_OF_K = "best_of_k"
+BEST_BY_METRIC = "best_of_k_by_metric"
+MEAN_OF_K = "mean_of_k"
+"""Names of its best samples (`scene_scores.BEST_RULES`), and of the mean of all samples' scores."""
 UPPER_BOUND = "upper_bound"
 """Key that marks a predictor that saw the views of its scores."""
 HOW = "make them with `completesplat test ckpt=RUN/checkpoints/last.ckpt out=DIR`"
@@ -52,7 +56,7 @@ class Record(TypedDict, total=False):
 
 
 class Protocol(TypedDict, total=False):
-    """Statement of how results were measured. Code reads the entries below; others are only printed."""
+    """Statement of how results were measured. Code reads the entries below. Others are only printed."""
 
     name: str
     method: str
@@ -67,7 +71,7 @@ class Protocol(TypedDict, total=False):
 
 
 def read_mapping(path: Path) -> dict[str, object]:
-    """Read the mapping in a file by `write_json`; return an empty one if that fails, as when its writer was killed."""
+    """Read the mapping in a file by `write_json`, or an empty one if that fails, as when its writer was killed."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(content, dict):
@@ -84,7 +88,7 @@ def read_mapping(path: Path) -> dict[str, object]:
 
 
 def read_record(folder: Path) -> Record:
-    """Read a folder's `run.json`; return an empty record if there is none."""
+    """Read a folder's `run.json`, or an empty record if there is none."""
     return cast(Record, read_mapping(folder / RECORD))
 
 
@@ -137,7 +141,7 @@ class PredictorScores(NamedTuple):
 
 
 def tested_predictors(content: Mapping[str, object]) -> PredictorScores:
-    """Return the test in the content of `metrics.json`, which `fit` or `test` wrote; empty if nothing was tested."""
+    """Return the test in the content of a `metrics.json` by `fit` or `test`. It is empty if nothing was tested."""
     test = content if PROTOCOL in content else _mapping(content.get("test"))
     entries = {key: entry for key, entry in test.items() if key != PROTOCOL and isinstance(entry, Mapping)}
     scores = {predictor: flat_scores(entry) for predictor, entry in entries.items()}
@@ -198,7 +202,7 @@ def find_results(folder: Path) -> RunTree:
 
 
 def _result(path: Path, root: Path) -> ResultsFile:
-    """Read a file of results; raise ValueError, with the reason, if it is unusable."""
+    """Read a file of results, or raise ValueError, with the reason, if it is unusable."""
     from completesplat.metrics import MetricFormat  # which `predict` does not need
 
     content = read_mapping(path)

@@ -32,7 +32,7 @@ def counted_pixels(truth: Views, region: str) -> Bool[Tensor, "view 1 height wid
 
 
 def novel_values(images: SampledViews, truth: Views) -> dict[str, tuple[SampledValues, TrueValues]]:
-    """Return the values of the samples and the true values by region; the first view of `truth` is the reference.
+    """Return the values of the samples and the true values by region. The first view of `truth` is the reference.
 
     Regions are all pixels (`full`) and, if true depth is known, those that the reference view does not show (`hidden`).
     """

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from completesplat.data.loading.distributed import gather_values
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.records import BEST_BY_METRIC, BEST_OF_K, MEAN_OF_K, MODEL
 from completesplat.evaluation.regions import REGIONS, counted_pixels, in_region, novel_values
 from completesplat.metrics.image_sets import ImageSets, SetMetric
 from completesplat.metrics.images import (
@@ -31,15 +32,11 @@ from completesplat.scene import SceneBatch, Views
 Scores = dict[tuple[str, str, str], float]
 """Scores of one scene by region, kind of view (`reference` or `novel`) and metric."""
 
-MODEL = "model"
-BEST = "best_of_k"
-BEST_BY_METRIC = "best_of_k_by_metric"
-MEAN = "mean_of_k"
 BEST_RULES = {
-    BEST: "of each region one sample for all metrics: that with the best `criterion` there, in novel views",
+    BEST_OF_K: "of each region one sample for all metrics: that with the best `criterion` there, in novel views",
     BEST_BY_METRIC: "of each region and metric another sample: the best by it, in novel views; no metrics of sets",
 }
-"""Rules by which rows choose the best sample; the paper states none."""
+"""Rules by which rows choose the best sample. The paper states none."""
 
 RESERVED_NAMES = ("sharpness", "energy", "crps", "fid", "kid")
 """Names of scores that are no image metrics, which metrics of the user's own cannot have."""
@@ -125,7 +122,7 @@ class SceneScores:
 
     @torch.no_grad()
     def update(self, predictor: str, images: Float[Tensor, "batch view 3 height width"], scenes: SceneBatch) -> None:
-        """Score images predicted for the reference (first view) and all targets; they are clipped to [0, 1]."""
+        """Score images predicted for the reference (first view) and all targets. They are clipped to [0, 1]."""
         truth = scenes.all_views()
         for b, name in enumerate(scenes.names):
             clipped = images[b].clamp(0, 1)
@@ -140,7 +137,7 @@ class SceneScores:
         if len(by_sample) == 1:
             return
         self._add_best(name, by_sample, images, truth)
-        self.scores[MEAN][name] = {
+        self.scores[MEAN_OF_K][name] = {
             key: sum(scores[key] for scores in by_sample) / len(by_sample) for key in by_sample[0]
         }
         proper, ranks = proper_scores(images[:, 1:], truth)
@@ -177,7 +174,7 @@ class SceneScores:
         by_criterion = {region: best[region, self.criterion] for region in REGIONS}
         keys = by_sample[0].keys()
         scores = {key: by_sample[by_criterion[key[0]]][key] for key in keys}
-        self._add(BEST, name, scores, {region: images[i] for region, i in by_criterion.items()}, truth)
+        self._add(BEST_OF_K, name, scores, {region: images[i] for region, i in by_criterion.items()}, truth)
         self.scores[BEST_BY_METRIC][name] = {
             (region, view, metric): by_sample[best[region, metric]][region, view, metric]
             for region, view, metric in keys
@@ -228,7 +225,7 @@ class SceneScores:
                     self.sets.add(owner, region, name, in_region(views.float(), truth, region)[self.first_novel :])
 
     def gather(self) -> None:
-        """Merge the scores of all processes; each of them must call this."""
+        """Merge the scores of all processes. Each of them must call this."""
         of_this_process = self.scores, self.views, self.of_samples, self.sets.described, self.skipped
         self.reset()
         for scores, views, of_samples, descriptors, skipped in gather_values(of_this_process):
@@ -247,12 +244,12 @@ class SceneScores:
             return results
         scenes = [self.of_samples[name] for name in sorted(self.of_samples)]
         for kind in ("curve", "curve_noisy_mean"):
-            results[BEST][kind] = _means([scene[kind] for scene in scenes])
-        results[MEAN]["diversity"] = sum(scene["diversity"] for scene in scenes) / len(scenes)
+            results[BEST_OF_K][kind] = _means([scene[kind] for scene in scenes])
+        results[MEAN_OF_K]["diversity"] = sum(scene["diversity"] for scene in scenes) / len(scenes)
         for region in ("full", "hidden"):
             ranks = [scene["ranks"][region] for scene in scenes if region in scene["ranks"]]
             if ranks:
-                results[MEAN][f"ranks_{region}"] = _means(ranks)
+                results[MEAN_OF_K][f"ranks_{region}"] = _means(ranks)
         return results
 
     def _means_of(self, predictor: str) -> dict[str, Any]:

@@ -6,6 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar, cast
 
 from completesplat.evaluation.records import (
+    BEST_BY_METRIC,
+    BEST_OF_K,
+    MEAN_OF_K,
     MODEL,
     PROTOCOL,
     UPPER_BOUND,
@@ -34,9 +37,6 @@ from completesplat.evaluation.tables import (
 from completesplat.files import counted
 from completesplat.metrics import METRIC_FORMATS, MetricFormat
 
-BEST_OF_K = "best_of_k"
-BEST_BY_METRIC = "best_of_k_by_metric"
-MEAN_OF_K = "mean_of_k"
 OURS = "completesplat: "  # not "ours", because the paper gives its rows that name
 COST = ("inference", "rendering")
 LEADING = {
@@ -91,7 +91,7 @@ Measured = TypeVar("Measured")
 
 
 def group_by_protocol(measurements: Iterable[tuple[Measured, Protocol]], *more: str) -> list[list[Measured]]:
-    """Group measurements by equal protocols, in a fixed order; only scores within a group can be compared."""
+    """Group measurements by equal protocols, in a fixed order. Only scores within a group can be compared."""
     groups: dict[str, list[Measured]] = {}
     for measured, protocol in measurements:
         values: Mapping[str, object] = protocol
@@ -101,7 +101,7 @@ def group_by_protocol(measurements: Iterable[tuple[Measured, Protocol]], *more: 
 
 
 def protocol_line(protocol: Protocol, keys: Sequence[str] = DESCRIBED) -> str:
-    """Return the entries of the protocol as one line; with all of `DESCRIBED` it names the checkpoint as well."""
+    """Return the entries of the protocol as one line. With all of `DESCRIBED` it names the checkpoint as well."""
     values: Mapping[str, object] = protocol
     parts = []
     for key in keys:
@@ -305,7 +305,7 @@ def _known(entry: Entry, column: str) -> bool:
 
 
 def evaluation_table(results: Mapping[str, Mapping[str, object]], model: str = MODEL) -> Table:
-    """Return a row for each predictor, PSNR in dB; object pixels only if there are masks.
+    """Return a row for each predictor, PSNR in dB, and object pixels only if there are masks.
 
     Args:
         results: the protocol (without it, metrics of the user's own are left out), and `SceneScores.results`.

@@ -17,13 +17,15 @@ from torch import Tensor
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import gather_values
 from completesplat.data.loading.loader import SceneLoader
+from completesplat.evaluation.records import MODEL
 from completesplat.evaluation.regions import REGIONS
-from completesplat.evaluation.scene_scores import MODEL, SceneScores
+from completesplat.evaluation.scene_scores import SceneScores
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.quantities import Share
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
+from completesplat.signals import restore_handlers
 
 Result = TypeVar("Result")
 Renders = Float[Tensor, "batch view 3 height width"]
@@ -40,7 +42,7 @@ def mirror_reference(scenes: SceneBatch) -> Renders:
 
 
 def repeat_image(image: Float[Tensor, "3 height width"], scenes: SceneBatch) -> Renders:
-    """Return an image for every view; the training set's mean image is the best constant prediction of the MSE."""
+    """Return an image for every view. The training set's mean image is the best constant prediction of the MSE."""
     return image.to(scenes.reference.images).expand_as(scenes.all_views().images)
 
 
@@ -64,7 +66,7 @@ class Scorer(LightningModule):
     """Whether the model has seen the views that it is scored on."""
 
     fitted_to: str | None = None
-    """Views that the Gaussians are fitted to, for tables; None if scenes are predicted."""
+    """Views that the Gaussians are fitted to, for tables, or None if scenes are predicted."""
 
     first_novel = 1
     """Number of views before the novel ones: 1 (the reference that the model is given), or 0 if it is given none."""
@@ -117,6 +119,7 @@ class Scorer(LightningModule):
             return self.rasterizer(gaussians, cameras).over(self.background)
 
     def on_test_start(self) -> None:
+        restore_handlers()  # Lightning's would end a test with exit status 0
         self.evaluation.reset()
         self.evaluation.first_novel = self.first_novel
         self.seconds = defaultdict(list)

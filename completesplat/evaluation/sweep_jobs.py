@@ -90,7 +90,7 @@ def _job(folder: Path, sweep: Path) -> Job:
 
 
 def _read_config(folder: Path) -> Mapping[str, object]:
-    """Return a job's config; return an empty one if it cannot be read, as when its writer was killed."""
+    """Return a job's config, or an empty one if it cannot be read, as when its writer was killed."""
     try:
         config = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
     except (OmegaConfBaseException, YAMLError, OSError, ValueError):
@@ -108,7 +108,7 @@ def _pairs(overrides: Sequence[str]) -> dict[str, str]:
 
 
 def _joined(parts: Sequence[list[Job]]) -> list[Job]:
-    """Return the jobs of all parts of a sweep; of a job in several parts, the one with the most progress."""
+    """Return the jobs of all parts of a sweep. A job in several parts is taken from the one with the most progress."""
     local = _local_settings(parts)
     best: dict[object, Job] = {}
     jobs = [job for part in parts for job in part]

@@ -38,12 +38,12 @@ class SweepSummary(Callback):
     """
 
     def on_job_end(self, config: Any, job_return: JobReturn, **kwargs: object) -> None:
-        """Rewrite the summary, whether the job finished or failed; do nothing outside a sweep."""
+        """Rewrite the summary after a job of a sweep, whether it finished or failed."""
         if config.hydra.mode == RunMode.MULTIRUN:
             _summarize(config, last=False)
 
     def on_multirun_end(self, config: Any, **kwargs: object) -> None:
-        """Write the summary again, because jobs that end together may miss each other; print it and its path."""
+        """Write the summary again, because jobs that end together may miss each other. Print it and its path."""
         _summarize(config, last=True)
 
 
@@ -103,7 +103,7 @@ def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> Entry:
 
 
 def _deviation(values: Sequence[float]) -> float:
-    """Return the sample standard deviation; NaN if a value is infinite."""
+    """Return the sample standard deviation, or NaN if a value is infinite."""
     return stdev(values) if all(map(math.isfinite, values)) else math.nan
 
 
@@ -163,7 +163,7 @@ def _program_remarks(records: Sequence[Record]) -> list[str]:
 
 
 def write_summary(folder: Path, *parts: Path) -> tables.Table:
-    """Write `summary.csv` (all metrics), `summary.md` and `summary.tex`; return the table.
+    """Write `summary.csv` (all metrics), `summary.md` and `summary.tex` and return the table.
 
     `parts` are the folders of one sweep on several machines; the files then cover all of them.
     """

@@ -23,7 +23,7 @@ HEADING_GROUPS = {
     "object_reference": "object pixels, reference view",
 }
 SSIM_NOTE = "SSIM: mean over all pixels, images mirrored at their border (skimage leaves 5 pixels out on every side)."
-"""Note below tables with SSIM; the border has 37 % of the pixels of a 48 x 48 image, 15 % of a 128 x 128 one."""
+"""Note below tables with SSIM. The border has 37 % of the pixels of a 48 x 48 image, 15 % of a 128 x 128 one."""
 SHARPNESS_NOTE = "Sharpness: gradient energy of the novel views over the truth's; a blur has less than 1."
 
 BEST = "best"
@@ -125,14 +125,14 @@ def score_cell(
 
 
 class TableRow(NamedTuple):
-    """Row of a table; a rule separates rows of different sources, such as the paper and a run."""
+    """Row of a table. A rule separates rows of different sources, such as the paper and a run."""
 
     source: str
     cells: list[Cell]
 
 
 class Heading(NamedTuple):
-    """Heading of a column, and the format of its values; the columns of a group share the heading above."""
+    """Heading of a column, and the format of its values. The columns of a group share the heading above."""
 
     text: str
     group: str = ""
@@ -206,7 +206,7 @@ def _longest(pattern: re.Pattern[str], texts: Sequence[str]) -> int:
 
 
 def _side_by_side(widths: Sequence[int], room: int) -> list[list[int]]:
-    """Return the columns of each part of a table; all parts begin with column 0 and fit into the room if two do."""
+    """Return the columns of each part of a table. All parts begin with column 0 and fit into the room if two do."""
     parts = [[0]]
     for index in range(1, len(widths)):
         if len(parts[-1]) > 1 and sum(widths[i] + 3 for i in (*parts[-1], index)) > room:
@@ -218,7 +218,7 @@ def _side_by_side(widths: Sequence[int], room: int) -> list[list[int]]:
 def records_table(
     title: str, records: Sequence[Mapping[str, object]], columns: Mapping[str, Heading] | None = None
 ) -> Table:
-    """Return a table with a row for each record, whose `source` is the row's; missing values stay empty.
+    """Return a table with a row for each record, whose `source` is the row's. Missing values stay empty.
 
     Without `columns`, the records' keys are the headings, and lists and mappings are left out.
     """
@@ -243,7 +243,7 @@ def _columns_of(records: Sequence[Mapping[str, object]]) -> dict[str, Heading]:
 
 
 def _written(value: object, form: str) -> str:
-    """Return a value as text; without a format, a float below 1000 has four digits, a larger one no decimals."""
+    """Return a value as text. Without a format, a float below 1000 has four digits, a larger one no decimals."""
     if value is None:
         return ""
     if form:
@@ -330,7 +330,7 @@ def write_tables(tables: Sequence[Table], out: Path) -> None:
 
 
 def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[object]]) -> None:
-    """Write a CSV file; None is an empty field, and numbers have all digits."""
+    """Write a CSV file. None is an empty field, and numbers have all digits."""
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)

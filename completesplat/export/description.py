@@ -37,7 +37,7 @@ CONVENTIONS = {
 def write_scene_json(
     path: str | Path, reference: Cameras, settings: Mapping[str, Any], seed: int, files: Mapping[str, str]
 ) -> None:
-    """Write a scene's description, `settings` and `files` as JSON; raise ValueError if a number is not finite."""
+    """Write a scene's description, `settings` and `files` as JSON, or raise ValueError if a number is not finite."""
     scene = {
         "format": "completesplat scene 1",
         "reference_camera": plain_camera(reference),
@@ -90,7 +90,7 @@ def described_camera(entry: object) -> Cameras:
 
 
 def described_up(settings: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the direction up in the settings of a description; raise DataError if it has no usable length."""
+    """Return the direction up in the settings of a description, or raise DataError if it has no usable length."""
     up = finite_array(settings.get("up", UP), (3,), "up")
     if not 1 / EXTREME < np.abs(up).max() < EXTREME:
         raise BadAnnotation(f"up must have a length, not {settings['up']}")

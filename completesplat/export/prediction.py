@@ -95,13 +95,13 @@ def write_prediction(
 
 
 def _prepared(sample: PlacedScene, name: str, rasterizer: Rasterizer) -> PlacedScene:
-    """Return a sample without broken Gaussians and with a pivot of orbits; `name` is for error messages."""
+    """Return a sample without broken Gaussians and with a pivot of orbits. Errors and warnings have its `name`."""
     intact = replace(sample, gaussians=cleaned(sample.gaussians, name))
     return replace(intact, pivot=pivot_of(intact, rasterizer))
 
 
 def _make_room(folder: Path) -> None:
-    """Remove the files of an earlier prediction, finished or not; refuse files with such names of anybody else."""
+    """Remove the files of an earlier prediction, finished or not, but refuse files with such names of anybody else."""
     old = sorted(file for file in folder.iterdir() if WRITTEN.fullmatch(file.name))
     if is_described(folder):
         logger.info("%s: an earlier prediction is replaced", folder)

@@ -26,7 +26,7 @@ class PhotoProgress:
         self.photo = name
 
     def begin(self, step: str, advance: int = 1) -> None:
-        """Show which step of the photo begins; `advance` is the number of earlier steps that end."""
+        """Show which step of the photo begins, after which `advance` earlier steps have ended."""
         if self.bar.disable:
             print(f"{self.photo}: {step}", flush=True)
         self.bar.update(self.task, description=escape(f"{self.photo}: {step}"), advance=advance)

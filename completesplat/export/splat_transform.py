@@ -1,7 +1,6 @@
 """Export by npm's `@playcanvas/splat-transform`: file formats, and a page with a viewer."""
 
 import json
-import logging
 import math
 import os
 import shutil
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
-from completesplat.files import atomic_path, write_bytes
+from completesplat.files import atomic_path
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 
@@ -29,14 +28,14 @@ PACKAGE = "@playcanvas/splat-transform@2.7.1"
 LIMIT_SECONDS = 600
 WIDEST_WINDOW = 20 / 9
 LARGEST_FOV = 120.0  # phones' windows
-CONTROLS = b"<style>#controlsWrap.faded-out { visibility: visible; opacity: 1 }</style>"
-IN_A_ROOM = b"const isObjectExperience = !bbox.containsPoint(resetCamera.position);"
-
-log = logging.getLogger(__name__)
 
 
 def convert(program: str, source: Path, target: Path, options: Sequence[str] = ()) -> None:
-    """Write `target` in its suffix's format, whole or not at all; raise CompleteSplatError if the program fails."""
+    """Write `target` in its suffix's format, whole or not at all.
+
+    Raises:
+        CompleteSplatError: the program fails.
+    """
     with atomic_path(target) as temporary:
         _run([program, "--quiet", "--overwrite", *options, str(source), str(temporary)])
         if not temporary.is_file():
@@ -44,7 +43,11 @@ def convert(program: str, source: Path, target: Path, options: Sequence[str] = (
 
 
 def find_splat_transform() -> str:
-    """Return the program on PATH or npm's (`npx` downloads 200 MB once); raise CompleteSplatError if neither works."""
+    """Return the program on PATH or npm's (`npx` downloads 200 MB once).
+
+    Raises:
+        CompleteSplatError: neither works.
+    """
     return _find(shutil.which(PROGRAM), shutil.which("npx"))
 
 
@@ -62,7 +65,11 @@ def _find(program: str | None, npx: str | None) -> str:
 
 
 def _run(command: Sequence[str]) -> str:
-    """Run a program in a new session, so that npx's child processes can be killed with it; return its output."""
+    """Run a program in a new session, so that npx's child processes can be killed with it.
+
+    Returns:
+        What the program prints.
+    """
     name = Path(command[0]).name
     try:
         process = subprocess.Popen(
@@ -98,29 +105,18 @@ class PageView:
 
 
 def write_turning_page(path: Path, gaussians: Gaussians, view: PageView) -> None:
-    """Write a page with the upright scene, seen from the front and turning until a person touches it."""
+    """Write a page with the upright scene, seen from the front and turning until a person touches it.
+
+    The viewer in the page turns its camera about the object if the camera lies outside of the scene's bounding box, and
+    on the spot if it lies within.
+    """
     turn = upright_rotation(view.up)
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / "scene.ply"
         settings = Path(folder) / "settings.json"
         write_ply(scene, gaussians.transform(turn))
         settings.write_text(json.dumps(viewer_settings(view, turn)))
-        html = Path(folder) / "page.html"
-        convert(find_splat_transform(), scene, html, ["--viewer-settings", str(settings)])
-        # The viewer hides its controls after 4 seconds, and a person may not find them.
-        write_bytes(path, around_the_target(html.read_bytes()).replace(b"</head>", CONTROLS + b"</head>", 1))
-
-
-def around_the_target(page: bytes) -> bytes:
-    """Make the page's camera turn about its target, even within the bounding box of the scene.
-
-    The viewer assumes that a camera within the bounding box stands in a room, and turns it on the spot. Far Gaussians
-    of our scenes extend the box behind the photo's camera. The viewer has no option for this.
-    """
-    if IN_A_ROOM not in page:
-        log.warning("this version of %s may turn the page's camera on the spot, not about the object", PROGRAM)
-    page = page.replace(IN_A_ROOM, b"const isObjectExperience = true;")
-    return page.replace(b"<title>SuperSplat Viewer</title>", b"<title>completesplat</title>")
+        convert(find_splat_transform(), scene, path, ["--viewer-settings", str(settings)])
 
 
 def upright_rotation(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:

@@ -134,8 +134,7 @@ def load_heads() -> list[Head]:
     resource = files("torchmetrics.functional.image") / "lpips_models" / "vgg.pth"
     with as_file(resource) as path:
         weights = torch.load(path, map_location="cpu", weights_only=True)
-    # `plan` loads them as fake tensors, which are on "meta" whatever `map_location` says.
-    return [weights[f"lin{layer}.model.1.weight"].cpu() for layer in range(5)]
+    return [weights[f"lin{layer}.model.1.weight"] for layer in range(5)]
 
 
 class PerceptualTerm:
@@ -153,21 +152,12 @@ class PerceptualTerm:
             return torch.mean(self.distance(predicted, true))
 
 
-class UntrainedPerceptualSimilarity(PerceptualTerm):
-    """LPIPS with random weights, to count the work of a step (`completesplat plan`)."""
-
-    def __init__(self) -> None:
-        self.distance = PerceptualDistance(vgg16(), load_heads())
-
-
 class LearnedPerceptualSimilarity(PerceptualTerm):
     """LPIPS with VGG16 (paper, Eq. 1, third term).
 
     Args:
         vgg_weights, vgg_sha256: see `load_vgg16`; `vgg_sha256=None` accepts any file of the right layout.
     """
-
-    untrained = UntrainedPerceptualSimilarity
 
     def __init__(self, vgg_weights: str, vgg_sha256: str | None = None) -> None:
         self.distance = PerceptualDistance(load_vgg16(vgg_weights, vgg_sha256), load_heads())

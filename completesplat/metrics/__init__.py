@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 PSNR_LIMIT = 100.0
-"""Largest reported PSNR (dB); identical images have an infinite one, and averages must stay finite."""
+"""Largest reported PSNR (dB). Identical images have an infinite one, and averages must stay finite."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from completesplat.weights import first_line, weights_file
 
 URL = "https://nvlabs-fi-cdn.nvidia.com/stylegan2-ada-pytorch/pretrained/metrics/inception-2015-12-05.pt"
 SHA256 = "f58cb9b6ec323ed63459aa4fb441fe750cfe39fafad6da5cb504a16f19e958f4"
-"""Digest of the file at `URL`; k-diffusion (`k_diffusion/evaluation.py`) states the same."""
+"""Digest of the file at `URL`, which k-diffusion (`k_diffusion/evaluation.py`) states as well."""
 ADVICE = "give inception-2015-12-05.pt as evaluation.scoring.sets.inception.weights=FILE_OR_URL"
 DOWNLOAD_ADVICE = f"fetch Inception with `curl -LO {URL}` and give it as evaluation.scoring.sets.inception.weights=FILE"
 
@@ -38,7 +38,7 @@ class SetMetric(Protocol):
         """Return descriptors of images with values in [0, 1]."""
 
     def distances(self, true: Descriptors, predicted: Descriptors) -> dict[str, float]:
-        """Return figures by name; lower is better."""
+        """Return figures by name. Lower is better."""
 
     def settings(self) -> dict[str, MetricSettings]:
         """Return the settings that figures depend on, by the figures' names."""
@@ -104,7 +104,7 @@ class Inception:
         return features
 
     def distances(self, true: Descriptors, predicted: Descriptors) -> dict[str, float]:
-        """See `SetMetric`; raise RuntimeError for a single image, which has no covariance."""
+        """See `SetMetric`. Raise RuntimeError for a single image, which has no covariance."""
         return {"fid": frechet_distance(true, predicted), "kid": kernel_distance(true, predicted, self.subset_size)}
 
     def settings(self) -> dict[str, MetricSettings]:
@@ -113,7 +113,7 @@ class Inception:
 
 
 def inception(weights: str | None, sha256: str | None = None, subset_size: int = 1000) -> Inception | MissingMetrics:
-    """Return FID and KID, or why they are missing; see `load_inception` for the weights."""
+    """Return FID and KID, or why they are missing. See `load_inception` for the weights."""
     load = partial(load_inception, sha256=sha256, subset_size=subset_size)
     return load_or_missing(weights, load, ADVICE, ("fid", "kid"))
 

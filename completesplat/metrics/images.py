@@ -41,7 +41,7 @@ class MissingMetrics:
 def load_or_missing(
     weights: str | None, load: Callable[[str], T], advice: str, names: tuple[str, ...]
 ) -> T | MissingMetrics:
-    """Load a metric; return `MissingMetrics` with `advice` without `weights`, or with the error of unusable ones."""
+    """Load a metric, or return `MissingMetrics`: with `advice` without `weights`, with the error for unusable ones."""
     if weights is None:
         return MissingMetrics(advice, names)
     try:
@@ -83,7 +83,7 @@ def format_of(name: str, metric: Any) -> MetricFormat:
 
 
 def psnr(predicted: Images, true: Images) -> PerImage:
-    """Return the peak signal-to-noise ratio in dB, for values in [0, 1]; at most `PSNR_LIMIT`."""
+    """Return the peak signal-to-noise ratio in dB, for values in [0, 1], at most `PSNR_LIMIT`."""
     # torchmetrics makes the number of values on the GPU, which waits for it.
     return (-10 * (predicted - true).square().mean((1, 2, 3)).log10()).clamp(max=PSNR_LIMIT)
 
@@ -120,7 +120,7 @@ def sharpness(predicted: Images, true: Images, counted: Counted) -> float | None
 
 
 def perceptual_metric(vgg_weights: str | None, vgg_sha256: str | None = None) -> PerceptualDistance | MissingMetrics:
-    """Return LPIPS with VGG16 as in the paper (Tables 2 to 5), or why it is missing; see `load_vgg16`."""
+    """Return LPIPS with VGG16 as in the paper (Tables 2 to 5), or why it is missing. See `load_vgg16`."""
 
     def load(weights: str) -> PerceptualDistance:
         return PerceptualDistance(load_vgg16(weights, vgg_sha256), load_heads())

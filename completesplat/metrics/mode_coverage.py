@@ -30,7 +30,7 @@ def mean_of(modes: Float[Tensor, "mode *image _"], probabilities: Float[Tensor, 
 
 
 def scores(samples: SampledPixels, modes: ModePixels, probabilities: Probabilities) -> dict[str, float]:
-    """Score one scene; samples and modes are the region's pixels of all views in one row.
+    """Score one scene. Samples and modes are the region's pixels of all views in one row.
 
     `coverage`: share of the modes (of positive probability) that at least one sample belongs to. `total_variation`:
     half the sum of absolute differences between the samples' shares and the modes' probabilities. Rejected samples are

@@ -17,7 +17,7 @@ TrueValues = Float[Tensor, " value"]
 
 
 def energy_score(samples: SampledValues, truth: TrueValues) -> float:
-    """Return E |x - y| - E |x - x'| / 2 for samples x, x' and truth y; distances are root mean squares of values."""
+    """Return E |x - y| - E |x - x'| / 2 for samples x, x' and truth y. Distances are root mean squares of values."""
     samples = as_float64(samples)
     truth = as_float64(truth)
     count, size = samples.shape
@@ -38,7 +38,7 @@ def crps(samples: SampledValues, truth: TrueValues) -> float:
 
 
 def rank_histogram(samples: SampledValues, truth: TrueValues) -> Float[Tensor, " rank"]:
-    """Return the shares of values whose truth exceeds 0, 1, ... samples; flat if both have one distribution.
+    """Return the shares of values whose truth exceeds 0, 1, ... samples, flat if both have one distribution.
 
     A truth that equals some samples counts in equal parts for all ranks that it could have.
     """

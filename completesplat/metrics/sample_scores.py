@@ -12,7 +12,7 @@ SampledViews = Float[Tensor, "sample view 3 height width"]
 
 
 def best_sample(scores: Sequence[float], higher_is_better: bool = True) -> int:
-    """Return the index of the best score; raise ValueError as `expected_best_curve` does."""
+    """Return the index of the best score, or raise ValueError as `expected_best_curve` does."""
     return scores.index(_worst_first(scores, higher_is_better)[-1])
 
 

@@ -24,7 +24,7 @@ BACKGROUND_SHARE = 0.5  # of the border's pixels, at least, if an object lies on
 
 
 class Match(NamedTuple):
-    """How an image fits weights: the probability that it is of their kind, and `distance_to_training`."""
+    """Fit of an image to weights: the probability that it is of their kind, and its `distance_to_training`."""
 
     probability: float
     distance: float

@@ -104,7 +104,7 @@ def _opaque_box(image: Image.Image) -> Window | None:
 
 
 def cropped(image: Image.Image, window: Window) -> Image.Image:
-    """Crop a square. What extends beyond the image is transparent; a large square is reduced before it is padded."""
+    """Crop a square. What extends beyond the image is transparent. A large square is reduced before it is padded."""
     left, top, right, bottom = window
     side = right - left
     if left >= 0 and top >= 0 and right <= image.width and bottom <= image.height:

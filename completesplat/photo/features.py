@@ -9,9 +9,10 @@ from torch import Tensor
 
 
 def image_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 8"]:
-    """Return mean and standard deviation of red, green and blue, and two measures of detail; all lie in [0, 1].
+    """Return mean and standard deviation of red, green and blue, and two measures of detail.
 
-    The measures of detail are the mean absolute differences between neighbours in a row, and in a column.
+    The measures of detail are the mean absolute differences between neighbours in a row, and in a column. All features
+    lie in [0, 1].
     """
     means = images.mean((-2, -1))
     deviations = images.std((-2, -1), correction=0)
@@ -20,7 +21,7 @@ def image_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tens
 
 
 def distance_to_training(image: Float[Tensor, "3 size size"], training: Mapping[str, Any]) -> float | None:
-    """Return an image's distance from training images, in standard deviations; None if nothing is known of them.
+    """Return an image's distance from training images, in standard deviations, or None if nothing is known of them.
 
     It is the root mean square over the `image_features`: about 1 for an image of the same kind.
 

@@ -87,7 +87,11 @@ def decoded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterat
 
 
 def stored_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
-    """Return (height, width) of an image file or its content, from its header; errors as in `decode_image`."""
+    """Return (height, width) of an image file or its content, from its header.
+
+    Raises:
+        MissingFile, BadImage: as in `decode_image`.
+    """
     content = source if isinstance(source, bytes) else _require(source)
     with refused_as_bad(file), open_image(content, formats) as image:
         return image.height, image.width
@@ -121,7 +125,9 @@ def refused_as_bad(file: str) -> Iterator[None]:
 
 @contextmanager
 def open_image(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator[Image.Image]:
-    """Open an image and read its header, but not its pixels; convert Pillow's exceptions within the context.
+    """Open an image and read its header, but not its pixels.
+
+    Pillow's exceptions within the context are converted, because decoding the pixels there may raise others.
 
     Raises:
         ImageError: the image is damaged, has another format, or has more than 64 million pixels.
@@ -162,7 +168,7 @@ def over_grey(image: Image.Image, value: float) -> Image.Image:
 
 
 def turn_upright(image: Image.Image, orientation: object) -> Image.Image:
-    """Turn and mirror an image by its EXIF orientation; undefined values change nothing."""
+    """Turn and mirror an image by its EXIF orientation, unless that is undefined."""
     transposition = TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
     return image if transposition is None else image.transpose(transposition)
 
@@ -216,7 +222,7 @@ def _eight_bits(image: Image.Image, tiff_tags: Mapping[int, object], mode: Liter
 
 
 def _grey_channel(image: Image.Image) -> Image.Image:
-    """Return one of the three equal channels of a grey image; raise ImageError if it has colours."""
+    """Return one of the three equal channels of a grey image, or raise ImageError if it has colours."""
     red, green, blue = image.convert("RGB").split()
     if red.tobytes() != green.tobytes() or red.tobytes() != blue.tobytes():
         raise ImageError("has colours; a mask is grey")

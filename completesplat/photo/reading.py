@@ -53,7 +53,7 @@ class Photograph(TensorDataclass):
 
 @dataclass(frozen=True)
 class Framing:
-    """How the training images of a model were framed; photos for it are framed alike.
+    """Framing of a model's training images, and of photos for it.
 
     Attributes:
         size: side of the square images, in pixels.
@@ -194,7 +194,11 @@ def _pixels(image: np.ndarray | Tensor) -> Image.Image:
 
 
 def _to_tensor(square: Image.Image, stored: Image.Image, size: int, background: float) -> Float[Tensor, "3 size size"]:
-    """Convert pixels to sRGB in [0, 1]; `stored` is the opened file, because only it has TIFF tags."""
+    """Convert pixels to sRGB in [0, 1].
+
+    Args:
+        stored: the opened file, because only it has TIFF tags.
+    """
     if square.mode in DEEP_GREY_MODES:
         grey = Image.fromarray(files.deep_grey(square, getattr(stored, "tag_v2", {})))
         resized = np.asarray(grey.resize((size, size), Image.Resampling.LANCZOS))

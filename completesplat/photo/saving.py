@@ -17,7 +17,10 @@ def image_bytes(image: Image.Image, kind: str, **options: int | bytes) -> bytes:
 
 
 def save_image(image: Image.Image, path: Path, **options: int | bytes) -> None:
-    """Write an image in the format of its path's suffix; a full disk raises, while Pillow would truncate a JPEG."""
+    """Write an image in the format of its path's suffix.
+
+    A full disk raises OSError, while Pillow alone would truncate a JPEG.
+    """
     path.write_bytes(image_bytes(image, Image.registered_extensions()[path.suffix], **options))
 
 

@@ -1,4 +1,4 @@
-"""What is visible of a photo, if a box or a mask hides a part of it."""
+"""The visible part of a photo, if a box or a mask hides the rest."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ LANCZOS_REACH = 3  # radius of the filter, in pixels of the coarser image
 def visible_part(
     photograph: Photograph, mask: ImageLike | None, box: Sequence[float] | None
 ) -> Float[Tensor, "1 size size"] | None:
-    """Return 0 where a mask or a box hides the photo, and 1 elsewhere; None without both.
+    """Return 0 where a mask or a box hides the photo, and 1 elsewhere, or None without both.
 
     Args:
         mask: an image that is white where the photo is hidden, and is cropped like the photo.
@@ -41,7 +41,10 @@ def visible_part(
 
 
 def outside_of_box(photograph: Photograph, box: Sequence[float]) -> Float[Tensor, "1 size size"]:
-    """Return 1 where a photo is visible, 0 where a box hides it; see `visible_part`.
+    """Return 1 where a photo is visible, and 0 where a box hides it.
+
+    Args:
+        box: see `visible_part`.
 
     Raises:
         CompleteSplatError: the box is not four numbers, or not of positive size within the square.
@@ -60,7 +63,10 @@ def outside_of_box(photograph: Photograph, box: Sequence[float]) -> Float[Tensor
 
 
 def outside_of_mask(photograph: Photograph, mask: ImageLike) -> Float[Tensor, "1 size size"]:
-    """Return 1 where a photo is visible, 0 where a mask hides it; see `visible_part`.
+    """Return 1 where a photo is visible, and 0 where a mask hides it.
+
+    Args:
+        mask: see `visible_part`.
 
     Raises:
         ImageError: the mask cannot be read.

@@ -1,6 +1,5 @@
 """Checks of the settings of verbs and of their parts, made before any work begins."""
 
-import math
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -31,14 +30,20 @@ HYDRA_KEYS = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 
 def check_values(verb: str, config: DictConfig) -> None:
     """Raise CompleteSplatError for the first unfit setting of a verb itself, without importing torch."""
-    if lost := [group for group in ("experiment", "ablation") if group in config]:
-        raise CompleteSplatError(f"{lost[0]}: its file needs `# @package _global_` as its first line, to set anything")
+    for group in ("experiment", "ablation"):
+        if group in config:
+            message = "its file needs `# @package _global_` as its first line, to set anything"
+            raise CompleteSplatError(f"{group}: {message}")
     if verb in VERBS:
         check_settings(VERBS[verb], config)
 
 
 def check_parts_of_verb(verb: str, config: DictConfig) -> None:
-    """Complete a verb's task; raise CompleteSplatError for the first unfit setting of its parts, except for `view`."""
+    """Complete a verb's task.
+
+    Raises:
+        CompleteSplatError: a setting of its parts does not fit, except for `view`.
+    """
     if "task" in config:
         complete_task(config)
     if verb != "view":  # `view` shows its page before it imports torch, so it checks its parts later
@@ -47,9 +52,11 @@ def check_parts_of_verb(verb: str, config: DictConfig) -> None:
 
 def complete_task(config: DictConfig) -> None:
     """Let a config's task refer to the settings of the config that have the names of its function's arguments."""
-    names = part_arguments(config.task)[0].keys() & config.keys()
+    hints, _ = part_arguments(config.task)
     with open_dict(config):
-        config.task.update({name: f"${{{name}}}" for name in names - config.task.keys() - {"out"}})
+        for name in hints.keys() & config.keys():
+            if name != "out" and name not in config.task:
+                config.task[name] = f"${{{name}}}"
 
 
 def check_parts(config: Container, place: str = "") -> None:
@@ -67,8 +74,6 @@ def check_parts(config: Container, place: str = "") -> None:
         key = _origin(config, name, f"{place}.{name}".lstrip("."))
         if complete and name not in (*hints, *HYDRA_KEYS):
             raise CompleteSplatError(f"{config._target_} has no setting {name} ({key}){did_you_mean(name, hints)}")
-        if isinstance(plain, float) and math.isnan(plain):
-            raise CompleteSplatError(f"{key}=nan: must be a number")
         if name in hints:
             check_value(key, hints[name], plain)
         if OmegaConf.is_config(value) and not OmegaConf.is_interpolation(config, name):
@@ -95,9 +100,11 @@ def remove_start_weights(config: DictConfig) -> None:
 
 def part_arguments(config: Container) -> tuple[Mapping[str, object], bool]:
     """Return a part's `arguments_of`, or none if it cannot be imported, because building the part reports that."""
+    target = config.get("_target_") if isinstance(config, DictConfig) else None
+    if target is None:
+        return {}, False
     try:
-        target = config.get("_target_") if isinstance(config, DictConfig) else None
-        return ({}, False) if target is None else arguments_of(get_object(target))
+        return arguments_of(get_object(target))
     except Exception:
         return {}, False
 
@@ -106,7 +113,10 @@ def _origin(config: Container, name: Any, place: str) -> str:
     """Return the setting to which a place refers for its value, or the place itself."""
     root = config._get_root()
     raw = config._get_node(name)
-    while isinstance(raw, Node) and (reference := REFERENCE.fullmatch(str(raw._value()))) is not None:
+    while isinstance(raw, Node):
+        reference = REFERENCE.fullmatch(str(raw._value()))
+        if reference is None:
+            break
         place = reference[1]
         above, _, last = place.rpartition(".")
         parent = OmegaConf.select(root, above) if above else root

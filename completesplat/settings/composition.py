@@ -1,4 +1,4 @@
-"""Composition of a verb's config by Hydra: search path, resolvers, arguments of sweeps, errors with nearest names."""
+"""Composition of a verb's config by Hydra: search path, resolvers, arguments of sweeps, nearest names."""
 
 import hashlib
 import re
@@ -7,9 +7,8 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from hydra import compose as compose_by_hydra
 from hydra import initialize_config_dir
@@ -22,17 +21,18 @@ from omegaconf import DictConfig, OmegaConf
 
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.arguments import for_hydra
-from completesplat.settings.checks import part_arguments
-from completesplat.settings.options import LEAST_LIKE, conf_folder, did_you_mean, groups, options, search_settings
+from completesplat.settings.options import conf_folder, did_you_mean, groups, options
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
-NOT_THERE = re.compile(r"Could not override '([^']+)'")
+UNKNOWN_KEY = re.compile(r"Could not override '([^']+)'\.\s*(?:To append to your config use .*)?")
 LONGEST_NAME = 120
-PARTS_OF_STAGES = {"autoreconstructor", "regressor", "conditioning", "denoiser", "sampler", "objective"}
 
 
 class SettingsOfWorkingFolder(SearchPathPlugin):
-    """Hydra plugin that finds further options of the config groups in `./conf`; the package's own come first."""
+    """Hydra plugin that finds further options of the config groups in `./conf`.
+
+    The package's own come first.
+    """
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         """Append `./conf`, if it exists, to the search path (Hydra calls this method)."""
@@ -42,7 +42,10 @@ class SettingsOfWorkingFolder(SearchPathPlugin):
 
 
 def use_working_folder() -> None:
-    """Append the working folder to `sys.path`, and its `conf` to Hydra's search path; each process must call this."""
+    """Append the working folder to `sys.path`, and its `conf` to Hydra's search path.
+
+    Each process must call this.
+    """
     folder = str(Path.cwd())
     if not {"", folder} & set(sys.path):
         sys.path.append(folder)
@@ -59,7 +62,7 @@ def compose(verb: str, *overrides: str) -> DictConfig:
         raise CompleteSplatError(f"no verb {verb!r}; `completesplat --help` shows those that there are")
     arguments = for_hydra(verb, overrides)
     try:
-        with nearest_names(verb, arguments):
+        with nearest_names(verb):
             config = _composed(verb, arguments)
     except HydraException as error:
         raise CompleteSplatError(" ".join(str(error).split())) from error
@@ -73,87 +76,49 @@ def _composed(verb: str, overrides: Sequence[str] = ()) -> DictConfig:
         return compose_by_hydra(verb, overrides=list(overrides))
 
 
-def without_unused_parts(config: DictConfig) -> DictConfig:
-    """Return a config without those `PARTS_OF_STAGES` to which no other part refers."""
-    plain = cast(dict[str, object], OmegaConf.to_container(config, resolve=False))
-    texts = {key: str(value) for key, value in plain.items()}
-    used = waiting = texts.keys() - PARTS_OF_STAGES
-    while waiting:
-        named = {name for key in waiting for name in re.findall(r"\$\{(\w+)", texts[key])}
-        waiting = (named & texts.keys()) - used
-        used |= waiting
-    return OmegaConf.masked_copy(config, [key for key in texts if key in used])
-
-
 @contextmanager
-def nearest_names(verb: str, arguments: Sequence[str]) -> Iterator[None]:
-    """Raise CompleteSplatError with the nearest names in place of Hydra's error about an unknown name."""
+def nearest_names(verb: str) -> Iterator[None]:
+    """Raise CompleteSplatError with the nearest name after Hydra's error about a name that does not exist."""
     try:
         yield
-    except (HydraException, ValueError) as error:
-        if (message := _misspelt(error, verb, arguments)) is None:
+    except MissingConfigException as error:
+        group, _, option = (error.missing_cfg_file or "").strip("/").rpartition("/")
+        known = options(group)
+        if not known:
             raise
+        message = f"no {group} {option!r}: there are {', '.join(known)}{did_you_mean(option, known)}"
         raise CompleteSplatError(message) from error
+    except HydraException as error:
+        unknown = UNKNOWN_KEY.match(str(error))
+        if unknown is None:
+            raise
+        names = {*setting_names(_composed(verb)), *groups()}
+        message = f"{unknown[0]}{did_you_mean(unknown[1], names)}"
+        raise CompleteSplatError(message) from error
+    except ValueError as error:
+        if not str(error).startswith("Config group override must be"):  # `group=null`
+            raise
+        raise CompleteSplatError(str(error)) from error
 
 
-def _misspelt(error: Exception, verb: str, arguments: Sequence[str]) -> str | None:
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        group, _, option = error.missing_cfg_file.strip("/").rpartition("/")
-        known = [name for name in error.options or () if not name.startswith("_")]
-        kind = f"task of completesplat {verb}" if group == f"{verb}_task" else group
-        return f"no {kind} {option!r}: there are {', '.join(known)}{did_you_mean(option, known)}"
-    if str(error).startswith("Config group override must be"):
-        empty = [text.partition("=")[0] for text in arguments if text.endswith("=null") and options(text[:-5])]
-        return f"{empty[0]}=null: choose one of {', '.join(options(empty[0]))}" if empty else None
-    unknown = NOT_THERE.match(str(error)) if isinstance(error, HydraException) else None
-    return _unknown_setting(verb, unknown[1], arguments) if unknown else None
-
-
-def _unknown_setting(verb: str, key: str, arguments: Sequence[str]) -> str:
-    settings = [text for text in arguments if not text.startswith("-") and text.lstrip("+~").partition("=")[0] != key]
-    try:
-        config = _composed(verb, settings)
-    except Exception:  # another argument is wrong, too
-        config = _composed(verb)
-    names = [name for name in _keys(config) if not name.startswith("task.")] + (groups() if verb == "fit" else [])
-    nearest = _nearest(verb, key, list(dict.fromkeys(names)))
-    above, _, last = key.rpartition(".")
-    parent = OmegaConf.select(config, above, throw_on_resolution_failure=False) if above else None
-    if isinstance(parent, DictConfig) and (last in part_arguments(parent)[0] or not (nearest or "_target_" in parent)):
-        nearest = f"; +{key}=VALUE adds it"
-    hint = f"; completesplat {verb} --help shows those that there are, --help WORD searches them"
-    return f"no setting {key!r} of completesplat {verb}{nearest or hint}"
-
-
-def _nearest(verb: str, key: str, names: Sequence[str]) -> str:
-    """Return an ending for a message about an unknown key: settings near its last name, or found by words."""
-    top = key.partition(".")[0]
-    last = key.rpartition(".")[2]
-    lasts = {name: name.rpartition(".")[2] for name in names}
-    known = set(lasts.values())
-    close = [last] if last in known else get_close_matches(last, known, cutoff=LEAST_LIKE)
-    likely = [name for near in close for name in names if lasts[name] == near]
-    likely = likely or [setting.key for setting, _, _ in search_settings(verb, None, [last]) if setting.key in lasts]
-    likely = [name for name in likely if name.startswith(f"{top}.")] or likely
-    nearest = get_close_matches(key, likely, cutoff=LEAST_LIKE) or likely[:3]
-    return f"; did you mean {' or '.join(nearest)}?" if nearest else ""
-
-
-def _keys(config: DictConfig, place: str = "") -> Iterator[str]:
+def setting_names(config: DictConfig, place: str = "") -> Iterator[str]:
+    """Yield the names of all settings of a config and of its parts."""
     for name in map(str, config):
         yield f"{place}{name}"
-        followed = OmegaConf.is_missing(config, name) or OmegaConf.is_interpolation(config, name)
-        if not followed and isinstance(config[name], DictConfig):
-            yield from _keys(config[name], f"{place}{name}.")
+        refers = OmegaConf.is_missing(config, name) or OmegaConf.is_interpolation(config, name)
+        if not refers and isinstance(config[name], DictConfig):
+            yield from setting_names(config[name], f"{place}{name}.")
 
 
 def sweep_arguments(verb: str, arguments: Sequence[str]) -> list[str]:
     """Return arguments to add for a sweep: its directory, and in it one for each job, named by the swept settings."""
     keys = [override.split("=")[0] for override in arguments]
-    added = [] if "out" in keys else [f"out=outputs/{verb}/{RUN_NAME}"]
+    swept = swept_keys(arguments)
+    added = []
+    if "out" not in keys:
+        added.append(f"out=outputs/{verb}/{RUN_NAME}")
     if verb == "fit" and "ckpt_path" not in keys:
         added.append("ckpt_path=last")
-    swept = swept_keys(arguments)
     if swept and "hydra.sweep.subdir" not in keys:
         added.append(f"hydra.sweep.subdir=${{job_name:{','.join(swept)}}}${{shard_folder:}}")
     return added

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, NamedTuple, TypedDict
 from completesplat.errors import CompleteSplatError
 from completesplat.quantities import CameraPath, Entries, Format, NonNegative, Positive, Range, Seed, Share
 
-MOST_SHOWN = 1e6  # help texts leave out larger bounds
 NOT_A_LIST = "must be a list"
 NUMBERS: Mapping[type, type] = {int: Integral, float: Real}  # which include NumPy's numbers
 KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "null"}
@@ -51,20 +50,7 @@ class FitSettings(TypedDict):
 class PlanSettings(FitSettings):
     """Settings of `completesplat plan`."""
 
-    gpu: str
-    devices: Positive
-    share: Annotated[float, Range(0.01, 1)]
-    price: NonNegative
-    sequences: Positive
-    frames: Positive
-    pixel_bytes: NonNegative
-    loading_rate: Annotated[float, Range(1e-3)]
-    bandwidth_share: Annotated[float, Range(0.01, 1)]
-    checkpoint_rate: Annotated[float, Range(1e-3)]
-    gaussian_ns: NonNegative
-    operation_us: NonNegative
-    usable: Annotated[float, Range(0.01, 1)]
-    gpus: Mapping[str, Mapping[str, Annotated[float, Range(1e-3)]]]
+    timed_steps: Positive
 
 
 class SceneSettings(TypedDict):
@@ -306,8 +292,10 @@ def _in_union(members: Sequence[object], value: object) -> list[Violation]:
         return []
     alternatives: list[str] = []
     for member in members:
-        if member is NoneType or typing.get_origin(member) is Literal:
-            alternatives.append(described(member) or "null")
+        if member is NoneType:
+            alternatives.append("null")
+        elif typing.get_origin(member) is Literal:
+            alternatives.append(", ".join(map(str, typing.get_args(member))))
     return [unfit._replace(reason=", or ".join([unfit.reason, *alternatives])) for unfit in attempts[0]]
 
 
@@ -332,31 +320,6 @@ def _in_mapping(annotation: object, value: object) -> list[Violation]:
         for unfit in violations(hints.get(key, default), part):
             result.append(unfit._replace(place=f".{key}{unfit.place}"))
     return result
-
-
-def described(annotation: object) -> str:
-    """Describe the values that an annotation allows in a few words, or by an empty text if they are unknown."""
-    origin = typing.get_origin(annotation)
-    arguments = typing.get_args(annotation)
-    if origin is Annotated:
-        kind, *rules = arguments
-        ranges = [_range_words(rule) for rule in rules if isinstance(rule, Range)]
-        return ", ".join(filter(None, [described(kind), *ranges]))
-    if origin in (typing.Union, UnionType):
-        return " or ".join(dict.fromkeys(filter(None, map(described, arguments))))
-    if origin is Literal:
-        return ", ".join(map(str, arguments))
-    if origin is Sequence:
-        return "list"
-    if origin is Mapping or typing.is_typeddict(annotation):
-        return "mapping"
-    return KINDS.get(annotation, "").removeprefix("a ") if isinstance(annotation, type) else ""
-
-
-def _range_words(allowed: Range) -> str:
-    if allowed.most > MOST_SHOWN:
-        return f"at least {allowed.least:g}"
-    return f"{allowed.least:g} to {allowed.most:g}"
 
 
 def _is_a(kind: type, value: object) -> bool:

@@ -19,7 +19,7 @@ from completesplat.data.loading.distributed import gather_values
 from completesplat.errors import DivergenceError, WeightsError
 from completesplat.files import atomic_path, make_folder
 from completesplat.quantities import Positive
-from completesplat.signals import keep_signals
+from completesplat.signals import keep_signals, restore_handlers
 from completesplat.training.loggers import ContinuedCSVLogger
 from completesplat.training.stopping import agreed_signal, end_training
 from completesplat.weights.checkpoint_reading import check_whole, not_finite, read_checkpoint
@@ -107,6 +107,7 @@ class Checkpoints(Checkpoint):
             last = self.folder / LAST
             if resumed != last and resumed.parent == self.folder:
                 link(resumed, last)  # replace a damaged file, which must not become `previous.ckpt`
+        restore_handlers()  # Lightning's wait for other processes within a step, for ever if these are gone
         keep_signals(True)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.loading.distributed import gather_values
 from completesplat.data.loading.latent_cache import LatentCache
-from completesplat.diffusion.guidance import Latents
+from completesplat.diffusion.denoiser import Latents
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.evaluation.scorer import Scorer

@@ -117,7 +117,7 @@ class ReconstructionModule(ReconstructionScorer, Stage):
             CompleteSplatError: there is a latent cache, which is for stage 2, the posterior gets too few views, or
                 published weights get images of another size.
         """
-        if self.trainer.datamodule is None:  # type: ignore[attr-defined]  # a benchmark trains on one batch
+        if self.trainer.datamodule is None:  # type: ignore[attr-defined]  # plain batches, which have no data set
             return
         data = self.data
         if self.sees_views and data.targets < 2:

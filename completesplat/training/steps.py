@@ -24,12 +24,13 @@ MAXIMAL_NORM = 1.0  # of gradients, as in conf/trainer
 class Training:
     """Optimizer steps of either stage as in a run, without its logging.
 
-    `module` is on its device. `precision` is in Lightning's notation: "bf16-mixed" computes the networks in bfloat16.
+    Args:
+        precision: Lightning's name; "bf16-mixed" computes the networks in bfloat16.
     """
 
-    def __init__(self, module: Stage, precision: str) -> None:
+    def __init__(self, module: Stage, precision: str | int) -> None:
         self.module = module
-        self.precision = precision
+        self.precision = str(precision)
         for logs in ("log_loss", "log_step"):  # there is no trainer to log with
             setattr(module, logs, lambda *_, **__: None)
 
@@ -38,15 +39,24 @@ class Training:
         """Return the optimizer, which takes memory from the first step on."""
         return self.module.optimizer([p for p in self.module.parameters() if p.requires_grad])
 
-    def step(self, batch: Batch) -> None:
-        loss = self.loss(batch)
-        self.optimizer.zero_grad()
-        torch.autograd.backward([loss])
+    def optimizer_bytes(self) -> int:
+        """Return the bytes of the optimizer's state."""
+        values = (value for state in self.optimizer.state.values() for value in state.values())
+        return sum(value.nbytes for value in values if isinstance(value, Tensor))
+
+    def step(self, *batches: Batch) -> None:
+        """Accumulate the gradients of the batches, and change the weights."""
+        for index, batch in enumerate(batches):
+            loss = self.loss(batch) / len(batches)
+            if index == 0:
+                self.optimizer.zero_grad()  # after the forward pass, as Lightning does
+            torch.autograd.backward([loss])
         self.update()
 
     def loss(self, batch: Batch) -> Tensor:
         module = self.module.train()
-        with autocast(module.device, self.precision):
+        dtype = torch.float16 if self.precision.startswith("16") else torch.bfloat16
+        with torch.autocast(module.device.type, dtype, enabled=not self.precision.startswith("32")):
             loss: Tensor = module.training_step(batch.to(module.device), 0)  # type: ignore[assignment]
         return loss
 
@@ -54,11 +64,6 @@ class Training:
         """Clip the gradients and change the weights."""
         torch.nn.utils.clip_grad_norm_(self.module.parameters(), MAXIMAL_NORM, foreach=True)
         self.optimizer.step()
-
-
-def autocast(device: torch.device, precision: str) -> torch.autocast:
-    """Return the context in which Lightning computes with this precision."""
-    return torch.autocast(device.type, torch.bfloat16, enabled=precision.startswith("bf16"))
 
 
 def cameras_on_orbit(size: int, views: int) -> Cameras:

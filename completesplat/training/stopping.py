@@ -32,11 +32,7 @@ logger = logging.getLogger(__name__)
 
 @contextmanager
 def stopped_together() -> Iterator[None]:
-    """Leave signals to `completesplat.signals`, and let processes that trainers or `Fabric` start end with this one.
-
-    Lightning's handlers wait for other processes in the middle of a step, for ever if these are gone. They end `fit`
-    and `test` with exit status 0, and its observer kills the first process if another one got a signal.
-    """
+    """Let processes that trainers or `Fabric` start end with this one."""
     started: list[subprocess.Popen[bytes]] = []
     observers: list[_Observer] = []
 
@@ -64,42 +60,39 @@ def stopped_together() -> Iterator[None]:
 
 @contextmanager
 def _observed_by(observe: Callable[[list[subprocess.Popen[bytes]]], None]) -> Iterator[None]:
-    """Replace Lightning's handlers of signals by none, and its observer of child processes by `observe`.
+    """Replace Lightning's observer of child processes by `observe`.
 
-    Both are private, because Lightning has no public way. Where a release has renamed one of them, Lightning keeps its
-    own behaviour, and a warning says so.
+    Lightning's own, which is private, kills this process within five seconds after a signal has ended another one, so
+    that nothing could say how to continue. This can go when Lightning lets a launcher choose its observer, or ends all
+    processes by the signal that one of them got. Where a release has renamed it, Lightning keeps its own behaviour.
     """
-    connector: Any = None
-    try:
-        from lightning.pytorch.trainer.connectors.signal_connector import _SignalConnector
-
-        before = _SignalConnector.register_signal_handlers, [x._launch_process_observer for x in LAUNCHERS]
-        connector = _SignalConnector
-    except (ImportError, AttributeError):
-        message = "lightning %s has other names: signals during training are handled in its own way"
+    before = [getattr(launcher, "_launch_process_observer", None) for launcher in LAUNCHERS]
+    if None in before:
+        message = "lightning %s has other names: processes that a signal ends are handled in its own way"
         logger.warning(message, lightning.__version__)
-    if connector is None:
         yield
         return
-    connector.register_signal_handlers = lambda self: None
     for launcher in LAUNCHERS:
         launcher._launch_process_observer = observe
     try:
         yield
     finally:
-        connector.register_signal_handlers = before[0]
-        for launcher, function in zip(LAUNCHERS, before[1], strict=True):
+        for launcher, function in zip(LAUNCHERS, before, strict=True):
             launcher._launch_process_observer = function
 
 
 def _end(process: "subprocess.Popen[bytes]", number: int) -> None:
-    for seconds, next_number in ((GRACE_SECONDS / 5, number), (GRACE_SECONDS, signal.SIGKILL), (None, None)):
+    """Wait for a process to end.
+
+    Send it the signal after a second, and kill it after five more.
+    """
+    for seconds, next_number in ((GRACE_SECONDS / 5, number), (GRACE_SECONDS, signal.SIGKILL)):
         try:
             process.wait(seconds)
             return
         except subprocess.TimeoutExpired:
-            assert next_number is not None
             process.send_signal(next_number)
+    process.wait()
 
 
 class _Observer(threading.Thread):
@@ -152,7 +145,10 @@ class _Observer(threading.Thread):
 
 
 def agreed_signal(trainer: Trainer) -> int | None:
-    """Return the signal that a process of the run received, if any did; all processes have to call this."""
+    """Return the signal that a process of the run received, if any did.
+
+    All processes have to call this.
+    """
     if trainer.world_size == 1:
         return signals.received()  # without a wait for the GPU
     local = torch.tensor(signals.received() or 0, device=trainer.strategy.root_device)

@@ -50,7 +50,9 @@ class GuardedServer(viser.ViserServer):
     def __init__(self, port: int) -> None:
         self.token = secrets.token_urlsafe(32)
         self._guarded = False
-        # viser's constructor starts the websocket server in a thread and waits for it, and has no options for it.
+        # viser's constructor starts the websocket server in a thread, waits for it, and has no options for it. A proxy
+        # in front would leave viser's own port open to every page of this machine's browsers. This can go when viser
+        # takes a `process_request`, or asks for a token itself.
         serve = websockets_server.serve
         websockets_server.serve = partial(self._serve, serve)  # type: ignore[assignment, misc]
         try:
@@ -63,11 +65,17 @@ class GuardedServer(viser.ViserServer):
 
     @property
     def address(self) -> str:
-        """Address that opens the page; it contains the token."""
+        """Address that opens the page.
+
+        It contains the token.
+        """
         return f"http://{self.get_host()}:{self.get_port()}/?token={self.token}"
 
     def _serve(self, serve: Callable[..., Any], *args: Any, process_request: Answer, **settings: Any) -> Any:
-        """Start viser's websocket server with our checks; viser calls this instead of `serve`."""
+        """Start viser's websocket server with our checks.
+
+        viser calls this instead of `serve`.
+        """
         self._guarded = True
         answer = partial(self._answer, process_request)
         return serve(*args, process_request=answer, **settings | {"max_size": MOST_FRAME})
@@ -126,7 +134,10 @@ def show_status(server: viser.ViserServer, text: str) -> None:
 
 
 def stop_server(server: viser.ViserServer) -> None:
-    """Stop a server; browsers then lose the page."""
+    """Stop a server.
+
+    Browsers then lose the page.
+    """
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
@@ -144,5 +155,8 @@ def tokens(request: Request, port: int) -> list[bytes]:
 
 
 def with_head(page: str) -> str:
-    """Return viser's HTML with our title, icon and script at the start of its head; viser has no settings for them."""
+    """Return viser's HTML with our title, icon and script at the start of its head.
+
+    viser has no settings for them.
+    """
     return page.replace("<head>", f"<head>{HEAD.read_text()}", 1)

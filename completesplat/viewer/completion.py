@@ -23,7 +23,7 @@ PAUSE = 0.2  # seconds between two images of a scene that forms
 
 
 class Completion:
-    """Controls that complete a photo, added to a page; the model runs only in the page's worker."""
+    """Controls that complete a photo, added to a page. The model runs only in the page's worker."""
 
     def __init__(self, page: Page, model: SceneModel, start: dict[str, Any]) -> None:
         self.page = page
@@ -52,7 +52,7 @@ class Completion:
         self.page.submit(SHOWN, client, partial(self._draw, *self.photograph, settings))
 
     def complete(self, image: Path, name: str, client: viser.ClientHandle | None) -> None:
-        """Load an image file; raise a `CompleteSplatError` if it is none, or its background cannot be removed."""
+        """Load an image file, or raise CompleteSplatError if it is none or its background cannot be removed."""
         show_status(self.page.server, f"reading {name}")
         photograph = self.model.read(image, remove_background=self.controls.remove_background.value)
         self.load(name, photograph, client)

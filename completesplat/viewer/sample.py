@@ -64,7 +64,7 @@ class Sample:
 
 
 def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
-    """Read a file of Gaussians, or all samples of a prediction or fitted scene; return them and the direction up.
+    """Read the scene in a file, or all samples of a prediction or fitted scene, and the direction up.
 
     A file without our `scene.json` beside it is seen by its `framing_camera`.
 
@@ -92,7 +92,11 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
 
 
 def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
-    """Return a run's newest step, scenes and direction up (`write_newest`); raise CompleteSplatError if unreadable."""
+    """Return a run's newest step, its scenes and the direction up, as `write_newest` wrote them.
+
+    Raises:
+        CompleteSplatError: they cannot be read.
+    """
     path = folder / NEWEST_FILE
     samples = []
     with errors_at(path):

@@ -27,7 +27,8 @@ def module(model: str, *settings: str) -> ReconstructionModule:
 
 def pair(model: str, setting: str) -> tuple[ReconstructionModule, ReconstructionModule]:
     """A module without and with a setting, of the same weights under the same names."""
-    plain, other = module(model), module(model, setting)
+    plain = module(model)
+    other = module(model, setting)
     other.load_state_dict(plain.state_dict())
     return plain, other
 

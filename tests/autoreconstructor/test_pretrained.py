@@ -44,18 +44,21 @@ def before_the_last_convolution(network, run):
 
 @torch.no_grad()
 def test_latents_and_decoder_features_are_the_vaes_and_all_but_head_and_skips_bit_for_bit(vae, folder):
-    model, random = build(str(folder)), build()
+    model = build(str(folder))
+    random = build()
     assert_loaded(model, vae)
     images = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(2))
     posterior, features = model.encoder(images)
     expected = vae.encode(images * 2 - 1).latent_dist
     torch.testing.assert_close(posterior.mean, expected.mean)
     torch.testing.assert_close(posterior.log_variance, expected.logvar)
-    latent, reconstructor = expected.mean, model.reconstructor
+    latent = expected.mean
+    reconstructor = model.reconstructor
     ours = before_the_last_convolution(reconstructor.network, lambda: reconstructor(latent, features))
     theirs = before_the_last_convolution(vae.decoder, lambda: vae.decode(latent))
     torch.testing.assert_close(ours, theirs)
-    head, untouched = reconstructor.network.conv_out, random.reconstructor.network.conv_out
+    head = reconstructor.network.conv_out
+    untouched = random.reconstructor.network.conv_out
     assert torch.equal(head.weight, untouched.weight)
     assert torch.equal(head.bias, untouched.bias)
     assert not any(parameter.any() for parameter in reconstructor.skips.parameters())
@@ -84,7 +87,8 @@ def test_older_names_of_the_attention_are_known(vae, folder):
 
 def by_ldms_names(vae) -> dict[str, torch.Tensor]:
     """A VAE's tensors by Stable Diffusion's own names; the attention's layers are 1 x 1 convolutions there."""
-    renamed, blocks = {}, len(vae.config.up_block_types)
+    renamed = {}
+    blocks = len(vae.config.up_block_types)
     for name, value in vae.state_dict().items():
         new = re.sub(r"down_blocks\.(\d)\.resnets", r"down.\1.block", name)
         new = re.sub(r"down_blocks\.(\d)\.downsamplers\.0", r"down.\1.downsample", new)
@@ -122,7 +126,8 @@ def test_half_precision_under_its_own_name_is_loaded(vae, folder):
 
 
 def test_of_a_hub_pipeline_only_the_vae_is_fetched(vae, tmp_path, monkeypatch):
-    hub, cache = tmp_path / "hub", tmp_path / "cache"
+    hub = tmp_path / "hub"
+    cache = tmp_path / "cache"
     for part in ("vae", "unet"):
         vae.save_pretrained(hub / part, safe_serialization=False)
 

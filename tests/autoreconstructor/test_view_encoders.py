@@ -13,7 +13,8 @@ from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 from completesplat.scene import Views
 from completesplat.splatter_image import Parameterization
 
-SIZE, VIEWS = 16, 4
+SIZE = 16
+VIEWS = 4
 SIZES = {"channels": (8, 8), "layers_per_block": 1, "norm_groups": 4}
 DEPTHS = torch.tensor([[1.0, 4.0]])
 
@@ -69,7 +70,8 @@ def test_what_another_view_shows_moves_the_posterior(model):
 
 
 def test_poses_matter_and_the_order_of_the_views_does_not(model):
-    seen, model = views(), trained(model)
+    seen = views()
+    model = trained(model)
     order = [0, 3, 1, 2]
     torch.testing.assert_close(mean(model, seen[:, order]), mean(model, seen), atol=1e-4, rtol=1e-4)
     shuffled = replace(seen, cameras=seen.cameras[:, order])
@@ -77,7 +79,8 @@ def test_poses_matter_and_the_order_of_the_views_does_not(model):
 
 
 def test_with_the_reference_alone_the_posterior_is_the_images(model):
-    seen, model = views(), trained(model)
+    seen = views()
+    model = trained(model)
     own, _ = model.encoder(seen.images[:, 0])
     assert torch.equal(mean(model, seen[:, :1]), own.mean)
 

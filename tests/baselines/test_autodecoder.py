@@ -30,7 +30,8 @@ def test_an_image_keeps_its_code_until_the_table_is_full():
 
 
 def test_a_checkpoint_knows_which_code_is_whose():
-    model, file = decoder(), io.BytesIO()
+    model = decoder()
+    file = io.BytesIO()
     expected = codes_of(model, ("b", 3), ("a", 0), ("b", 1))
     torch.save(model.state_dict(), file)
     file.seek(0)

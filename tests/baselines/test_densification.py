@@ -13,8 +13,10 @@ from completesplat.baselines.fitting import RawGaussians, opacity_of_copies, pos
 @pytest.mark.parametrize("opacity", [0.01, 0.5, 0.95, 0.999])
 def test_copies_hide_as_much_as_the_original(opacity, copies):
     """In the middle exactly, and along a line in the integral, here a sum over a fine grid."""
-    o, n = torch.tensor([opacity]), torch.tensor([copies])
-    share, factor = opacity_of_copies(o.double(), n).item(), scale_of_copies(o, n).item()
+    o = torch.tensor([opacity])
+    n = torch.tensor([copies])
+    share = opacity_of_copies(o.double(), n).item()
+    factor = scale_of_copies(o, n).item()
     assert 1 - (1 - share) ** copies == pytest.approx(opacity, rel=1e-6)
     x = torch.linspace(-12, 12, 20001, dtype=torch.float64)
     together = 1 - (1 - share * torch.exp(-(x**2) / (2 * factor**2))) ** copies
@@ -54,7 +56,8 @@ def test_where_nothing_lives_nothing_moves():
 
 
 def test_noise_has_a_transparent_gaussians_covariance_and_spares_opaque_ones():
-    one, rate = some_gaussians(1, opacity=1e-4)[0][:1], 1e-6
+    one = some_gaussians(1, opacity=1e-4)[0][:1]
+    rate = 1e-6
     many = one.map(lambda tensor: tensor.expand(20_000, *tensor.shape[1:]))
     torch.manual_seed(0)
     noise = position_noise(many, rate)

@@ -12,7 +12,8 @@ from completesplat.metrics.images import psnr
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import Views
 
-SIZE, VIEWS = 16, 6
+SIZE = 16
+VIEWS = 6
 DEPTH_RANGE = torch.tensor([[1.5, 2.5], [1.0, 3.0]])
 FEW = FittingSettings(count=100, steps=40, views=2, position_rate=30.0, other_rates=10.0)
 MSE = WeightedSum({"mse": {"weight": 1.0, "term": MeanSquaredError()}})

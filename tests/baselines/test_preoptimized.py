@@ -11,17 +11,21 @@ from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.splatter_image import CHANNELS, Parameterization, SplatterImage
 
-HEIGHT, WIDTH, BATCH = 4, 4, 2
+HEIGHT = 4
+WIDTH = 4
+BATCH = 2
 DEPTH_RANGE = torch.tensor([[1.0, 3.0], [0.5, 6.0]])
 # The world is elsewhere: only the intrinsics matter.
 ELSEWHERE = torch.tensor([[0.0, 1, 0, 5], [-1, 0, 0, 1], [0, 0, 1, -9], [0, 0, 0, 1]])
 CAMERAS = Cameras(ELSEWHERE.expand(BATCH, 4, 4), pinhole(60.0, WIDTH).expand(BATCH, 3, 3), (HEIGHT, WIDTH))
-ONE, RANGE = CAMERAS[:1], DEPTH_RANGE[:1]
+ONE = CAMERAS[:1]
+RANGE = DEPTH_RANGE[:1]
 
 
 def at(points: list[tuple[float, float, float]], opacities: list[float]) -> Gaussians:
     """Gaussians of one scene, at (column, row, depth), with different looks."""
-    pixels, focal = torch.tensor([points]), ONE.intrinsics[0, 0, 0]
+    pixels = torch.tensor([points])
+    focal = ONE.intrinsics[0, 0, 0]
     means = torch.cat([(pixels[..., :2] - WIDTH / 2) / focal * pixels[..., 2:], pixels[..., 2:]], dim=-1)
     draws = torch.Generator().manual_seed(0)
     rotations, scales, colors = (torch.rand(1, len(points), n, generator=draws) for n in (4, 3, 3))
@@ -62,7 +66,10 @@ def test_of_several_in_a_pixel_the_most_opaque_stay(layers, layer_depths):
 
 
 def test_what_the_camera_does_not_see_fills_no_pixel():
-    behind, left, below, invisible = (2.5, 2.5, -2.0), (-0.01, 1.0, 2.0), (1.0, HEIGHT + 0.01, 2.0), (0.5, 0.5, 2.0)
+    behind = (2.5, 2.5, -2.0)
+    left = (-0.01, 1.0, 2.0)
+    below = (1.0, HEIGHT + 0.01, 2.0)
+    invisible = (0.5, 0.5, 2.0)
     gaussians = at([behind, left, below, invisible], [0.9, 0.9, 0.9, 0.0039])
     image, empty = project_to_splatter_image(gaussians, ONE, RANGE, Parameterization())
     assert empty.all()
@@ -72,7 +79,8 @@ def test_what_the_camera_does_not_see_fills_no_pixel():
 
 
 def test_scenes_of_a_batch_stay_apart():
-    one, other = at([(0.5, 0.5, 2.0)], [1.0]), at([(2.5, 1.5, 1.5)], [0.4])
+    one = at([(0.5, 0.5, 2.0)], [1.0])
+    other = at([(2.5, 1.5, 1.5)], [0.4])
     both = Gaussians(*(torch.cat(pair) for pair in zip(vars(one).values(), vars(other).values(), strict=True)))
     image, empty = project_to_splatter_image(both, CAMERAS, DEPTH_RANGE, Parameterization(layers=1))
     assert image.raw.isfinite().all()  # for full opacity too

@@ -22,7 +22,8 @@ def images():
 
 
 def test_there_is_one_gaussian_to_a_layer_and_pixel_and_no_posterior_and_images_are_centred_on_grey(images):
-    model, seen = build(layers=2).eval(), []
+    model = build(layers=2).eval()
+    seen = []
     model.network.conv_in.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     reconstruction = model(images)
     assert reconstruction.posterior is None
@@ -32,7 +33,8 @@ def test_there_is_one_gaussian_to_a_layer_and_pixel_and_no_posterior_and_images_
 
 @pytest.mark.parametrize("mixed", [False, True])
 def test_gradients_reach_every_parameter_and_bfloat16_autocast_gives_finite_float32(images, mixed):
-    model, inner = build(), []
+    model = build()
+    inner = []
     model.network.conv_out.register_forward_hook(lambda *call: inner.append(call[2].dtype))
     with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
         raw = model(images).splatter_image.raw

@@ -14,7 +14,8 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.splatter_image import CHANNELS, Parameterization, SplatterImage
 
-SIZE, COUNT = 16, 60
+SIZE = 16
+COUNT = 60
 SHAPE = {"channels": (16, 32), "layers_per_block": 1, "norm_groups": 8}
 
 
@@ -66,7 +67,8 @@ def test_the_same_is_measured_on_a_device_without_float64(measured):
 
 
 def test_what_does_not_vary_is_centred_and_an_empty_layer_left_alone():
-    vae, image = tiny_vae(), sparse_image()
+    vae = tiny_vae()
+    image = sparse_image()
     raw = image.raw.clone()
     raw[:, :, 0] = 3.0
     raw[:, 1, 4] = -30.0
@@ -102,7 +104,8 @@ def test_errors_are_those_of_single_places(measured):
 
 
 def test_one_sparse_splatter_image_can_be_learned_by_heart():
-    vae, image = tiny_vae(), sparse_image()
+    vae = tiny_vae()
+    image = sparse_image()
     vae.measure([image])
     optimizer = torch.optim.Adam(vae.parameters(), lr=1e-2)
     losses = []

@@ -31,5 +31,5 @@ def test_small_steps_are_the_steps(tmp_path):
 def test_every_step_works_at_tiny_sizes(tmp_path):
     lacking = gpu_day.run(tmp_path, small=True)
     assert lacking == [], "\n".join((tmp_path / f"{name}.failed.txt").read_text()[-2000:] for name in lacking)
-    for file in ("paper/paper.json", "plan_diffusion/plan.json", "test_48/metrics.json"):
+    for file in ("rasterizers/rasterizers.json", "plan_diffusion/plan.json", "test_48/metrics.json"):
         assert strict_json(tmp_path / file)

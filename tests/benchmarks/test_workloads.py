@@ -13,7 +13,7 @@ from completesplat.evaluation import scorer
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers import Rendering
-from completesplat.rasterizers.kernels import drawing
+from completesplat.rasterizers.kernels import runtime
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.training import steps
 from completesplat.training.steps import FOV_DEGREES, peak_megabytes
@@ -79,7 +79,7 @@ def test_the_peak_is_the_memory_that_work_adds(monkeypatch: pytest.MonkeyPatch) 
     arrays = [np.ones(FLOATS, np.float32)]  # memory from before does not count
     assert peak_megabytes(lambda: None, CPU) < 5
     assert 50 < peak_megabytes(lambda: np.ones(FLOATS, np.float32), CPU) < 70
-    assert all(peak_megabytes(lambda: drawing.empty((FLOATS,)).fill(1), CPU) > 50 for _ in range(2))
+    assert all(peak_megabytes(lambda: runtime.empty((FLOATS,)).fill(1), CPU) > 50 for _ in range(2))
     assert 50 < peak_megabytes(lambda: arrays.append(np.ones(FLOATS, np.float32)), CPU) < 70
 
 

@@ -9,8 +9,7 @@ from support import python, strict_json
 
 FEW = ["samples=2", "frames=4", "steps=2", "color_fits=1"]
 UNNEEDED = ["lightning", "matplotlib", "pandas", "torchmetrics", "viser", "wandb"]
-UNNEEDED += ["torch._dynamo", "sympy", "scipy.stats", "scipy.integrate", "requests"]  # diffusers imports them
-UNNEEDED += [f"completesplat.{part}" for part in ("data.importing", "data.loading", "metrics", "studies", "training")]
+UNNEEDED += [f"completesplat.{part}" for part in ("data.captures", "data.loading", "metrics", "evaluation.scorer", "training")]
 
 
 @pytest.fixture

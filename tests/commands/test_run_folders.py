@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from support import SMALL, interrupted_at, strict_json
 
 from completesplat.commands import jobs
-from completesplat.commands.jobs import hold_job_lock
+from completesplat.commands.locks import hold_job_lock
 from completesplat.data.toy import write_objects
 from completesplat.errors import CompleteSplatError
 from completesplat.files import atomic_path
@@ -22,7 +22,7 @@ from completesplat.training.reconstruction import ReconstructionModule
 HOLDER = """
 import os, sys, time
 from pathlib import Path
-from completesplat.commands.jobs import hold_job_lock
+from completesplat.commands.locks import hold_job_lock
 with hold_job_lock(*[Path(sys.argv[1])] * 2):
     if os.fork() == 0:
         time.sleep(900)

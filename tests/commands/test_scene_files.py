@@ -14,8 +14,8 @@ from written_commands import ROOT, arguments_of, block_commands
 
 from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.paper_tables import published_tables
+from completesplat.evaluation.ply_samples import PlySamples
 from completesplat.evaluation.records import find_results, flat_scores
-from completesplat.evaluation.scene_files import SceneFiles
 from completesplat.evaluation.scorer import Scorer
 from completesplat.evaluation.tables import as_markdown
 from completesplat.export.ply import read_ply, write_ply
@@ -91,7 +91,7 @@ def in_front(count: int = 40, seed: int = 0) -> Gaussians:
 
 
 def drawn(folder: Path, scenes: SceneBatch, samples: int, frame: str = "opencv", align: str = "none") -> Gaussians:
-    stage = SceneFiles(str(folder), frame, align, None, rasterizer=ReferenceRasterizer())
+    stage = PlySamples(str(folder), frame, align, None, rasterizer=ReferenceRasterizer())
     stage.find_files(scenes.names, samples)
     return stage.draw(scenes, [0], samples)
 

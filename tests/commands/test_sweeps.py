@@ -64,6 +64,9 @@ def whole(toy_root, tmp_path_factory) -> Path:
 
 def test_a_sweep_that_is_started_again_repeats_no_finished_job(command, toy_root, whole):
     jobs = [whole / "seed-0", whole / "seed-1"]
+    record = strict_json(jobs[0] / "run.json")
+    assert (record["verb"], record["groups"]["experiment"]) == ("fit", "toy_var")
+    assert record["sweep"] == {"folder": "..", "job": 0}
     before = (jobs[0] / LAST).stat().st_mtime_ns
     again = command.succeeds(*settings(toy_root), "seed=0,1", f"out={whole}")
     assert again.out.count("finished before, not repeated") == 1
@@ -85,7 +88,10 @@ def test_a_finished_run_is_not_overwritten_and_not_repeated_even_with_other_numb
     config = OmegaConf.to_container(OmegaConf.load(job / "config.yaml"))
     assert config["ckpt_path"] == "last"
     trainer = config["trainer"]
-    for same in (config, config | {"trainer": trainer | {"devices": 2, "num_nodes": 3, "strategy": "ddp"}}):
+    evaluation = config["evaluation"]
+    earlier = evaluation | {"scoring": evaluation["scoring"] | {"_target_": "completesplat.metrics.scoring.Evaluation"}}
+    processes = trainer | {"devices": 2, "num_nodes": 3, "strategy": "ddp"}
+    for same in (config, config | {"trainer": processes}, config | {"evaluation": earlier}):
         assert is_finished(job, same)
     for other, message in (
         ({"ckpt_path": None}, "continue it with ckpt_path=last"),

@@ -16,7 +16,7 @@ from support import LIMIT
 from viewer_scenes import balls
 from written_commands import ROOT
 
-from completesplat.commands.jobs import hold_job_lock
+from completesplat.commands.locks import hold_job_lock
 from completesplat.commands.view import newest_scenes, scenes_in, setting_of_path, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.description import UP
@@ -189,7 +189,7 @@ def test_an_offline_page_is_written_from_a_scene_and_of_what_is_drawn(command, p
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
     out = f"out={tmp_path / 'out'}"
     write_ply(tmp_path / "my scene.ply", balls(points=5))
-    command.succeeds("view", "my scene.ply", "--export", "page.html", out)
+    command.succeeds("view", "my scene.ply", "export=page.html", out)
     text = (tmp_path / "page.html").read_text()
     assert text.startswith("<!doctype html>")
     assert "__VISER_EMBED_DATA__" in text

@@ -52,7 +52,8 @@ def write_images(folder: Path) -> None:
 
 def write_colmap(folder: Path, shift: np.ndarray | float = 0.0) -> None:
     """A text model and its images, with the world's origin moved by -`shift`."""
-    (model := folder / "sparse/0").mkdir(parents=True)
+    model = folder / "sparse/0"
+    model.mkdir(parents=True)
     write_images(folder / "images")
     (model / "cameras.txt").write_text(f"# cameras\n1 PINHOLE {WIDTH} {HEIGHT} 19 19.5 8 6\n")
     lines = ["# images"]
@@ -258,7 +259,8 @@ def test_photographs_with_stored_pixels_are_not_turned(tmp_path):
 
 def test_windows_separators_lead_to_the_images(tmp_path):
     write_transforms(tmp_path)
-    expected, file = sequence(tmp_path), tmp_path / "transforms.json"
+    expected = sequence(tmp_path)
+    file = tmp_path / "transforms.json"
     file.write_text(file.read_text().replace("images/", r"images\\"))
     must_agree(sequence(tmp_path), expected)
 
@@ -366,7 +368,8 @@ def test_keyframes_of_polycam_are_a_capture(tmp_path, kind):
     expected = sequence(tmp_path)
     content = json.loads((tmp_path / "transforms.json").read_text())
     (tmp_path / "transforms.json").unlink()
-    (cameras := tmp_path / f"keyframes/{kind}cameras").mkdir(parents=True)
+    cameras = tmp_path / f"keyframes/{kind}cameras"
+    cameras.mkdir(parents=True)
     move("images", f"keyframes/{kind}images")(tmp_path)
     for number, frame in enumerate(content["frames"]):
         entry = {f"t_{row}{column}": frame["transform_matrix"][row][column] for row in range(3) for column in range(4)}

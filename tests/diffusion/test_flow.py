@@ -39,7 +39,9 @@ def test_a_perfect_denoiser_takes_noise_to_the_latent_in_any_number_of_steps(sam
 
 def test_an_exact_denoiser_gives_the_data_distribution():
     """Data with two modes, of which one is three times as probable: shares, means and deviations of both."""
-    modes, shares, std = torch.tensor([-2.0, 1.0]), torch.tensor([0.25, 0.75]), 0.1
+    modes = torch.tensor([-2.0, 1.0])
+    shares = torch.tensor([0.25, 0.75])
+    std = 0.1
 
     def velocity(noisy, time, conditioning):
         t = (time[0] / 1000).clamp(max=0.9999).double()

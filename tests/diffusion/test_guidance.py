@@ -25,7 +25,8 @@ def predicted(features):
 
 
 def test_at_either_end_it_is_one_prediction_in_one_call_and_linear_between():
-    conditioned, free = predicted(FEATURES), predicted(torch.zeros_like(FEATURES))
+    conditioned = predicted(FEATURES)
+    free = predicted(torch.zeros_like(FEATURES))
     for weight, expected in ((0.0, conditioned), (1.0, free)):
         denoise = Counting()
         torch.testing.assert_close(guided_noise(denoise, LATENT, STEP, FEATURES, weight), expected)

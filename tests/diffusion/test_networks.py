@@ -32,7 +32,8 @@ def test_denoiser_predicts_noise_of_the_latents_shape_from_every_input(kind):
 
 @pytest.mark.parametrize("kind", OF_KIND)
 def test_recomputed_activations_give_the_same_gradients(kind, monkeypatch):
-    gradients, recomputed = [], []
+    gradients = []
+    recomputed = []
     run = torch.utils.checkpoint.checkpoint
     monkeypatch.setattr(torch.utils.checkpoint, "checkpoint", lambda *a, **k: recomputed.append(1) or run(*a, **k))
     for checkpointing in (False, True):
@@ -46,7 +47,9 @@ def test_recomputed_activations_give_the_same_gradients(kind, monkeypatch):
 
 
 def test_cross_attention_without_text_adds_a_constant_and_asks_nothing_where_nothing_is_trained():
-    denoiser, added, asked = tiny(TextlessStableDiffusion), [], []
+    denoiser = tiny(TextlessStableDiffusion)
+    added = []
+    asked = []
     assert not any("context" in name for name in denoiser.state_dict())  # the token of zeros is no weight
     crossing = [module for name, module in denoiser.network.named_modules() if name.endswith("attn2")]
     assert len(crossing) == 4  # One of the way down, two of the way up, one between.
@@ -67,7 +70,8 @@ def test_cross_attention_without_text_adds_a_constant_and_asks_nothing_where_not
 
 def test_stable_diffusions_size_is_the_published_one():
     with torch.device("meta"):
-        denoiser, without_text = TextlessStableDiffusion(), Denoiser()
+        denoiser = TextlessStableDiffusion()
+        without_text = Denoiser()
     count, less = (sum(p.numel() for p in network.parameters()) for network in (denoiser, without_text))
     # The published UNet (CompVis v1-inference.yaml) takes in four channels, ours eight.
     assert count == 859_520_964 + 320 * 4 * 9

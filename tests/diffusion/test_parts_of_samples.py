@@ -36,7 +36,8 @@ def test_calls_that_overlap_leave_torchs_number_of_threads_as_it_was(set_threads
 
 
 def test_parts_that_do_not_fit_are_halved_until_they_do(caplog):
-    asked, room = [], 3
+    asked = []
+    room = 3
 
     def draw(part: slice) -> list[int]:
         items = list(range(11))[part]

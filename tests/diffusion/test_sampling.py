@@ -24,7 +24,8 @@ NOISE = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_line
 DDIM = NOISE | {"clip_sample": False, "set_alpha_to_one": True, "timestep_spacing": "trailing"}
 NAMES = sorted(p.stem for p in (conf_folder() / "sampler").glob("[!_]*.yaml") if not p.stem.startswith("flow"))
 SOLVERS = ["ddim50", "dpm20", "unipc10"]
-MEAN, STD = 0.7, 0.5
+MEAN = 0.7
+STD = 0.5
 
 
 @cache
@@ -68,7 +69,8 @@ def exact_prediction(kind: str, sigmas: torch.Tensor | None = None):
         if sigmas is not None:
             bar = 1 / (1 + next(levels).to(latent) ** 2)
         surplus = (latent - bar.sqrt() * MEAN) / (bar * STD**2 + 1 - bar)
-        noise, clean = (1 - bar).sqrt() * surplus, MEAN + bar.sqrt() * STD**2 * surplus
+        noise = (1 - bar).sqrt() * surplus
+        clean = MEAN + bar.sqrt() * STD**2 * surplus
         velocity = bar.sqrt() * noise - (1 - bar).sqrt() * clean
         return {"epsilon": noise, "sample": clean, "v_prediction": velocity}[kind]
 
@@ -100,7 +102,8 @@ def test_forward_noising_is_equation_two_and_diffusers_with_every_sampler(name):
     own = made(name)
     assert own.training_timesteps == 1000
     torch.manual_seed(0)
-    latent, noise = torch.randn(3, 4, 2, 2), torch.randn(3, 4, 2, 2)
+    latent = torch.randn(3, 4, 2, 2)
+    noise = torch.randn(3, 4, 2, 2)
     step = torch.tensor([0, 500, 999])
     noisy = own.add_noise(latent, noise, step)
     bar = alpha_bar()[step].view(-1, 1, 1, 1).float()
@@ -113,7 +116,8 @@ def test_forward_noising_is_equation_two_and_diffusers_with_every_sampler(name):
 def test_one_step_is_ddims_equation(sampler):
     """DDIM (Song et al. 2021, Eq. 12, sigma = 0): from t = 999 straight to the clean latent."""
     torch.manual_seed(0)
-    noise, predicted = torch.randn(2, 4, 2, 2), torch.randn(2, 4, 2, 2)
+    noise = torch.randn(2, 4, 2, 2)
+    predicted = torch.randn(2, 4, 2, 2)
     result = sampler(lambda *_: predicted, noise, torch.zeros(2, 1, 2, 2), steps=1)
     last = alpha_bar()[999].float()
     torch.testing.assert_close(result, (noise - (1 - last).sqrt() * predicted) / last.sqrt(), atol=1e-4, rtol=1e-4)
@@ -140,7 +144,8 @@ def test_ddim_is_of_first_order_and_dpm_solver_2m_of_second(steps):
 
 @pytest.mark.parametrize(("name", "steps"), [*product(NAMES, [1, None]), ("ddim50", 1000)])
 def test_a_step_costs_one_call_of_the_whole_batch(name, steps):
-    own, calls = made(name), []
+    own = made(name)
+    calls = []
     noise = gaussian_noise(3)
     drawn = own(lambda x, t, c: calls.append((len(x), len(t), len(c))) or 0.1 * x, noise, nothing(3), steps=steps)
     assert calls == [(3, 3, 3)] * (steps or int(name.lstrip("dimpunc")))
@@ -166,8 +171,10 @@ def test_steps_that_ddim_cannot_make_are_refused(sampler, steps):
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "sample"])
 def test_estimates_are_shown_at_every_step_and_samples_do_not_depend_on_their_batch(name, kind):
-    own, shown = made(name, kind), []
-    noise, exact = gaussian_noise(2), exact_prediction(kind)
+    own = made(name, kind)
+    shown = []
+    noise = gaussian_noise(2)
+    exact = exact_prediction(kind)
     drawn = own(exact, noise, nothing(2), on_step=lambda *step: shown.append(step))
     alone = [own(exact, noise[i : i + 1], nothing(1)) for i in range(2)]
     torch.testing.assert_close(drawn, torch.cat(alone), atol=1e-6, rtol=1e-5)
@@ -182,7 +189,9 @@ def test_estimates_are_shown_at_every_step_and_samples_do_not_depend_on_their_ba
 
 @pytest.mark.parametrize("name", ["ddim50", "dpm20", "unipc10", "flow25"])
 def test_calls_in_four_threads_draw_what_each_draws_alone(name):
-    own, steps, meeting = made(name), (5, 10, 20, 25), Barrier(4)
+    own = made(name)
+    steps = (5, 10, 20, 25)
+    meeting = Barrier(4)
 
     def draw(steps: int, wait=lambda: None) -> torch.Tensor:
         """Every call has begun before any makes its first step."""

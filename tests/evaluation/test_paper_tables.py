@@ -8,9 +8,11 @@ import pytest
 from readers import put
 
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation import paper_tables
 from completesplat.evaluation.paper_tables import published_tables
 from completesplat.evaluation.records import find_results
-from completesplat.evaluation.tables import SSIM_NOTE, Table
+from completesplat.evaluation.tables import ABSENT, BEST, SECOND, SSIM_NOTE, Cell, Table
+from completesplat.settings.options import options
 
 HYDRANTS = {"name": "co3d", "data_set": "co3d/hydrant", "resolution": 128, "image_size": 128, "scenes": 77}
 HYDRANTS |= {"subset": "fewview_dev", "scenes_listed": 77}
@@ -279,3 +281,37 @@ def test_a_sweep_without_ablations_counts_as_single_runs(runs, sweep, job) -> No
         test = {"protocol": SWEPT, "model": {"scenes": 9, "views": 9, "full": {"novel": {"psnr": 20.0}}}}
         sweep.add(f"denoiser.channels=[{channels}]", test=test)
     assert [table.name for table in published_tables(find_results(runs))] == [*PAPERS, "own_1"]
+
+
+def test_every_published_table_is_complete() -> None:
+    for table in paper_tables.read_tables():
+        rows = paper_tables.printed_rows(table)
+        assert all(len(row) == len(table.columns) for row in rows)
+        assert all(data_set for *_, data_set in paper_tables.score_columns(table))
+        text = " ".join(cell.text for row in rows for cell in row)
+        assert {name for name, sign in paper_tables.SIGNS.items() if sign in text} == set(table.get("legend", {}))
+
+
+def ranked(cells: list[Cell], higher_is_better: bool) -> list[Cell]:
+    return sorted(cells, key=lambda cell: float(cell.text), reverse=higher_is_better)
+
+
+@pytest.mark.parametrize(("name", "unmarked"), [("ablations", []), ("objects_only", [8])])
+def test_typed_figures_are_in_the_order_of_the_marks_that_the_paper_prints(name, unmarked) -> None:
+    """In these two tables all rows compete; the paper marks none in one column."""
+    (table,) = (table for table in paper_tables.read_tables() if table.name == name)
+    for number, column, _ in paper_tables.score_columns(table):
+        cells = [row[number] for row in paper_tables.printed_rows(table) if row[number].text != ABSENT]
+        best, second, *others = ranked(cells, column.key == "psnr")
+        if number in unmarked:
+            assert not any(cell.mark for cell in cells)
+            continue
+        assert (best.mark, second.mark) == (BEST, SECOND)
+        assert all(float(cell.text) == float(second.text) for cell in others if cell.mark)
+
+
+def test_every_protocol_of_a_table_is_there_and_every_option_of_a_row() -> None:
+    assert {name for table in paper_tables.read_tables() for name in table.evaluations} <= set(options("evaluation"))
+    (table,) = (table for table in paper_tables.read_tables() if table.get("options"))
+    assert set(table.options.values()) == {row[0].text for row in paper_tables.printed_rows(table)}
+    assert set(table.options) <= {*options("ablation"), *options("model")}

@@ -51,7 +51,8 @@ def written(converter, tmp_path_factory):
 
 @pytest.mark.parametrize("kind", PRECISION)
 def test_every_format_reads_back_as_the_same_gaussians_on_the_same_axes(written, kind):
-    own, back = read_ply(written / "a.ply"), read_ply(written / f"{kind}.ply")
+    own = read_ply(written / "a.ply")
+    back = read_ply(written / f"{kind}.ply")
     distances = torch.cdist(own.means.double(), back.means.double())
     nearest = distances.argmin(1)
     assert sorted(nearest.tolist()) == list(range(own.count))  # each Gaussian is there once

@@ -36,7 +36,8 @@ def program(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("formats", [["splat"], SPLATS])
 def test_the_formats_that_are_wanted_are_written_and_no_others(tmp_path, program, monkeypatch, formats):
-    out, scene = tmp_path / "out", some_gaussians(1)[0]
+    out = tmp_path / "out"
+    scene = some_gaussians(1)[0]
     out.mkdir()
     files = {}
     for kind in formats:

@@ -40,7 +40,8 @@ def read(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
     arrays = {}
     for name, index in description["meshes"][0]["primitives"][0]["attributes"].items():
         accessor = description["accessors"][index]
-        view, kind = description["bufferViews"][accessor["bufferView"]], np.dtype(COMPONENTS[accessor["componentType"]])
+        view = description["bufferViews"][accessor["bufferView"]]
+        kind = np.dtype(COMPONENTS[accessor["componentType"]])
         shape = accessor["count"], NUMBERS[accessor["type"]]
         assert (view["byteOffset"] % 4, view["byteLength"]) == (0, shape[0] * shape[1] * kind.itemsize)
         arrays[name] = np.frombuffer(data, kind, shape[0] * shape[1], start + 8 + view["byteOffset"]).reshape(shape)

@@ -15,7 +15,8 @@ from completesplat.export.images import (
 
 
 def test_images_stand_where_they_were_given_each_pixel_a_square():
-    first, second = torch.rand(3, 3, 4, 5), torch.rand(2, 3, 4, 5)
+    first = torch.rand(3, 3, 4, 5)
+    second = torch.rand(2, 3, 4, 5)
     large = np.asarray(image_grid(first, second, factor=3))
     plain = large[::3, ::3]
     assert large.shape == (24, 45, 3)
@@ -49,7 +50,8 @@ def test_headings_and_labels_are_drawn_and_move_nothing():
     named = np.asarray(image_sheet(["", "heading"], [[SheetCell(image, "label"), None]])).astype(int)
     rows, columns = np.nonzero((plain != named).any(-1))
     assert plain.shape == named.shape
-    in_heading, in_label = (rows < 32) & (columns > 144), (rows >= 32) & (rows < 52) & (columns < 144)
+    in_heading = (rows < 32) & (columns > 144)
+    in_label = (rows >= 32) & (rows < 52) & (columns < 144)
     assert in_heading.any()
     assert in_label.any()
     assert (in_heading | in_label).all()

@@ -16,7 +16,8 @@ from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.tiled import TiledRasterizer
 
-UP, PIVOT = torch.tensor([0.0, -1.0, 0.0]), torch.tensor([0.0, 0.0, 2.5])
+UP = torch.tensor([0.0, -1.0, 0.0])
+PIVOT = torch.tensor([0.0, 0.0, 2.5])
 VIEW = PageView(Cameras(torch.eye(4), pinhole(50, 64), (64, 64)), PIVOT, UP, 0.25)
 VOXELS = 48
 TO_GLTF = np.array([1, -1, -1])  # +y up, towards the viewer +z
@@ -34,7 +35,8 @@ def blobs(points: np.ndarray, colors: object, size: float = 0.02) -> Gaussians:
 
 def sphere(center: tuple[float, ...], radius: float, count: int) -> np.ndarray:
     index = np.arange(count) + 0.5
-    height, angle = 1 - 2 * index / count, index * math.pi * (3 - math.sqrt(5))
+    height = 1 - 2 * index / count
+    angle = index * math.pi * (3 - math.sqrt(5))
     ring = np.sqrt(1 - height**2)
     return np.array(center) + radius * np.stack([ring * np.cos(angle), height, ring * np.sin(angle)], axis=-1)
 
@@ -50,7 +52,9 @@ def written(folder, scene: Gaussians) -> tuple[trimesh.Trimesh, np.ndarray]:
 
 
 def test_a_hollow_sphere_becomes_a_closed_solid_and_what_floats_or_lies_behind_is_left_out(tmp_path):
-    center, radius, color = (0.1, -0.05, 2.9), 0.35, (0.5, 0.2, 0.8)
+    center = (0.1, -0.05, 2.9)
+    radius = 0.35
+    color = (0.5, 0.2, 0.8)
     wall = np.stack([*np.meshgrid(np.linspace(-2, 2, 30), np.linspace(-2, 2, 30)), np.full((30, 30), 5.0)], -1)
     scene = blobs(sphere(center, radius, 2500), color)
     others = [blobs(sphere((-0.5, 0.4, 2.6), 0.05, 100), color), blobs(wall.reshape(-1, 3), color, 0.1)]
@@ -70,7 +74,8 @@ def test_a_hollow_sphere_becomes_a_closed_solid_and_what_floats_or_lies_behind_i
 def test_each_side_of_a_cube_has_its_colour_on_the_right_side(tmp_path):
     along = np.linspace(-0.35, 0.35, 24)
     first, second = (axis.ravel() for axis in np.meshgrid(along, along))
-    parts, sides = [], {}
+    parts = []
+    sides = {}
     for axis in range(3):
         for sign in (-1, 1):
             points = np.insert(np.stack([first, second], -1), axis, 0.35 * sign, axis=1)
@@ -92,7 +97,9 @@ def test_each_side_of_a_cube_has_its_colour_on_the_right_side(tmp_path):
 
 def test_what_no_view_sees_is_inside_and_what_lies_before_surfaces_or_emptiness_outside():
     cameras = mesh.cameras_around(torch.zeros(3), 1.0, 0.5)  # at a distance of sqrt(5)
-    center, ahead, depths = torch.zeros(1, 3), 5**0.5, torch.ones(20, 1, 96, 96)
+    center = torch.zeros(1, 3)
+    ahead = 5**0.5
+    depths = torch.ones(20, 1, 96, 96)
     for depth, expected in ((ahead - 0.21, -1.0), (ahead - 0.1, -0.5), (ahead, 0), (ahead + 0.1, 0.5), (9, 1), (0, 1)):
         result = mesh.signed_distances(center, cameras, depths * depth, 0.2)
         torch.testing.assert_close(result, torch.tensor([float(expected)]), rtol=0, atol=1e-4)

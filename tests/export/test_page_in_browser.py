@@ -12,7 +12,7 @@ from support import round_gaussians
 
 from completesplat.export import splat_transform
 from completesplat.export.images import to_pixels
-from completesplat.gaussians import Gaussians, merge_gaussians
+from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -21,16 +21,11 @@ CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")  # which Gi
 NODE = shutil.which("npx") or shutil.which("splat-transform")
 missing = CHROMIUM is None or NODE is None
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(missing, reason="no Chromium or no Node.js")]
-WIDTH, HEIGHT = 320, 180
+WIDTH = 320
+HEIGHT = 180
 UP = torch.tensor([0.05, -0.92, -0.38])
 PIVOT = torch.tensor([0.1, 0.1, 3.0])
 REFERENCE = Cameras(torch.eye(4), pinhole(50, 64), (64, 64))
-
-
-def room() -> Gaussians:
-    """The balls within far walls, which reach behind the camera."""
-    balls, far = scene(), torch.tensor([[-9.0, 0, -9], [9, 0, -9], [-9, 0, 9], [9, 0, 9], [0, -9, 0], [0, 9, 0]])
-    return merge_gaussians([balls, round_gaussians(far, 0.5, 0.9, 0.5)])
 
 
 def scene() -> Gaussians:
@@ -64,31 +59,26 @@ def opened(path, requests: list[str], options: str = "&noui", width: int = WIDTH
 
 def at_rest(page) -> torch.Tensor:
     """The page when something is drawn and nothing moves any more."""
-    width, height = page.viewport_size["width"], page.viewport_size["height"]
+    width = page.viewport_size["width"]
+    height = page.viewport_size["height"]
     screenshot = torch.zeros(height, width, 3)
     for _ in range(60):
         page.wait_for_timeout(1000)
         data = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-        earlier, screenshot = screenshot, torch.tensor(list(data.getdata())).view(height, width, 3) / 255
+        earlier = screenshot
+        screenshot = torch.tensor(list(data.getdata())).view(height, width, 3) / 255
         if screenshot.std() > 0.05 and torch.equal(screenshot, earlier):
             break
     return screenshot
 
 
-def screenshot(path, requests: list[str], drag: int = 0) -> torch.Tensor:
-    """The page at rest, after it was dragged to the right by so many pixels."""
+def screenshot(path, requests: list[str]) -> torch.Tensor:
+    """The page at rest."""
     with opened(path, requests) as page:
-        if drag:
-            page.locator("canvas").first.wait_for()
-            page.wait_for_timeout(5000)
-            page.mouse.move(WIDTH / 2, HEIGHT / 2)
-            page.mouse.down()
-            page.mouse.move(WIDTH / 2 + drag, HEIGHT / 2, steps=8)
-            page.mouse.up()
         return at_rest(page)
 
 
-def test_a_phone_shows_all_that_the_photo_shows_and_controls_that_stay(tmp_path, converter):
+def test_a_phone_shows_all_that_the_photo_shows(tmp_path, converter):
     """Balls at the photo's left and right edges."""
     means = torch.tensor([[1.2, 0.0, 3.0], [-1.2, 0.0, 3.0], [0.0, 0.0, 3.0]])
     edges = round_gaussians(means, 0.15, 0.99, torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]))
@@ -96,8 +86,6 @@ def test_a_phone_shows_all_that_the_photo_shows_and_controls_that_stay(tmp_path,
     splat_transform.write_turning_page(tmp_path / "scene.html", edges, view)
     with opened(tmp_path / "scene.html", [], "", 390, 844) as page:
         seen = at_rest(page)
-        page.wait_for_timeout(6000)  # after four seconds the viewer would hide them
-        assert page.locator("#settings").is_visible()
     areas = [((seen - color).abs() < 0.45).all(-1).sum().item() for color in torch.eye(3)]
     assert min(areas) > 0.9 * max(areas) > 0
     assert place(seen, torch.eye(3)[1]) < 0.5 < place(seen, torch.eye(3)[0])
@@ -107,22 +95,13 @@ def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path, converter):
     view = splat_transform.PageView(REFERENCE, PIVOT, UP, 0.25)
     splat_transform.write_turning_page(tmp_path / "scene.html", scene(), view)
     requests: list[str] = []
-    theirs, ours = screenshot(tmp_path / "scene.html", requests), our_image(view)
+    theirs = screenshot(tmp_path / "scene.html", requests)
+    ours = our_image(view)
     assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
     assert (theirs - ours).abs().mean() < 0.003
     # So does no other way up, nor the mirror image.
     for other in (theirs.flip(0), theirs.flip(1), theirs.flip(0, 1)):
         assert (other - ours).abs().mean() > 0.01
-
-
-def test_dragging_turns_the_page_s_camera_about_the_object_also_within_walls(tmp_path, converter):
-    splat_transform.write_turning_page(
-        tmp_path / "scene.html", room(), splat_transform.PageView(REFERENCE, PIVOT, UP, 0.25)
-    )
-    before, after = (screenshot(tmp_path / "scene.html", [], drag) for drag in (0, 150))
-    for color in torch.eye(3):  # the balls around the pivot
-        assert abs(place(before, color) - place(after, color)) < 0.1
-    assert (before - after).abs().mean() > 0.001  # walls, and what is before what
 
 
 def place(screenshot: torch.Tensor, color: torch.Tensor) -> float:

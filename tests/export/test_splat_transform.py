@@ -5,7 +5,7 @@ from fake_converter import calls, install
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export import splat_transform
-from completesplat.export.splat_transform import PACKAGE, around_the_target, convert, find_splat_transform
+from completesplat.export.splat_transform import PACKAGE, convert, find_splat_transform
 
 pytestmark = pytest.mark.processes
 
@@ -50,15 +50,6 @@ def test_programs_that_do_not_start_are_refused_early(bin_folder, name, script, 
     install(bin_folder, name).write_text(script)
     with pytest.raises(CompleteSplatError, match=message):
         find_splat_transform()
-
-
-def test_the_page_turns_about_its_target_wherever_its_camera_is(caplog):
-    """The page's own viewer: npm's package, lib/viewer; what it does is looked at in `test_page_in_browser.py`."""
-    page = b"<title>SuperSplat Viewer</title> const isObjectExperience = !bbox.containsPoint(resetCamera.position);"
-    assert around_the_target(page) == b"<title>completesplat</title> const isObjectExperience = true;"
-    assert caplog.text == ""
-    assert around_the_target(b"another viewer") == b"another viewer"
-    assert "may turn the page's camera on the spot" in caplog.text
 
 
 def test_a_file_is_converted_in_place_of_an_older_one(bin_folder, tmp_path):

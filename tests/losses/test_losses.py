@@ -36,7 +36,9 @@ def test_ssim_has_the_values_and_gradients_of_other_libraries(pair):
 
 
 def test_ssim_is_computed_in_full_precision_and_a_training_may_follow_a_test(pair):
-    term, truth, images = StructuralDissimilarity(), views(pair[1][..., :23, :23]), pair[0][..., :23, :23].clone()
+    term = StructuralDissimilarity()
+    truth = views(pair[1][..., :23, :23])
+    images = pair[0][..., :23, :23].clone()
     with torch.inference_mode():
         full = term(prediction(images), truth)
     with torch.autocast("cpu", torch.bfloat16):

@@ -48,7 +48,8 @@ def standin_projection(means, covars, quats, scales, viewmats, Ks, width, height
         depths = means[b].double() @ viewmats[b, v, 2, :3].double() + viewmats[b, v, 2, 3].double()
         seen = (depths >= options["near_plane"]) & (depths <= options["far_plane"])
         seen &= options["opacities"][b] >= 1 / 255
-        splats, limits = (means[b, seen].double(), covariances[b, seen]), (options["eps2d"], -math.inf, math.inf)
+        splats = (means[b, seen].double(), covariances[b, seen])
+        limits = (options["eps2d"], -math.inf, math.inf)
         view = viewmats[b, v : v + 1].double(), Ks[b, v : v + 1].double(), width, height
         radii, *projected, _ = _torch_impl._fully_fused_projection(*splats, *view, *limits)
         results[0].append(torch.zeros(count, 2, dtype=torch.int32).index_put((seen,), radii[0]))
@@ -61,7 +62,8 @@ def standin_projection(means, covars, quats, scales, viewmats, Ks, width, height
 def standin_tiles(means2d, radii, depths, tile_size, tile_width, tile_height, **options) -> tuple:
     """`isect_tiles`: the drawn Gaussians of each image once (not once for each tile), from front to back."""
     assert not options["packed"]
-    drawn, count = (radii > 0).all(-1).flatten(0, 1), radii.shape[-2]
+    drawn = (radii > 0).all(-1).flatten(0, 1)
+    count = radii.shape[-2]
     orders = [torch.argsort(row, stable=True) for row in depths.flatten(0, 1)]
     indices = torch.cat([i * count + order[drawn[i][order]] for i, order in enumerate(orders)])
     return drawn.int(), indices, indices.int()
@@ -74,7 +76,8 @@ def standin_offsets(isect_ids, n_images, tile_width, tile_height) -> Tensor:
 def standin_pixels(means2d, conics, colors, opacities, width, height, tile_size, offsets, indices, **options) -> tuple:
     """`rasterize_to_pixels` for every pixel and all Gaussians of an image."""
     assert options["backgrounds"] is None
-    images, count = means2d.shape[:2], means2d.shape[2]
+    images = means2d.shape[:2]
+    count = means2d.shape[2]
     x, y = torch.meshgrid(torch.arange(width) + 0.5, torch.arange(height) + 0.5, indexing="xy")
     pixels = torch.stack([x, y], dim=-1).double()
     results = []
@@ -86,7 +89,8 @@ def standin_pixels(means2d, conics, colors, opacities, width, height, tile_size,
 
 
 def composite(pixels: Tensor, means: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor) -> tuple:
-    left, done = torch.ones_like(pixels[..., :1]), torch.zeros_like(pixels[..., :1], dtype=torch.bool)
+    left = torch.ones_like(pixels[..., :1])
+    done = torch.zeros_like(pixels[..., :1], dtype=torch.bool)
     # An image of nothing is connected with what could have been in it, as gsplat's is.
     nothing = sum(tensor[:0].sum() for tensor in (means, conics, colors, opacities))
     image = nothing + torch.zeros(*pixels.shape[:-1], colors.shape[-1], dtype=pixels.dtype)
@@ -217,7 +221,8 @@ def test_the_near_plane_is_the_references_and_the_far_one_gsplats(front_end: lis
 
 
 def test_refused_calls(front_end: list) -> None:
-    gaussians, cameras = healthy(3), camera()
+    gaussians = healthy(3)
+    cameras = camera()
     with pytest.raises(CompleteSplatError, match="means is float64 on cpu"):
         CudaRasterizer()(gaussians.to(torch.float64), cameras)
     following = replace(cameras, intrinsics=cameras.intrinsics.clone().requires_grad_())
@@ -246,7 +251,8 @@ def test_refused_constants(changes: dict, message: str, monkeypatch: pytest.Monk
 
 def test_all_backends_take_the_constants_of_gsplats_kernels(monkeypatch):
     """A run that was trained with others keeps them: `cuda` refuses (see above), the others draw with them."""
-    max_alpha, other = 0.999, 0.99
+    max_alpha = 0.999
+    other = 0.99
     pretend_a_device(monkeypatch)
     pretend_gsplat(monkeypatch)
     configured = instantiate(compose_config("fit", "rasterizer=cuda").rasterizer.constants)

@@ -97,7 +97,8 @@ def test_the_sign_of_a_scale_and_a_zero_quaternion_have_a_meaning() -> None:
 
 def test_nothing_is_drawn_where_rounding_makes_the_exponent_positive() -> None:
     """An indefinite matrix has directions in which its quadratic form is negative."""
-    pixels, center = torch.tensor([[1.0, 1.0], [1.0, -1.0]]), torch.zeros(1, 2)
+    pixels = torch.tensor([[1.0, 1.0], [1.0, -1.0]])
+    center = torch.zeros(1, 2)
     covariance = torch.tensor([[[1.0, 2.0], [2.0, 1.0]]])
     alphas = alphas_at(pixels, center, covariance, torch.tensor([0.5]), RenderingConstants())
     assert alphas[0, 0] == 0

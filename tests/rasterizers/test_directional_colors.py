@@ -23,7 +23,8 @@ def directional(seed: int, degree: int = 1) -> tuple[DirectionalGaussians, Camer
 @pytest.mark.parametrize("rasterizer", [ReferenceRasterizer(), TiledRasterizer()])
 def test_opposite_sides_of_a_gaussian_have_opposite_slopes(rasterizer: Rasterizer) -> None:
     """Degree 1: the colour along d is the mean plus a linear function of d, which has opposite values from behind."""
-    slope, first = torch.tensor([0.1, -0.2, 0.3]), (3 / (4 * torch.pi)) ** 0.5
+    slope = torch.tensor([0.1, -0.2, 0.3])
+    first = (3 / (4 * torch.pi)) ** 0.5
     harmonics = torch.zeros(1, 1, 3, 3)
     harmonics[0, 0, 1] = slope / first  # times z
     gaussian = DirectionalGaussians(**vars(round_gaussians(torch.zeros(1, 1, 3), 0.3, 0.99, 0.5)), harmonics=harmonics)

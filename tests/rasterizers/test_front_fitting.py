@@ -99,7 +99,8 @@ def test_it_works_where_autograd_is_off(image):
     visible = torch.ones(1, 1, SIDE, SIDE)
     expected = fitted(wall(2, 0.2), image, 2, visible).colors
     with torch.inference_mode():
-        scene, camera = wall(2, 0.2).map(torch.clone), CAMERA.map(torch.clone)
+        scene = wall(2, 0.2).map(torch.clone)
+        camera = CAMERA.map(torch.clone)
         result = fit_front(scene, camera, image.clone(), ReferenceRasterizer(), 2, 0.5, visible.clone())
     assert torch.equal(result.colors, expected)
 

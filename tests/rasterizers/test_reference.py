@@ -38,7 +38,9 @@ def test_an_opaque_point_lands_on_its_pixel_with_its_colour(size, center, column
 def test_alpha_of_one_gaussian_in_closed_form() -> None:
     """A round Gaussian on the optical axis has the 2D variance (f s / z)^2 + blur; its neighbours follow exp."""
     camera = straight_camera(center=(8.5, 6.5))
-    scale, depth, opacity = 0.1, 2.0, 0.8
+    scale = 0.1
+    depth = 2.0
+    opacity = 0.8
     gaussian = Gaussians(f64([0, 0, depth]), f64([1, 2, 3, 4]), f64([scale] * 3), f64(opacity), f64([1, 0.5, 0]))
     rendering = render(gaussian, camera)
     variance = (20 * scale / depth) ** 2 + 0.3
@@ -54,11 +56,14 @@ def test_alpha_of_one_gaussian_in_closed_form() -> None:
 def test_compositing_goes_front_to_back_whatever_the_order_of_input(order: list[int]) -> None:
     """The expected depth is the mean weighted by contribution, and zero where nothing is."""
     camera = straight_camera()
-    depths, opacities, colors = (2.0, 3.0, 5.0), (0.5, 0.25, 0.75), torch.eye(3).tolist()
+    depths = (2.0, 3.0, 5.0)
+    opacities = (0.5, 0.25, 0.75)
+    colors = torch.eye(3).tolist()
     points = [at_pixel(camera, 4, 7, *values) for values in zip(depths, opacities, colors, strict=True)]
     rendering = render(merge_gaussians([points[i] for i in order]), camera)
     images = rendering.color, rendering.alpha, rendering.depth, rendering.expected_depth()
-    weights, alpha = f64(0.5, 0.5 * 0.25, 0.5 * 0.75 * 0.75), 1 - 0.5 * 0.75 * 0.25
+    weights = f64(0.5, 0.5 * 0.25, 0.5 * 0.75 * 0.75)
+    alpha = 1 - 0.5 * 0.75 * 0.25
     mean = weights @ f64(*depths)
     expected = torch.cat([weights, f64(alpha, mean, mean / alpha)])
     torch.testing.assert_close(torch.cat([image[0, 0, :, 7, 4] for image in images]), expected)
@@ -86,7 +91,8 @@ def test_one_gaussian_never_hides_more_than_the_largest_alpha(largest: float) ->
 def test_the_gaussian_that_would_use_up_the_transmittance_takes_no_part(second: float, takes_part: bool) -> None:
     """After 0.999 the transmittance is 1e-3: the next alpha brings it to 1.001e-4 or to 0.999e-4."""
     camera = straight_camera()
-    front, middle = at_pixel(camera, 4, 7, 2, 1.0, (1, 0, 0)), at_pixel(camera, 4, 7, 3, second, (0, 1, 0))
+    front = at_pixel(camera, 4, 7, 2, 1.0, (1, 0, 0))
+    middle = at_pixel(camera, 4, 7, 3, second, (0, 1, 0))
     behind = at_pixel(camera, 4, 7, 4, 0.0005 + 1 / 255, (0, 0, 1))  # would fit by itself, but the pixel has stopped
     color = render(merge_gaussians([behind, middle, front]), camera).color[0, 0, :, 7, 4]
     assert color[0].item() == pytest.approx(0.999, rel=1e-12)

@@ -45,7 +45,8 @@ def opaque_scene() -> dict[str, Tensor]:
 
 def combinations(*values: Tensor) -> Tensor:
     """Return 6 random sums of all pixels, which have all the derivatives of the images and far fewer rows."""
-    gaussians, cameras = Gaussians(*values[:5]), Cameras(values[5], values[6], SIZE)
+    gaussians = Gaussians(*values[:5])
+    cameras = Cameras(values[5], values[6], SIZE)
     rendering = ReferenceRasterizer()(gaussians[None], cameras[None, None])
     pixels = torch.cat([image.flatten() for image in vars(rendering).values()])
     weights = torch.randn(6, len(pixels), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -54,7 +55,8 @@ def combinations(*values: Tensor) -> Tensor:
 
 def alphas_of(scene: dict[str, Tensor]) -> Tensor:
     """Return alphas before clamp and threshold, from front to back."""
-    gaussians, camera = Gaussians(*(scene[name] for name in INPUTS[:5])), Cameras(*map(scene.get, INPUTS[5:]), SIZE)
+    gaussians = Gaussians(*(scene[name] for name in INPUTS[:5]))
+    camera = Cameras(*map(scene.get, INPUTS[5:]), SIZE)
     centers, depths, covariances = project_gaussians(gaussians, camera, CONSTANTS)
     rows, columns = torch.meshgrid(torch.arange(SIZE[0]), torch.arange(SIZE[1]), indexing="ij")
     pixels = torch.stack([columns, rows], dim=-1).flatten(0, 1).double() + 0.5
@@ -64,7 +66,8 @@ def alphas_of(scene: dict[str, Tensor]) -> Tensor:
 
 def test_the_soft_scene_skips_and_the_opaque_one_clamps_and_stops() -> None:
     """No alpha is so close to a limit that finite differences would cross it."""
-    soft, opaque = alphas_of(soft_scene()), alphas_of(opaque_scene())
+    soft = alphas_of(soft_scene())
+    opaque = alphas_of(opaque_scene())
     assert (soft < CONSTANTS.min_alpha).any()
     assert (soft > CONSTANTS.min_alpha).sum() > 20
     assert (soft < CONSTANTS.max_alpha).all()

@@ -21,7 +21,8 @@ def random_scene(batch: int, views: int, count: int, seed: int, size=(10, 14)) -
 def test_projected_covariances_are_the_exact_jacobians_inside_the_frustum() -> None:
     """J Sigma J^T + blur with J from automatic differentiation of the homogeneous projection."""
     gaussians, cameras = random_scene(1, 1, 40, seed=1, size=(60, 80))
-    scene, camera = gaussians[0], cameras[0, 0]
+    scene = gaussians[0]
+    camera = cameras[0, 0]
     centers, depths, covariances = project_gaussians(scene, camera, CONSTANTS)
     inside = ((centers >= 0) & (centers <= f64(80, 60))).all(-1) & (depths > 0.3)
     assert inside.sum() > 10
@@ -63,7 +64,8 @@ def test_scenes_and_views_of_a_batch_do_not_mix() -> None:
 def loop(gaussians: Gaussians, camera: Cameras) -> np.ndarray:
     """Colour, depth and alpha [5 height width], pixel by pixel and Gaussian by Gaussian, sharing no code."""
     height, width = camera.image_size
-    pose, k = camera.world_to_camera.numpy(), camera.intrinsics.numpy()
+    pose = camera.world_to_camera.numpy()
+    k = camera.intrinsics.numpy()
     items = []
     for mean, (w, x, y, z), scale, opacity, color in zip(*(v.numpy() for v in vars(gaussians).values()), strict=True):
         p = pose[:3, :3] @ mean + pose[:3, 3]
@@ -73,7 +75,8 @@ def loop(gaussians: Gaussians, camera: Cameras) -> np.ndarray:
         turn = np.eye(3) + 2 * (w * imaginary + imaginary @ imaginary) / (w * w + x * x + y * y + z * z)
         slopes = []
         for axis, extent in ((0, width), (1, height)):
-            low, high = -k[axis, 2] / k[axis, axis], (extent - k[axis, 2]) / k[axis, axis]
+            low = -k[axis, 2] / k[axis, axis]
+            high = (extent - k[axis, 2]) / k[axis, axis]
             slopes.append(min(max(p[axis] / p[2], low - 0.15 * (high - low)), high + 0.15 * (high - low)))
         flat = np.array([[k[0, 0], 0, -k[0, 0] * slopes[0]], [0, k[1, 1], -k[1, 1] * slopes[1]]]) / p[2]
         half = flat @ pose[:3, :3] @ turn @ np.diag(scale)

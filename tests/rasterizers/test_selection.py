@@ -112,7 +112,8 @@ def test_a_backend_that_raises_or_renders_wrongly_is_not_taken(wrong: str, monke
 @pytest.fixture
 def tests_run(monkeypatch, tmp_path) -> list[str]:
     """Names of the backends that were tested, where no test has been passed before."""
-    ran, test = list[str](), selection.failure.__wrapped__
+    ran = list[str]()
+    test = selection.failure.__wrapped__
     monkeypatch.setattr(selection, "failure", lambda name, constants: ran.append(name) or test(name, constants))
     monkeypatch.setattr(selection, "FASTER", {"tiled": Works})
     monkeypatch.setattr(compilation, "cache_directory", lambda: tmp_path)

@@ -36,12 +36,9 @@ ODD = [
         "data: {'rol': 3}: got an unexpected keyword argument 'rol'",
     ),
     ("fit", "+data.rot=x", "ToyObjectsDataModule has no setting rot (data.rot); did you mean root?"),
-    ("fit", "optimizer.lr=nan", f"optimizer.lr=nan: {NUMBER}"),
+    ("fit", "optimizer.lr=nan", "optimizer: Invalid learning rate: nan"),
     ("fit", "callbacks.images.scenes=0", "callbacks.images.scenes=0: must be at least 1"),
     ("fit", "schedule=exponential schedule.final_ratio=0", "schedule.final_ratio=0: must lie between 1e-09 and 1"),
-    ("plan", "bandwidth_share=0", "bandwidth_share=0: must lie between 0.01 and 1"),
-    ("plan", "checkpoint_rate=0", "checkpoint_rate=0: must be at least 0.001"),
-    ("plan", "gaussian_ns=-100", "gaussian_ns=-100: must be at least 0"),
     ("view", "skip_weight=null", f"skip_weight=null: {NUMBER}"),
     ("fit", f"{FIRST_DEPTH}=1", f"{FIRST_DEPTH}=1: must lie between 0.001 and 0.999"),
     ("fit", "optimizer.lr=-1", "optimizer: Invalid learning rate: -1"),
@@ -72,15 +69,11 @@ ODD = [
     ("data", "data_task=check splits=[x]", "splits=['x']: choose one of train, val, test"),
     ("data", "data_task=check splits=[]", "splits=[]: must not be empty"),
     ("data", "data_task=show split=x", "split=x: choose one of train, val, test"),
-    ("plan", "gpu=h10", "did you mean h100"),
-    ("plan", "devices=0", "devices=0: must be at least 1"),
-    ("plan", "price=-1", "price=-1: must be at least 0"),
-    ("plan", "share=0", "share=0: must lie between"),
-    ("plan", "devices=3", "must be a multiple of 3 processes"),
-    ("plan", "trainer.max_steps=-1", "give trainer.max_steps=N or trainer.max_epochs=N"),
-    ("plan", "model=per_scene", "PerScene has nothing to train"),
-    ("plan", "model=reconstructor_only", "this model cannot be planned"),
-    ("plan", "model=capture", "CaptureFit fits Gaussians, not a network: nothing to plan"),
+    ("plan", "timed_steps=0", "timed_steps=0: must be at least 1"),
+    ("plan", "trainer.devices=3", "must be a multiple of 3 processes"),
+    ("plan", "model=per_scene", "PerScene fits scenes"),
+    ("plan", "model=reconstructor_only", "ReconstructorOnly fits scenes"),
+    ("plan", "model=capture", "CaptureFit fits scenes"),
     ("report", "samples=1", "samples=1: must be at least 2"),
     ("report", "guidance_weights=0.5", "guidance_weights=0.5: must be a list, such as guidance_weights=[0.5]"),
     ("report", "seed=0", "nowhere: no such checkpoint"),
@@ -106,7 +99,7 @@ def test_a_wrong_value_is_refused_with_the_allowed_values(verb, setting, message
     assert message in refused(verb, *given[verb].split(), *setting.split())
 
 
-@pytest.mark.parametrize("chosen", [*VERBS, "data_task=check", "bench_task=paper", "report_task=summary"])
+@pytest.mark.parametrize("chosen", [*VERBS, "data_task=check", "bench_task=rasterizers", "report_task=summary"])
 def test_the_defaults_of_each_verb_pass_the_checks(chosen):
     verb = chosen.partition("_")[0]
     config = compose_config(verb, *([chosen] if "=" in chosen else []))
@@ -139,32 +132,32 @@ def test_a_wrong_value_is_reported_under_the_setting_that_the_user_gave():
 @pytest.mark.parametrize(
     ("typed", "message"),
     [
-        ("fit optimzer.lr=1", r"no setting 'optimzer.lr' of completesplat fit; did you mean optimizer.lr\?"),
-        ("fit experiment=toy_minis_var data.scene=3", r"no setting 'data.scene' .* did you mean data.scenes"),
-        ("fit xyzzy=1", r"no setting 'xyzzy' of completesplat fit; completesplat fit --help shows those that .*them$"),
-        ("fit max_steps=3", r"no setting 'max_steps' of completesplat fit; did you mean trainer.max_steps\?$"),
-        ("fit optimizer.learning_rate=3", r"no setting .*; did you mean optimizer.lr\?$"),
-        ("fit model=per_scene model.steps=3", r"no setting .*; did you mean model.fitting.steps\?$"),
-        ("fit data.foo=3", r"no setting 'data.foo' of completesplat fit; completesplat fit --help shows .* them$"),
-        ("fit trainer.max_epochs=3", r"no setting .*; \+trainer.max_epochs=VALUE adds it$"),
-        ("fit loss.terms.mine=null", r"no setting .*; \+loss.terms.mine=VALUE adds it$"),
+        ("fit optimzer.lr=1", r"Could not override 'optimzer.lr'. .* use \+optimzer.lr=1; did you mean optimizer.lr"),
+        ("fit experiment=toy_minis_var data.scene=3", r"Could not override 'data.scene'.* did you mean data.scenes"),
+        ("fit xyzzy=1", r"Could not override 'xyzzy'. To append to your config use \+xyzzy=1$"),
+        ("fit max_steps=3", r"Could not override 'max_steps'.* did you mean trainer.max_steps\?$"),
+        (
+            "fit trainer.max_epochs=3",
+            r"Could not override .* use \+trainer.max_epochs=3; did you mean trainer.max_steps",
+        ),
         ("fit experiment=toy_vr", r"no experiment 'toy_vr': there are anything_diffusion, .*; did you mean toy_var"),
         ("fit ablation=no_skip", r"no ablation 'no_skip': there are full, .*; did you mean no_skips"),
         ("fit -m loss=stge1,stage2", r"no loss 'stge1': .* perceptual, splats, stage1, stage2; did you mean stage1"),
-        ("fit data=null", r"data=null: choose one of capture, captures, co3d_category, "),
-        ("fit ablaton=no_ssim", r"no setting 'ablaton' .*; did you mean ablation or evaluation\?$"),
+        ("fit data=null", "Config group override must be a string or a list"),
+        ("fit ablaton=no_ssim", r"Could not override 'ablaton'.*; did you mean ablation"),
         ("data stats data=co3d_hydrants", r"data.root is needed: give data.root=VALUE$"),
         ("data latents", r"ckpt is needed: give ckpt=VALUE$"),
         ("bench rasterizers sizes=[]", r"sizes=\[\]: must not be empty$"),
-        ("fit toy_var", r"toy_var: no setting, which are given as key=value; did you mean experiment=toy_var\?"),
-        ("data chck", r"no task of completesplat data 'chck': there are check, .*; did you mean check\?"),
-        ("predict sampels=1", r"no setting 'sampels' of completesplat predict; did you mean samples\?"),
+        ("fit toy_var", "Error parsing override 'toy_var' missing EQUAL"),
+        ("fit seed=0,1", r"Ambiguous value for argument 'seed=0,1' .*--multirun"),
+        ("data chck", r"no data_task 'chck': there are check, .*; did you mean check\?"),
+        ("predict sampels=1", r"Could not override 'sampels'.*; did you mean samples"),
         ("predcit a.png", r"no verb 'predcit': there are data, .*; did you mean predict\?"),
         (f"predict image={__file__} weights=toy_object", r"toy_object: no such folder.*toy_objects"),
         ("report controls", "give one of ckpt=FILE, weights=DIR"),
         ("test ckpt=nowhere/checkpoints/last.ckpt", ".*no such checkpoint"),
         ("data toy kind=nonsense", "no toy data of kind 'nonsense'"),
-        ("fit -m seed=0,1 --cfg job", "--cfg and --info show the settings of one run: leave out -m$"),
+        ("fit -m seed=0,1 --cfg job", "--cfg shows the settings of one run: leave out -m$"),
         ("fit rasterizer._target_=nowhere.Mine", "Error loading 'nowhere.Mine': ModuleNotFoundError"),
     ],
 )
@@ -174,7 +167,7 @@ def test_a_refusal_is_one_line_that_suggests_the_nearest_name(command, typed, me
     assert len(refused) < 700
 
 
-@pytest.mark.parametrize("empty", ["out=", "out=''", "out=null", "out=[x]"])
+@pytest.mark.parametrize("empty", ["out=", "out=''", "out=null"])
 def test_an_empty_name_of_the_output_folder_is_refused_and_nothing_is_written(command, tmp_path, empty):
     assert command.refuses("fit", empty) == f"{empty}: names no folder; give out=DIR"
     assert not list(tmp_path.iterdir())

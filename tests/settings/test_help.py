@@ -1,4 +1,4 @@
-"""`VERB --help`: each setting with its comment, its kind and choices, in lines that fit."""
+"""`VERB --help`: the settings of each verb and task with their comments in `conf/`."""
 
 import re
 
@@ -6,106 +6,44 @@ import pytest
 
 from completesplat.cli import VERBS
 from completesplat.errors import CompleteSplatError
-from completesplat.settings import options as conf
-from completesplat.settings.help import WIDTH, help_page
+from completesplat.settings.composition import compose
+from completesplat.settings.help import defaults, help_page, setting_blocks
+from completesplat.settings.options import TASKS, options
 
-SOME_TASKS = (None, "check", "summary", "controls")
-WITH_TASKS = [
-    (verb, task) for verb in VERBS for task in (conf.options(f"{verb}_task") if verb in conf.TASKS else [None])
-]
-
-
-@pytest.mark.parametrize(("verb", "task"), WITH_TASKS)
-def test_each_own_setting_is_explained_in_conf(verb, task):
-    places = {choice.place.partition(".")[0] for choice in conf.choices_of_verb(verb, task)} | {"stage1", "stage2"}
-    settings = [setting for setting in conf.settings_of_verb(verb, task) if setting.key.partition(".")[0] not in places]
-    assert settings[0].key == ("kind" if verb == "new" else "out")  # `new` writes into the working folder
-    unexplained = [setting.key for setting in settings if not setting.comment and "." not in setting.key]
-    assert unexplained == []
+PAGES = [(verb, None) for verb in VERBS]
+PAGES += [(verb, task) for verb in TASKS for task in options(f"{verb}_task")]
 
 
-@pytest.mark.parametrize(("verb", "task"), [one for one in WITH_TASKS if one[1] in SOME_TASKS])
-def test_a_page_has_examples_settings_and_parts_and_fits(verb, task):
-    text = help_page(verb, [task] if task else [])
-    assert text.startswith(f"completesplat {verb}: ")
-    assert max(map(len, text.splitlines())) <= WIDTH
+@pytest.mark.parametrize(("verb", "task"), PAGES)
+def test_a_page_has_its_settings_each_with_a_comment_and_its_parts(verb, task):
+    text = help_page(verb, [] if task is None else [task])
+    assert text.startswith(f"completesplat {verb}")
+    name = verb if task is None else f"{verb}_task/{task}"
+    bases, choices = defaults(name)
+    for place in choices:
+        assert re.search(rf"^  {re.escape(place)}=", text, re.MULTILINE), place
+    for block in [block for file in (*bases, name) for block in setting_blocks(file)]:
+        assert block in text
+    config = compose(verb, *([] if task is None else [f"{verb}_task={task}"]))
+    parts = {place.partition(".")[0] for place in choices}
+    names = config.keys() - parts - {"verb", "description", "task", "hydra", "experiment", "ablation"}
+    if task is not None or verb not in TASKS:
+        for setting in names - {"out"}:
+            assert re.search(rf"^  {setting}:", text, re.MULTILINE), setting
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_verb_has_examples_and_its_tasks(verb):
+    text = help_page(verb)
     assert "Examples:\n  completesplat " in text
-    for setting in conf.settings_of_verb(verb, task):
-        assert re.search(rf"^  {re.escape(setting.key)}(=| |$)", text, re.MULTILINE), setting.key
-    for choice in conf.choices_of_verb(verb, task):
-        assert re.search(rf"^  {re.escape(choice.place)}(=| |$)", text, re.MULTILINE), choice
-    assert "_target_" not in text
+    assert all(f"\n  {task} " in text for task in (options(f"{verb}_task") if verb in TASKS else []))
 
 
-def test_kinds_ranges_and_choices_are_shown():
-    text = " ".join(help_page("predict", []).split())
-    assert "samples=4 Number of samples of each photo. [whole number, 1 to 1000]" in text
-    assert "[number, 0 to 1 or null]" in text
-    assert "image needed; A photo" in text
-    assert "rasterizer=auto what draws Gaussians [auto, cuda, reference, tiled]" in text
-    assert "_global_" not in help_page("bench", ["rasterizers"])  # its constants have no name to choose them by
+def test_a_setting_keeps_its_comment():
+    assert "  # Number of samples of each photo.\n  samples: 4\n" in help_page("predict")
+    assert "_target_" not in help_page("data", ["toy"])
 
 
-def test_a_part_shows_its_settings_with_the_docstring_of_its_class():
-    text = " ".join(help_page("fit", ["data=co3d_hydrants"]).split())
-    assert "data.evaluation_batch_size=4 scenes of an evaluation batch; 1 is used if" in text
-    assert "data.on_bad=skip What cannot be read: skip" in text
-    assert "[skip, raise]" in text
-    assert "data.category=hydrant" in text
-    assert "Made by completesplat.data.co3d.module.CO3DDataModule." in text
-    assert "optimizer.lr=5.0e-5" in help_page("fit", ["optimizer"])
-    assert "trainer.max_steps=" in help_page("fit", ["trainer"])
-    pages = [help_page("fit", [group]) for group in ("data", "model", "evaluation", "ablation")]
-    assert max(len(line) for text in pages for line in text.splitlines()) <= WIDTH
-
-
-def test_unknown_parts_are_answered_with_the_nearest():
-    for word, message in (
-        ("data=toy_object", "no data 'toy_object': there are .*; did you mean toy_objects"),
-        ("modle", "nothing to say on 'modle'; did you mean mode or model"),
-        ("batchsize", "nothing to say on 'batchsize'; did you mean batch_size"),
-        ("model.loss", "nothing to say on"),  # a reference
-        ("_target_", "nothing to say on"),
-    ):
-        with pytest.raises(CompleteSplatError, match=message):
-            help_page("fit", [word])
-
-
-def found(*words: str) -> list[str]:
-    """The keys that `fit --help WORDS` shows."""
-    return re.findall(r"^  (\w[\w.]*)(?==| |$)", help_page("fit", [*words]), re.MULTILINE)
-
-
-def test_a_word_is_searched_for_in_the_names_and_comments_of_all_options():
-    assert found("lr") == ["optimizer.lr", "optimizer.adam_lr"]  # not in "already", and not once for each experiment
-    assert "optimizer.adam_lr=3.0e-3" in help_page("fit", ["lr"])
-    assert "learning rate of biases and norms [number, at least 0] (optimizer=muon)" in help_page("fit", ["lr"])
-    assert found("trainer.max_steps")[0] == found("max", "steps")[0] == "trainer.max_steps"
-    assert found("batch_size")[0] == "data.batch_size"  # names come before comments
-    assert {"optimizer.lr", "optimizer.adam_lr"} < set(found("learning_rate"))
-
-
-def test_every_group_is_explained_and_every_option_is_read():
-    assert set(conf.groups()) <= conf.about_groups().keys()
-    for group in conf.groups():
-        for option in conf.options(group):
-            assert conf.settings_of_option(group, option) is not None
-
-
-def test_a_files_lines_are_read_as_they_explain_themselves():
-    written = conf.parse(
-        "# @package _global_\n# About it.\n\n# Of the first.\na: 1\nb: [1, 2] # of the second\n"
-        "e: # With entries.\n  - 1\n# Of all.\npart:\n"
-        "  # Of the inner\n  # one.\n  c: x\n  d: null\n"
-        "defaults:\n  - _base\n  - override /data@here: toy # why\n  - _self_\n"
-    )
-    assert (written.about, written.package) == ("About it.", "_global_")
-    assert [tuple(setting) for setting in written.settings] == [
-        ("a", "1", "Of the first."),
-        ("b", "[1, 2]", "of the second"),
-        ("e", "", "With entries."),
-        ("part.c", "x", "Of the inner one."),
-        ("part.d", "null", ""),
-    ]
-    assert [tuple(one) for one in written.choices] == [("data", "here", "toy", "why")]
-    assert written.bases == ["_base"]
+def test_an_unknown_task_is_answered_with_the_nearest():
+    with pytest.raises(CompleteSplatError, match=r"no task of completesplat data 'chck': .*; did you mean check"):
+        help_page("data", ["chck", "--help"])

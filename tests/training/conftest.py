@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-REGISTRY, CUDA, META = "_ZN3c104impl26device_guard_impl_registryE", 1, 14
+REGISTRY = "_ZN3c104impl26device_guard_impl_registryE"
+CUDA = 1
+META = 14
 
 
 @pytest.fixture

@@ -17,7 +17,8 @@ from completesplat.training.checkpoints import CheckpointFiles, Checkpoints
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stage import Stage
 
-NAN, INFINITE = float("nan"), float("inf")
+NAN = float("nan")
+INFINITE = float("inf")
 FAULTS = {
     "a loss that is NaN": lambda loss, weight: loss * NAN,
     "an infinite loss, whose gradients are finite": lambda loss, weight: loss + INFINITE,
@@ -39,7 +40,11 @@ class Faulty(BoringModel):
 
     def __init__(self, fault=None, batches=(), fused=False) -> None:
         super().__init__()
-        self.fault, self.batches, self.fused, self.seen, self.averages = fault, batches, fused, [], []
+        self.fault = fault
+        self.batches = batches
+        self.fused = fused
+        self.seen = []
+        self.averages = []
 
     configure_gradient_clipping = Stage.configure_gradient_clipping  # Lightning's takes no fused optimizer
     gradient_norm = None
@@ -116,7 +121,8 @@ class Arrival:
 
 
 def test_on_a_gpu_a_step_is_looked_at_in_the_next_until_one_was_bad(monkeypatch):
-    looks, reduce = [], SingleDeviceStrategy.reduce
+    looks = []
+    reduce = SingleDeviceStrategy.reduce
     monkeypatch.setattr(SingleDeviceStrategy, "reduce", lambda *args, **kw: reduce(*args, **kw).as_subclass(OnGpu))
     monkeypatch.setattr("torch.cuda.current_stream", Arrival)
     monkeypatch.setattr(
@@ -132,7 +138,8 @@ def test_on_a_gpu_a_step_is_looked_at_in_the_next_until_one_was_bad(monkeypatch)
 
 
 def test_a_run_without_bad_steps_is_as_it_would_be_without_the_callback(monkeypatch):
-    watched, free = Faulty(), Faulty()
+    watched = Faulty()
+    free = Faulty()
     train(watched, ExponentialMovingAverage(0.9))
     monkeypatch.setattr(BadSteps, "on_before_optimizer_step", lambda *_: None)
     train(free, ExponentialMovingAverage(0.9))
@@ -144,7 +151,8 @@ def test_one_bad_batch_of_several_leaves_out_their_step(fault, batch):
     module = Faulty(FAULTS[fault], batches=(batch,))
     bad = train(module, ExponentialMovingAverage(0.9), steps=4, accumulated=3)
     assert bad.total == 1
-    before, after = module.seen[2], module.seen[7]
+    before = module.seen[2]
+    after = module.seen[7]
     assert equal(before, after)
     assert not equal(after, module.seen[8])
 
@@ -171,7 +179,9 @@ def test_the_count_goes_on_in_a_continued_run(tmp_path):
     def module() -> Faulty:
         return Faulty(FAULTS["a loss that is NaN"], batches=(3, 4))
 
-    whole, first, second = module(), module(), module()
+    whole = module()
+    first = module()
+    second = module()
     assert train(whole, ExponentialMovingAverage(0.9), steps=4, accumulated=2).total == 2
     train(first, ExponentialMovingAverage(0.9), Checkpoints(str(tmp_path)), steps=3, accumulated=2)
     path = tmp_path / "last.ckpt"
@@ -220,7 +230,8 @@ for name, fault in FAULTS.items():
 
 @pytest.mark.slow
 def test_two_processes_leave_out_the_same_steps(tmp_path, request):
-    program, folders = tmp_path / "program.py", request.path.parents[:2]
+    program = tmp_path / "program.py"
+    folders = request.path.parents[:2]
     program.write_text(TWO_PROCESSES)
     command = [sys.executable, str(program), *map(str, folders)]
     finished = subprocess.run(command, timeout=LIMIT, capture_output=True, text=True)

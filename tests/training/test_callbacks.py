@@ -105,7 +105,8 @@ class Drawer(BoringModel):
 
     def __init__(self, others: int = 0) -> None:
         super().__init__()
-        self.others, self.drawn = others, []
+        self.others = others
+        self.drawn = []
 
     def on_train_batch_end(self, *_) -> None:
         torch.rand(self.others)
@@ -124,7 +125,9 @@ def drawn(seed: int, others: int = 0) -> list[float]:
 
 
 def test_every_batch_draws_its_own_numbers_whatever_else_is_drawn():
-    first, again, other_seed = drawn(0), drawn(0, others=5), drawn(1)
+    first = drawn(0)
+    again = drawn(0, others=5)
+    other_seed = drawn(1)
     assert first == again
     assert len({*first, *other_seed}) == 2 * 12
     seeds = {callbacks.step_seed(*place) for place in itertools.product(range(3), repeat=4)}
@@ -136,7 +139,8 @@ class Watched(Callback):
     """Notes what the bar shows after each batch."""
 
     def __init__(self, bar: Progress) -> None:
-        self.bar, self.shown = bar, []
+        self.bar = bar
+        self.shown = []
 
     def on_train_batch_end(self, trainer, pl_module, *_) -> None:
         task = self.bar.train_progress_bar

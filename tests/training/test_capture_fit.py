@@ -10,12 +10,13 @@ from completesplat.data.captures.captured_frames import CapturedFrame
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_transforms
 from completesplat.errors import CompleteSplatError
-from completesplat.export import prediction
+from completesplat.export import fitted_scene
 from completesplat.export.ply import read_ply
 from completesplat.export.reading import read_gaussians
 from completesplat.training.capture_fit import CaptureFit
 
-FRAMES, STEPS = 9, 8
+FRAMES = 9
+STEPS = 8
 FITTING = {"initial": 200, "most": 260, "refine_every": 2}
 QUICK = ["experiment=capture", "data.root=capture", "data.image_size=12", f"trainer.max_steps={STEPS}"]
 QUICK += ["trainer.accelerator=cpu", "trainer.val_check_interval=100", "rasterizer=reference"]
@@ -36,9 +37,11 @@ def no_converter() -> None:
 
 def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, capture, tmp_path, monkeypatch):
     monkeypatch.setattr("completesplat.export.formats.find_splat_transform", no_converter)
-    read, original = [], CapturedFrame.read
-    columns, sheet = [], prediction.image_sheet
-    monkeypatch.setattr(prediction, "image_sheet", lambda names, *rest: columns.append(names) or sheet(names, *rest))
+    read = []
+    original = CapturedFrame.read
+    columns = []
+    sheet = fitted_scene.image_sheet
+    monkeypatch.setattr(fitted_scene, "image_sheet", lambda names, *rest: columns.append(names) or sheet(names, *rest))
     monkeypatch.setattr(CapturedFrame, "read", lambda self: read.append(self.number) or original(self))
 
     with interrupted_at(6, CaptureFit):
@@ -78,7 +81,8 @@ def test_held_out_frames_are_scored_and_not_fitted_and_a_run_continues(command, 
     torch.testing.assert_close(read_ply(tmp_path / "run/scene.ply").means, means)
     splat = read_gaussians(tmp_path / "run/scene.splat").means  # sorted by importance
     torch.testing.assert_close(splat.sort(0).values, means.sort(0).values)
-    scene, frames = strict_json(tmp_path / "run/scene.json"), read_transforms(capture / "transforms.json").frames
+    scene = strict_json(tmp_path / "run/scene.json")
+    frames = read_transforms(capture / "transforms.json").frames
     poses = torch.stack([torch.from_numpy(frame.world_to_camera).float() for frame in frames[::4]])
     camera = torch.tensor(scene["reference_camera"]["world_to_camera"])
     torch.testing.assert_close(camera, poses[0], atol=1e-5, rtol=1e-5)
@@ -109,7 +113,8 @@ def test_settings_without_effect_and_several_captures_are_refused(command, captu
 
 
 def test_settings_of_a_sweep_may_be_without_effect_in_one_of_its_jobs(tmp_path):
-    job, config = tmp_path / "sweep/x/0", compose_config("fit", "experiment=capture")
+    job = tmp_path / "sweep/x/0"
+    config = compose_config("fit", "experiment=capture")
     job.mkdir(parents=True)
     (job / "run.json").write_text('{"overrides": ["optimizer.lr=1"]}')
     with pytest.raises(CompleteSplatError, match=r"optimizer\.lr=1: CaptureFit does nothing with it"):

@@ -14,7 +14,8 @@ from completesplat.training.checkpoints import CheckpointFiles
 
 def test_a_file_is_written_whole_or_not_at_all_and_not_into_memory_first(tmp_path, monkeypatch):
     trainer = instantiate(compose_config("fit").trainer, accelerator="cpu", logger=False, _convert_="all")
-    path, files = tmp_path / "last.ckpt", trainer.strategy.checkpoint_io
+    path = tmp_path / "last.ckpt"
+    files = trainer.strategy.checkpoint_io
     (tmp_path / ".last.ckpt.unfinished").write_bytes(b"left by a run that was killed")
     files.save_checkpoint({"weights": torch.ones(3)}, path)
 
@@ -45,7 +46,8 @@ def step_of(path) -> int:
 @pytest.fixture
 def written(monkeypatch) -> list[int]:
     """Sizes of the files that are written, in order."""
-    sizes, save = [], torch.save
+    sizes = []
+    save = torch.save
 
     def recorded(contents, file):
         save(contents, file)

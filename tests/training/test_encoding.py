@@ -31,7 +31,8 @@ def root(tmp_path_factory) -> Path:
 
 
 def encode(root: Path, out: Path, model: nn.Module | None = None, **options) -> LatentCache:
-    data, networks = rooms(root, workers=options.pop("workers", 0)), ("conditioning", "precision", "device")
+    data = rooms(root, workers=options.pop("workers", 0))
+    networks = ("conditioning", "precision", "device")
     encoder = FrameEncoder(model or small_autoreconstructor(), **{k: options.pop(k) for k in networks if k in options})
     return encode_training_set(encoder, data, out, **{"progress": False, **options})
 
@@ -55,7 +56,8 @@ class Means(nn.Module):
 
 def test_every_frame_has_the_encoders_posterior(root, tmp_path):
     store = encode(root, tmp_path / "cache", batch_size=7, workers=2)
-    encoder, source = small_autoreconstructor().encoder, rooms(root).source("train")
+    encoder = small_autoreconstructor().encoder
+    source = rooms(root).source("train")
     assert list(store.sequences) == source.names
     for name, frame in itertools.product(source.names, range(FRAMES)):
         image = source.read(name).read(frame).image
@@ -70,7 +72,8 @@ def test_every_frame_has_the_encoders_posterior(root, tmp_path):
 def test_half_precision_needs_half_the_space_and_rounds_as_it_says(root, cache, tmp_path):
     half = encode(root, tmp_path / "half", precision="float16")
     for sequence, name in itertools.product(cache.sequences, ("mean", "log_variance")):
-        exact, rounded = cache.arrays(sequence)[name], half.arrays(sequence)[name]
+        exact = cache.arrays(sequence)[name]
+        rounded = half.arrays(sequence)[name]
         assert 2 * rounded.nbytes == exact.nbytes
         assert (np.abs(rounded.astype(np.float64) - exact) <= 2.0**-11 * np.abs(exact) + 1e-7).all()
     assert half.std == pytest.approx(cache.std, rel=1e-3)
@@ -94,7 +97,8 @@ def test_moments_are_those_of_a_mixture_of_two_equal_gaussians_in_each_channel(m
 @pytest.mark.parametrize(("value", "precision"), [(float("nan"), "float32"), (1e30, "float16")])
 def test_encodings_that_are_not_finite_are_refused_with_their_place(root, tmp_path, value, precision):
     sequence = rooms(root).source("train").read("c2")
-    expected_image, model = sequence.read(3).image / 255, small_autoreconstructor()
+    expected_image = sequence.read(3).image / 255
+    model = small_autoreconstructor()
 
     def change(_: nn.Module, inputs: tuple, output: tuple) -> tuple:
         posterior, features = output
@@ -110,7 +114,9 @@ def test_encodings_that_are_not_finite_are_refused_with_their_place(root, tmp_pa
 
 
 def test_the_store_of_a_killed_run_does_not_open_and_is_overwritten(root, cache, tmp_path):
-    model, left, calls = small_autoreconstructor(), tmp_path / "left", []
+    model = small_autoreconstructor()
+    left = tmp_path / "left"
+    calls = []
 
     def copy(*_: object) -> None:
         # What lies on the disk when the last batch is encoded: all rows but its own.
@@ -167,7 +173,8 @@ def test_the_fingerprint_depends_on_names_types_shapes_and_values():
 
 
 def test_latents_that_see_views_depend_on_the_weights_that_see_them():
-    model, found = small_autoreconstructor(), set()
+    model = small_autoreconstructor()
+    found = set()
     for view_encoder in (None, nn.Linear(2, 2), nn.Linear(2, 2)):
         model.view_encoder = view_encoder
         found.add(fingerprints(model, None)[0])
@@ -175,7 +182,8 @@ def test_latents_that_see_views_depend_on_the_weights_that_see_them():
 
 
 def test_the_cache_of_this_model_is_accepted_and_stale_ones_are_refused(root, cache, tmp_path):
-    own, other = small_autoreconstructor(), small_autoreconstructor(1)
+    own = small_autoreconstructor()
+    other = small_autoreconstructor(1)
     features = encode(root, tmp_path / "features", conditioning=Means())
     nn.init.ones_(own.reconstructor.network.conv_out.weight)  # only the encoder makes latents
     check_cache(cache, own, Means(frozen=False))

@@ -106,7 +106,8 @@ def test_a_finished_run_whose_end_moves_is_the_run_that_had_this_end_from_the_st
 
 def must_be_equal(whole, result) -> None:
     """Weights, the rows of `metrics.csv` and the figures in `metrics.json`."""
-    expected, continued = weights(whole), weights(result)
+    expected = weights(whole)
+    continued = weights(result)
     assert expected.keys() == continued.keys()
     same = {name: value == continued[name] for name, value in expected.items()}
     assert [name for name, equal in same.items() if not (equal.all() if isinstance(equal, Tensor) else equal)] == []

@@ -31,7 +31,8 @@ def epoch_of(root: str, batch_size: int) -> list[list[tuple[str, int]]]:
 
 
 def test_two_processes_share_the_batch(toy_root, monkeypatch):
-    alone, shares = epoch_of(str(toy_root), 4), []
+    alone = epoch_of(str(toy_root), 4)
+    shares = []
     for rank in (0, 1):
         for name, value in (("is_initialized", True), ("get_rank", rank), ("get_world_size", 2)):
             monkeypatch.setattr(distributed, name, lambda value=value: value)
@@ -57,7 +58,8 @@ def test_a_batch_that_is_larger_than_an_epoch_is_refused_before_training(toy_roo
 
 
 def test_accumulated_batches_share_the_batch_and_the_share_is_recorded(command, toy_root, tmp_path, monkeypatch):
-    counts, step = [], ReconstructionModule.training_step
+    counts = []
+    step = ReconstructionModule.training_step
 
     def counted(self, scenes, index):
         counts.append(len(scenes.names))
@@ -123,8 +125,10 @@ class MeanOfScenes(Stage):
 def test_accumulated_batches_step_as_their_scenes_in_one_batch_also_at_an_epochs_end(scenes, limit, tmp_path):
     """In closed form: a step of plain SGD moves the weight by minus the mean of the step's scenes."""
     batch = scene_batch(scenes, size=8)
-    numbers, batches = batch.reference.images.mean((1, 2, 3)).tolist(), [batch[i : i + 2] for i in range(0, scenes, 2)]
-    module, settings = MeanOfScenes(), {"limit_train_batches": limit, "default_root_dir": tmp_path}
+    numbers = batch.reference.images.mean((1, 2, 3)).tolist()
+    batches = [batch[i : i + 2] for i in range(0, scenes, 2)]
+    module = MeanOfScenes()
+    settings = {"limit_train_batches": limit, "default_root_dir": tmp_path}
     trainer = quiet_trainer(max_epochs=2, accumulate_grad_batches=4, **settings)
     trainer.fit(module, torch.utils.data.DataLoader(batches, batch_size=None, collate_fn=lambda batch: batch))
     seen = numbers if limit == 1.0 else numbers[: 2 * limit]

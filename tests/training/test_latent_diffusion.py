@@ -14,7 +14,8 @@ from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import CachedScene, SceneBatch
 from completesplat.training.latent_diffusion import LatentDiffusion, losses_by_timestep
 
-BATCH, SIZE = 2, 32
+BATCH = 2
+SIZE = 32
 
 
 def scenes(share: float = 1.0) -> SceneBatch:
@@ -43,7 +44,8 @@ def gradients(module: LatentDiffusion) -> dict[str, torch.Tensor]:
 
 
 def test_the_conditioning_sees_the_visible_part_and_the_encoder_everything(monkeypatch) -> None:
-    batch, seen = scenes(0.5), {}
+    batch = scenes(0.5)
+    seen = {}
     module, _ = module_of(monkeypatch)
     parts = module.completesplat
     for name, part in (("conditioning", parts.conditioning), ("encoder", parts.autoreconstructor.encoder)):
@@ -59,14 +61,17 @@ class Recorder(nn.Module):
     latent_channels = 4
 
     def forward(self, noisy_latent, timestep, conditioning):
-        self.noisy_latent, self.timestep, self.conditioning = noisy_latent, timestep, conditioning
+        self.noisy_latent = noisy_latent
+        self.timestep = timestep
+        self.conditioning = conditioning
         return torch.zeros_like(noisy_latent)
 
 
 class AsItIs(nn.Module):
     """A frozen conditioning: what was encoded beforehand is used as it is."""
 
-    frozen, pretrained = True, None
+    frozen = True
+    pretrained = None
 
 
 def encoded(count: int) -> CachedScene:
@@ -83,7 +88,8 @@ def recording(monkeypatch, **settings) -> tuple[LatentDiffusion, dict[str, float
 
 
 def test_the_conditioning_alone_is_zeroed_at_the_stated_rate(monkeypatch):
-    batch, steps = encoded(4000), []
+    batch = encoded(4000)
+    steps = []
     for rate in (0.0, 0.2):
         module, _ = recording(monkeypatch, unconditional_probability=rate)
         torch.manual_seed(0)
@@ -99,9 +105,11 @@ def test_the_conditioning_alone_is_zeroed_at_the_stated_rate(monkeypatch):
 
 
 def test_a_scene_gets_several_noises_and_timesteps_and_is_encoded_once(monkeypatch):
-    batch, encodings = scenes(), []
+    batch = scenes()
+    encodings = []
     module, _ = module_of(monkeypatch, noise_draws=3)
-    parts, shown = module.completesplat, Recorder()
+    parts = module.completesplat
+    shown = Recorder()
     parts.denoiser = shown
     for part in (parts.conditioning, parts.autoreconstructor.encoder):
         part.register_forward_pre_hook(lambda _, inputs: encodings.append(len(inputs[0])))
@@ -143,7 +151,8 @@ def test_the_buckets_losses_average_to_the_total(monkeypatch):
 
 
 def test_losses_by_timestep_are_logged_once_a_step_and_never_without_an_interval():
-    rows, trainer = [], SimpleNamespace(log_every_n_steps=2)
+    rows = []
+    trainer = SimpleNamespace(log_every_n_steps=2)
     loggers = [SimpleNamespace(log_metrics=lambda values, step: rows.append(step))]
     parts = SimpleNamespace(sampler=SimpleNamespace(training_timesteps=1000))
     module = SimpleNamespace(trainer=trainer, loggers=loggers, completesplat=parts, logged_step=-1)
@@ -154,7 +163,8 @@ def test_losses_by_timestep_are_logged_once_a_step_and_never_without_an_interval
 
 
 def test_encoded_scenes_train_the_same(monkeypatch):
-    batch, result = scenes(0.5), []
+    batch = scenes(0.5)
+    result = []
     for cached in (False, True):
         module, logged = module_of(monkeypatch)
         parts = module.completesplat

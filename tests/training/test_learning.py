@@ -23,7 +23,8 @@ def scores(command, run, out, *changes: str) -> dict:
 
 def test_both_stages_learn(command, tmp_path):
     data = [f"data.root={tmp_path / 'data'}", *SCENES, *SHORT]
-    var, diffusion = tmp_path / "var", tmp_path / "diffusion"
+    var = tmp_path / "var"
+    diffusion = tmp_path / "diffusion"
     # Gentler than the experiment, whose large steps make so short a run end anywhere within 3 dB, seed by seed.
     stage1 = ["experiment=toy_var", "optimizer.lr=1e-3", "trainer.max_steps=600"]
     assert command("fit", *stage1, *data, f"out={var}").status == 0

@@ -57,9 +57,11 @@ def test_a_schedule_goes_on_with_the_end_and_the_rate_of_its_config():
 
 
 def test_muon_steps_equally_far_in_all_directions_of_a_kernel_and_adam_moves_the_rest():
-    kernel, bias = torch.zeros(4, 2, 3, 3, requires_grad=True), torch.zeros(4, requires_grad=True)
+    kernel = torch.zeros(4, 2, 3, 3, requires_grad=True)
+    bias = torch.zeros(4, requires_grad=True)
     optimizer = muon([kernel, bias], lr=0.5, adam_lr=0.01)
-    left, right = torch.linalg.qr(torch.randn(4, 4)).Q, torch.linalg.qr(torch.randn(18, 4)).Q
+    left = torch.linalg.qr(torch.randn(4, 4)).Q
+    right = torch.linalg.qr(torch.randn(18, 4)).Q
     kernel.grad = ((left * torch.tensor([1, 3, 10, 30])) @ right.T).view(4, 2, 3, 3)  # singular values
     bias.grad = torch.tensor([1.0, -2.0, 30.0, -400.0])
     optimizer.step()

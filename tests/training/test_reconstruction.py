@@ -32,7 +32,8 @@ def test_hidden_pixels_are_not_seen_but_compared(masked, monkeypatch):
     trained = module(f"model.masked={str(masked).lower()}")
     monkeypatch.setattr(trained, "log", lambda *_, **__: None)  # There is no trainer.
     monkeypatch.setattr(type(trained), "global_step", 0)
-    seen, compared = [], []
+    seen = []
+    compared = []
     trained.model.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     loss = trained.loss
     trained.loss = lambda prediction, views, step: compared.append(views.images) or loss(prediction, views, step)
@@ -58,8 +59,11 @@ def test_gradients_are_clipped_for_fused_optimizers_by_a_norm_that_is_computed_o
 
 
 def test_naive_predictions_are_the_reference_its_mirror_image_and_one_image():
-    scenes, image = scene_batch(), torch.rand(3, 16, 16)
-    truth, copied, repeated = scenes.all_views().images, copy_reference(scenes), repeat_image(image, scenes)
+    scenes = scene_batch()
+    image = torch.rand(3, 16, 16)
+    truth = scenes.all_views().images
+    copied = copy_reference(scenes)
+    repeated = repeat_image(image, scenes)
     assert copied.shape == repeated.shape == truth.shape
     assert all(torch.equal(copied[:, view], truth[:, 0]) for view in range(truth.shape[1]))
     assert (repeated == image).all()

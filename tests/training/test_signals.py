@@ -12,12 +12,11 @@ from contextlib import suppress
 import pytest
 import torch
 from lightning.fabric.strategies.launchers import subprocess_script as launcher
-from lightning.pytorch.trainer.connectors import signal_connector
 from small_runs import STEPS, Logging, fit, rows
 from support import LIMIT, write_program
 
 from completesplat import signals
-from completesplat.signals import ENDING, Interrupted, ended_by_signals, received
+from completesplat.signals import ENDING, Interrupted, ended_by_signals, received, restore_handlers
 from completesplat.training.checkpoints import read_checkpoint
 from completesplat.training.stopping import stopped_together
 
@@ -150,24 +149,23 @@ def test_a_program_ends_whose_workers_nobody_has_ended():
     subprocess.run([sys.executable, "-c", "\n".join(lines)], timeout=LIMIT, check=True)
 
 
-@pytest.mark.parametrize(
-    ("owner", "name"),
-    [
-        (signal_connector, "_SignalConnector"),
-        (signal_connector._SignalConnector, "register_signal_handlers"),
-        (launcher, "_launch_process_observer"),
-    ],
-)
-def test_a_lightning_with_other_names_keeps_its_own_behaviour_with_a_warning(owner, name, monkeypatch, caplog):
-    hidden = getattr(owner, name)
-    register = signal_connector._SignalConnector.register_signal_handlers
-    monkeypatch.delattr(owner, name)
+def test_a_lightning_with_other_names_keeps_its_own_behaviour_with_a_warning(monkeypatch, caplog):
+    monkeypatch.delattr(launcher, "_launch_process_observer")
     with stopped_together():
-        assert not hasattr(owner, name)
-        monkeypatch.undo()
-        assert signal_connector._SignalConnector.register_signal_handlers is register
-    assert getattr(owner, name) is hidden
+        assert not hasattr(launcher, "_launch_process_observer")
     assert "its own way" in caplog.text
+
+
+def test_handlers_of_another_library_are_replaced_until_a_signal_comes():
+    others = []
+    with suppress(Interrupted), ended_by_signals():
+        signal.signal(signal.SIGTERM, lambda *_: others.append("another"))
+        restore_handlers()
+        os.kill(os.getpid(), signal.SIGTERM)
+        others.append("goes on")
+    assert others == []
+    restore_handlers()  # outside, there are none
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 @pytest.mark.parametrize(

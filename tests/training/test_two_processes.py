@@ -78,7 +78,8 @@ def test_the_figures_of_two_processes_are_those_of_one(toy_root, tmp_path):
 @pytest.mark.slow
 def test_the_weights_of_two_processes_are_those_of_one_up_to_rounding(toy_root, tmp_path):
     """In float64, of 2**29 times the resolution, they differ by so much less: by rounding alone."""
-    apart, given = {}, ["trainer.max_steps=32", "trainer.val_check_interval=32", "trainer.limit_val_batches=0"]
+    apart = {}
+    given = ["trainer.max_steps=32", "trainer.val_check_interval=32", "trainer.limit_val_batches=0"]
     for dtype in (torch.float32, torch.float64):
         one, two = (train(toy_root, tmp_path / f"{dtype}-{n}", n, *given, dtype=dtype) for n in (1, 2))
         apart[dtype] = furthest(one, two)

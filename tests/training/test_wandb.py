@@ -13,7 +13,10 @@ from completesplat.training.reconstruction import ReconstructionModule
 pytest.importorskip("wandb")
 pytestmark = pytest.mark.processes
 
-STAGE1, STAGE2, TEST, MODES = "stage 1", "stage 2", "test", "hidden modes"
+STAGE1 = "stage 1"
+STAGE2 = "stage 2"
+TEST = "test"
+MODES = "hidden modes"
 FIT, TESTED = (STAGE1, STAGE2), (STAGE1, STAGE2, TEST)  # `fit` ends with a test
 # The kind of the values, the runs that log them, and their keys; `*` stands for anything.
 LOGGED = [
@@ -75,7 +78,8 @@ def test_a_run_logs_all_that_is_listed_and_nothing_else(run, kind):
 
 @pytest.mark.slow
 def test_jobs_of_a_sweep_are_a_group_and_a_continued_job_is_the_same_run(command, pipeline, tmp_path, monkeypatch):
-    step, failed = ReconstructionModule.training_step, []
+    step = ReconstructionModule.training_step
+    failed = []
 
     def failing(self, scenes, index):
         if self.global_step == 1 and not failed:

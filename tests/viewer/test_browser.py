@@ -104,7 +104,8 @@ def changed(tab, before: np.ndarray) -> np.ndarray:
 
 def turn(tab, before: np.ndarray) -> np.ndarray:
     """Drag the scene to the side."""
-    x, y = before.shape[1] / 2, before.shape[0] / 2
+    x = before.shape[1] / 2
+    y = before.shape[0] / 2
     tab.mouse.move(x, y)
     tab.mouse.down()
     tab.mouse.move(x + 60, y, steps=5)
@@ -136,7 +137,8 @@ def place(image: np.ndarray, color: tuple[float, float, float]) -> tuple[float, 
 
 def agrees(seen: np.ndarray, pixels: float = 1) -> bool:
     """Return whether each ball is where our own rasterizer draws it, within pixels of an image a third as large."""
-    expected, actual = ours(*seen.shape[:2], shrink=3), shrunk(seen, 3)
+    expected = ours(*seen.shape[:2], shrink=3)
+    actual = shrunk(seen, 3)
     places = [(place(actual, color), place(expected, color)) for _, color in BALLS.values()]
     return all(one == pytest.approx(other, abs=pixels) for one, other in places)
 
@@ -182,7 +184,8 @@ def test_a_phone_shows_the_whole_scene_and_the_panel_when_it_is_wanted(chromium,
 
 
 def test_a_thumbnail_makes_its_sample_large_and_a_key_shows_all(tab, page):
-    first, second = balls_sample(), balls_sample()
+    first = balls_sample()
+    second = balls_sample()
     second.gaussians.colors[:] = torch.tensor(BALLS["yellow"][1])
     before = settled(tab)
     page.show([first, second])

@@ -194,7 +194,9 @@ def titles(page: Page, monkeypatch) -> list[str]:
 
 def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(completion, model, monkeypatch):
     monkeypatch.setattr("completesplat.viewer.completion.PAUSE", 0)
-    said, seen, show = titles(completion.page, monkeypatch), [], completion.page.show
+    said = titles(completion.page, monkeypatch)
+    seen = []
+    show = completion.page.show
     monkeypatch.setattr(completion.page, "show", lambda samples, text: seen.append(samples[0]) or show(samples, text))
     samples = load(completion.page)
     for sample, expected in zip(samples, model(completion.photograph[1], **SETTINGS), strict=True):
@@ -219,14 +221,16 @@ def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(comple
     ],
 )
 def test_other_files_are_refused_by_their_own_name(completion, name, content, message):
-    browser, before = Browser(), completion.page.view.samples
+    browser = Browser()
+    before = completion.page.view.samples
     assert load(completion.page, name, content, browser) is before
     assert len(browser.messages) == 1
     assert browser.messages[0].startswith(message)
 
 
 def test_an_uploaded_scene_is_shown_from_the_front_with_switches_for_its_layers(completion, tmp_path):
-    page, scene = completion.page, balls_sample().gaussians
+    page = completion.page
+    scene = balls_sample().gaussians
     page.view.set_up((0.0, 0.0, -1.0))
     write_splat(tmp_path / "a.splat", scene)
     (sample,) = load(page, "some balls.SPLAT", (tmp_path / "a.splat").read_bytes())
@@ -277,7 +281,8 @@ def test_one_of_several_scenes_is_chosen(server, tmp_path):
 
 
 def test_a_slider_draws_anew_unless_drawing_is_off(completion):
-    before, controls = load(completion.page)[0].gaussians.means, completion.controls
+    before = load(completion.page)[0].gaussians.means
+    controls = completion.controls
     controls.skip_weight.value = 0.25
     sample = finish(completion.page)[0]
     assert sample.settings["skip_weight"] == 0.25
@@ -285,7 +290,8 @@ def test_a_slider_draws_anew_unless_drawing_is_off(completion):
     controls.steps.value = 3  # moves on to a number that the sampler can make
     assert controls.steps.value == finish(completion.page)[0].settings["steps"] == 2
     before = finish(completion.page)
-    controls.live.value, controls.seed.value = False, 7
+    controls.live.value = False
+    controls.seed.value = 7
     assert finish(completion.page) is before
     assert press(completion.page, controls.draw)[0].settings["seed"] == 7
 
@@ -304,7 +310,9 @@ def test_earlier_samples_can_stay(completion):
 
 
 def test_a_refusal_goes_to_its_browser_and_changes_nothing(completion, monkeypatch):
-    before, browser, other = completion.page.view.samples, Browser(), Browser()
+    before = completion.page.view.samples
+    browser = Browser()
+    other = Browser()
     monkeypatch.setattr(completion.page.server, "get_clients", lambda: {0: browser, 1: other})
     press(completion.page, completion.controls.draw, browser)
     assert load(completion.page, "notes.txt", b"no image", browser) is before
@@ -317,7 +325,9 @@ def test_a_refusal_goes_to_its_browser_and_changes_nothing(completion, monkeypat
 
 def drawing(completion: Completion, monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Load a photo, and draw it again until the event is set."""
-    entered, release, denoiser = threading.Event(), threading.Event(), completion.model.denoiser
+    entered = threading.Event()
+    release = threading.Event()
+    denoiser = completion.model.denoiser
     forward = denoiser.forward
     load(completion.page)
     monkeypatch.setattr(denoiser, "forward", lambda *a: (entered.set(), release.wait(LIMIT), forward(*a))[-1])
@@ -347,7 +357,10 @@ def test_a_fault_is_shown_and_the_page_goes_on(completion, model, monkeypatch, c
 
 
 def test_a_drawing_that_fails_half_way_leaves_the_samples_before(completion, model, monkeypatch):
-    before, forward, steps, shown = load(completion.page), model.denoiser.forward, [], []
+    before = load(completion.page)
+    forward = model.denoiser.forward
+    steps = []
+    shown = []
     monkeypatch.setattr(completion_module, "PAUSE", -1)
     monkeypatch.setattr(model.denoiser, "forward", lambda *a: 1 / 0 if steps else steps.append(1) or forward(*a))
     show = completion.page.show
@@ -381,7 +394,8 @@ FILES |= {"video": ["orbit_00.mp4", "orbit_01.mp4"], "html": ["page_00.html"]}
 
 @pytest.mark.parametrize("kind", FILES)
 def test_files_are_written_and_sent_to_their_browser(page, kind, tmp_path, monkeypatch):
-    browser, converter = Browser(), fake_converter.install(tmp_path / "bin", "splat-transform")
+    browser = Browser()
+    converter = fake_converter.install(tmp_path / "bin", "splat-transform")
     monkeypatch.setenv("PATH", str(converter.parent), prepend=os.pathsep)
     page.show([balls_sample(), balls_sample()])
     page.view_controls.chosen.value = SIDE_BY_SIDE
@@ -405,7 +419,8 @@ def test_saving_again_overwrites_nothing_and_takes_the_chosen_sample(page):
 
 
 def test_each_click_saves_what_it_saw_for_its_browser(page):
-    release, browsers = threading.Event(), [Browser(), Browser()]
+    release = threading.Event()
+    browsers = [Browser(), Browser()]
     page.show([balls_sample(layers=4)])
     page.worker.submit("drawing", lambda: release.wait(LIMIT))
     for browser in browsers:
@@ -419,7 +434,8 @@ def test_each_click_saves_what_it_saw_for_its_browser(page):
 
 
 def test_a_fault_in_saving_goes_to_its_browser(page, monkeypatch, caplog):
-    browser, other = Browser(), Browser()
+    browser = Browser()
+    other = Browser()
     monkeypatch.setattr(page.server, "get_clients", lambda: {0: browser, 1: other})
     monkeypatch.setattr(page.saver, "save", lambda *_: 1 / 0)
     with caplog.at_level(logging.CRITICAL):
@@ -430,7 +446,8 @@ def test_a_fault_in_saving_goes_to_its_browser(page, monkeypatch, caplog):
 @pytest.mark.parametrize("exact", [True, False])
 def test_files_have_the_screen_space_dilation_once_and_videos_none(page, monkeypatch, exact):
     """Our rasterizer adds it itself; Gaussians from a file have it already."""
-    sample, drawn = replace(balls_sample(), exact=exact), []
+    sample = replace(balls_sample(), exact=exact)
+    drawn = []
     drawing = lambda rasterizer, gaussians, *_: drawn.append(gaussians) or (torch.rand(1, 3, 8, 8), None)  # noqa: E731
     monkeypatch.setattr(page_module, "orbit_views", drawing)
     (ply,), _ = page.saver.save("ply", [sample]), page.saver.save("video", [sample])
@@ -469,7 +486,8 @@ def test_names_of_images_are_text_in_the_panels_html_and_thumbnails_without_a_ke
 
 
 def test_the_object_is_cut_out_on_request(completion, model, monkeypatch):
-    seen, read = [], type(model).read
+    seen = []
+    read = type(model).read
 
     def reading(self, file, *given, remove_background=False):
         seen.append(remove_background)

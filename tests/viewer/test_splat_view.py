@@ -37,7 +37,8 @@ def test_all_of_a_row_are_in_view_and_none_overlap(count):
 
 def test_side_by_side_samples_reach_no_further_than_to_the_middle_between_them():
     """A scene's floor and walls are far larger than the image of its object: whole ones would hide each other."""
-    sample, wall = balls_sample(), balls()
+    sample = balls_sample()
+    wall = balls()
     wall = replace(wall, means=wall.means * torch.tensor([30.0, 30, 1]))
     large = replace(wall[:4], means=sample.pivot().expand(4, 3), scales=torch.full((4, 3), 3.0))
     scene = merge_gaussians([sample.gaussians, wall, large])
@@ -108,9 +109,11 @@ def test_centers_and_bytes_of_finite_gaussians():
 
 
 def test_depth_colours_brighten_towards_the_camera_on_one_scale():
-    near, far = balls(points=50), balls(points=50)
+    near = balls(points=50)
+    far = balls(points=50)
     far.means[:, 2] += 1
-    eye, ahead = torch.tensor([-3.0, 0, 1]), torch.tensor([5.0, 0, 1])
+    eye = torch.tensor([-3.0, 0, 1])
+    ahead = torch.tensor([5.0, 0, 1])
     sideways = replace(balls_sample().reference, world_to_camera=look_at(eye, ahead, torch.tensor([0.0, 0, 1])))
     depths = transform_points(sideways.world_to_camera, near.means)[:, 2]
     by_depth = depth_colored([near], [sideways])[0].colors.sum(-1)[depths.argsort()]

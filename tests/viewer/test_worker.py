@@ -17,7 +17,8 @@ def worker():
 
 def blocked(worker: Worker) -> threading.Event:
     """Keep the worker busy until the event is set."""
-    started, release = threading.Event(), threading.Event()
+    started = threading.Event()
+    release = threading.Event()
     worker.submit("block", lambda: (started.set(), release.wait(LIMIT)))
     assert started.wait(LIMIT)
     return release
@@ -35,7 +36,8 @@ def test_the_newest_waiting_job_of_a_kind_is_done_in_another_thread(worker):
 
 
 def test_waiting_jobs_are_dropped_on_close_which_ends_after_the_current_one(worker):
-    done, others = [], set(threading.enumerate())
+    done = []
+    others = set(threading.enumerate())
     release = blocked(worker)
     worker.submit("draw", lambda: done.append(True))
     threading.Timer(0.2, release.set).start()

@@ -361,9 +361,8 @@ def _read_config(path: Path) -> dict[str, dict[str, Any]]:
     sections: dict[str, dict[str, Any]] = {}
     for section, hints in SECTIONS.items():
         options = config.get(section) if isinstance(config, Mapping) else None
-        if not isinstance(options, Mapping):
-            raise WeightsError(f"{path}: no section {section}; only Splatter Image's own files are read")
-        sections[section] = {name: options.get(name) for name in hints}
+        known = options if isinstance(options, Mapping) else {}
+        sections[section] = {name: known.get(name) for name in hints}
         _check_section(path, section, sections[section])
     return sections
 

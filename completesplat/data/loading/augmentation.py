@@ -1,8 +1,8 @@
 """Random augmentation of training scenes: colours of all views, the reference's camera, flips, boxes over its image."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from completesplat.rasterizers.kernels.compilation import helper, kernel
 from completesplat.scene import SceneBatch, Views
 from completesplat.settings.schema import check_value, hints_of
 
+T = TypeVar("T")
 Images = Float[Tensor, "view 3 height width"]
 Plane = Float32[ndarray, " pixel"]
 BRIGHTNESS, CONTRAST, SATURATION, HUE = range(4)
@@ -206,6 +207,16 @@ class CameraJitter:
         return replace(scene, reference=reference, targets=targets, visible=resampled[4:])
 
 
+def _built(kind: Callable[..., T], settings: Mapping[str, Any] | None) -> T | None:
+    """Build a part of an augmentation from its settings, or nothing without any."""
+    if settings is None:
+        return None
+    try:
+        return kind(**settings)
+    except TypeError as error:  # a name is misspelt
+        raise CompleteSplatError(f"data: {dict(settings)}: {error}") from None
+
+
 @dataclass(frozen=True)
 class Augmentation:
     """Random changes of a training scene: jitter of colours and camera, mirroring with probability 0.5, and boxes.
@@ -230,15 +241,12 @@ class Augmentation:
         Raises:
             CompleteSplatError: a setting is unknown or out of its range.
         """
-        try:
-            return Augmentation(
-                None if color_jitter is None else ColorJitter(**color_jitter),
-                None if box_masks is None else BoxMasks(**box_masks),
-                horizontal_flip,
-                None if camera_jitter is None else CameraJitter(**camera_jitter),
-            )
-        except TypeError as error:  # a name is misspelt
-            raise CompleteSplatError(f"data: {error}") from None
+        return Augmentation(
+            color_jitter=_built(ColorJitter, color_jitter),
+            box_masks=_built(BoxMasks, box_masks),
+            horizontal_flip=horizontal_flip,
+            camera_jitter=_built(CameraJitter, camera_jitter),
+        )
 
     def active(self) -> list[str]:
         """Return the names of the changes that are on."""

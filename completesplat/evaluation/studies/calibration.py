@@ -28,8 +28,8 @@ def calibration_rows(renderer: SampleRenderer, scenes: Scenes, tick: OnProgress,
     """Return a row for each region of novel views (`novel_values`), with means over the scenes.
 
     `energy_N` is the energy score of N samples, `below_all` and `above_all` are the ends of the rank histogram `ranks`.
-    `spread` and `error` are the roots of the means of `squares`; `bins` has them for `BINS` equally large groups of
-    values, ordered by the samples' variance. The settings are skip and guidance weight (`CompleteSplat.generate`).
+    `spread` and `error` are the roots of the means of `squares`. `bins` has them for `BINS` equally large groups of
+    values, ordered by the samples' variance. The settings are skip and guidance weight (`Sampling`).
     """
     measured = defaultdict[str, list[SceneCalibration]](list)
     for index, scene in enumerate(scenes):
@@ -51,7 +51,8 @@ class SceneCalibration(NamedTuple):
 
 def measure_scene(samples: SampledValues, truth: TrueValues) -> SceneCalibration:
     """Measure the samples of one scene against the truth."""
-    scores: dict[str, float | None] = {**energies(samples, truth)}
+    scores: dict[str, float | None] = {}
+    scores |= energies(samples, truth)
     scores["crps"] = crps(samples, truth)
     means = torch.stack(squares(samples, truth)).double().mean(1)
     return SceneCalibration(scores, rank_histogram(samples, truth), means, halves(samples, truth))

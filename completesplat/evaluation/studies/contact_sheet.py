@@ -38,13 +38,13 @@ NEAREST = 0.05
 
 @dataclass(frozen=True)
 class Cross:
-    """Cross of three arms that start at `center`; the rows of `arms` are right, up and ahead."""
+    """Cross of three arms that start at `center`. The rows of `arms` are right, up and ahead."""
 
     center: Float[Tensor, "3"]
     arms: Float[Tensor, "3 3"]
 
     def ends(self) -> Float[Tensor, "3 2 3"]:
-        """Return the two ends of each arm in the world; the first is the centre."""
+        """Return the two ends of each arm in the world. The first is the centre."""
         return torch.stack([self.center.expand(3, 3), self.center + self.arms], dim=1)
 
 
@@ -125,7 +125,7 @@ def _row(sequence: PosedSequence, images: int) -> Image.Image:
 
 
 def _image_cell(sequence: PosedSequence, index: int, cross: Cross) -> SheetCell:
-    """Return an image with the cross drawn into it; the label says so if the cross lies outside."""
+    """Return an image with the cross drawn into it. The label says so if the cross lies outside."""
     label = f"frame {sequence.frames[index]}"
     try:
         frame = sequence.read(index)

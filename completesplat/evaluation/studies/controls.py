@@ -97,7 +97,7 @@ PANELS = {"reference_psnr": "Reference view: PSNR, dB", "near_object_psnr": "Obj
 
 
 def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
-    """Write a PNG with a panel for each measure of faithfulness; the paper's three settings are circled and named."""
+    """Write a PNG with a panel for each measure of faithfulness. The paper's three settings are circled and named."""
     with written_figure(path, title, (13, 5.5)) as figure:
         skips = sorted({row["skip_weight"] for row in rows})
         for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS.items(), strict=True):

@@ -11,7 +11,7 @@ from completesplat.files import atomic_path
 
 @contextmanager
 def written_figure(path: Path, title: str, size: tuple[float, float]) -> Iterator[Figure]:
-    """Yield a figure of this width and height in inches; write it as a PNG if the block ends without exception."""
+    """Yield a figure of this width and height in inches and write it as a PNG if the block ends without exception."""
     figure = Figure(figsize=size, layout="constrained")
     figure.suptitle(title)
     yield figure

@@ -34,7 +34,7 @@ class SampleRenderer:
     seed: int
 
     def __call__(self, scene: SceneBatch, **settings: Any) -> Float[Tensor, "sample view 3 height width"]:
-        """Render one scene (a batch of one) over the background, in [0, 1]; see `render`."""
+        """Render one scene (a batch of one) over the background, in [0, 1]. See `render`."""
         return self.over_background(self.render(scene, **settings))
 
     def over_background(self, rendering: Rendering) -> Float[Tensor, "*batch 3 height width"]:
@@ -69,7 +69,7 @@ def object_psnr(
     true: Float[Tensor, "view 3 height width"],
     masks: Float[Tensor, "view 1 height width"],
 ) -> float | None:
-    """Return the samples' PSNR (dB) over the true object's pixels of all views together; None without pixels."""
+    """Return the samples' PSNR (dB) over the true object's pixels of all views together, or None without pixels."""
     inside = (masks > 0.5).expand_as(true)
     if not inside.any():
         return None
@@ -93,7 +93,7 @@ def _cosines(reference: Cameras, targets: Cameras) -> Float[Tensor, " view"]:
 
 
 def mean_over_scenes(measured: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
-    """Return the mean of each figure over the scenes that have it; None if none has."""
+    """Return the mean of each figure over the scenes that have it, or None if none has."""
     means: dict[str, float | None] = {}
     for key in measured[0]:
         values = [value for value in (row[key] for row in measured) if value is not None]

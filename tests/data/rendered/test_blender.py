@@ -146,7 +146,7 @@ def test_a_mesh_gets_memory_by_the_size_of_its_file(into, program, tmp_path):
 
 def test_a_full_disk_is_no_reason_to_leave_meshes_out(into, program, tmp_path, monkeypatch):
     failing = program(VERSION.format("4.2.0") + "echo cannot write; exit 1")
-    monkeypatch.setattr(files, "_asked", lambda path: OSError(errno.ENOSPC, "No space left on device"))
+    monkeypatch.setattr(files, "_test_write_error", lambda path: OSError(errno.ENOSPC, "No space left on device"))
     assert "No space left on device" in into(tmp_path / "data", failing, DiskError)
     assert not (tmp_path / "data/rendered/broken.json").exists()
 

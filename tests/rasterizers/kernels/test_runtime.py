@@ -114,10 +114,12 @@ def _double(x: int) -> int:
 def test_memory_is_aligned_reused_and_not_shared() -> None:
     """Memory is in use as long as any view of the array."""
     runtime.release()
-    first, second = runtime.empty((1000, 7)), runtime.empty((1000, 7))
+    first = runtime.empty((1000, 7))
+    second = runtime.empty((1000, 7))
     assert first.ctypes.data % 64 == second.ctypes.data % 64 == 0
     assert not np.shares_memory(first, second)
-    address, part = first.ctypes.data, first[1:].T.view(np.int32)
+    address = first.ctypes.data
+    part = first[1:].T.view(np.int32)
     del first
     gc.collect()
     third = runtime.empty((7, 1000))
@@ -181,6 +183,6 @@ def test_the_system_may_take_large_free_memory() -> None:
 @pytest.mark.processes
 def test_memory_that_is_in_use_when_the_interpreter_ends() -> None:
     """Python clears the kernels' module before the main one, which holds the array."""
-    code = "from completesplat.rasterizers.kernels import drawing; array = runtime.empty((3,))"
+    code = "from completesplat.rasterizers.kernels import runtime; array = runtime.empty((3,))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT)
     assert (result.returncode, result.stderr) == (0, "")

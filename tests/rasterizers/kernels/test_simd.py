@@ -7,7 +7,11 @@ from completesplat.rasterizers.kernels import composite, project, simd
 from completesplat.rasterizers.kernels.compilation import kernel
 from completesplat.rasterizers.kernels.simd import LANES
 
-exp2, load, store, lowest_bit, word_mask = simd.exp2, simd.load, simd.store, simd.lowest_bit, composite.word_mask
+exp2 = simd.exp2
+load = simd.load
+store = simd.store
+lowest_bit = simd.lowest_bit
+word_mask = composite.word_mask
 
 
 @kernel
@@ -24,7 +28,8 @@ def run_mask(word: int, first: int, last: int) -> tuple[int, int]:
 
 def test_exp2_is_accurate_to_the_last_bits() -> None:
     x = np.concatenate([np.linspace(-126, 127, 16000), np.linspace(-8.1, 0.5, 15984), np.arange(-16, 0)])
-    out, x = np.full(x.size, np.nan, np.float32), x.astype(np.float32)
+    out = np.full(x.size, np.nan, np.float32)
+    x = x.astype(np.float32)
     run_exp2(x, out)
     assert np.abs(out / np.exp2(x.astype(np.float64)) - 1).max() < 3e-7
     assert (out[-16:] < 1).all()
@@ -39,9 +44,15 @@ def test_word_masks_hold_the_bits_of_their_columns(first: int, last: int) -> Non
         assert lowest == columns[0] - 64 * word
 
 
-append, load_block, store_block = project.append, composite.load_block, composite.store_block
-three_columns, sixteen_columns = simd.columns(3), simd.columns(LANES)
-narrow, scatter, square_root, widen = simd.narrow, simd.scatter, simd.square_root, simd.widen
+append = project.append
+load_block = composite.load_block
+store_block = composite.store_block
+three_columns = simd.columns(3)
+sixteen_columns = simd.columns(LANES)
+narrow = simd.narrow
+scatter = simd.scatter
+square_root = simd.square_root
+widen = simd.widen
 
 
 @kernel
@@ -69,14 +80,16 @@ def run_blocks(image: np.ndarray, out: np.ndarray, corner: int, width: int) -> N
 
 
 def test_doubles_have_the_precision_of_float64() -> None:
-    x, out = np.linspace(1, 2, LANES, dtype=np.float32), np.zeros(LANES, np.float32)
+    x = np.linspace(1, 2, LANES, dtype=np.float32)
+    out = np.zeros(LANES, np.float32)
     run_doubles(x, out)
     assert np.allclose(out, 0.5e-10 / x, rtol=1e-4, atol=0)
 
 
 def test_appended_rows_are_those_of_the_mask_in_their_order() -> None:
     values = np.random.default_rng(0).normal(size=(LANES, LANES)).astype(np.float32)
-    rows, numbers = np.zeros((LANES + 3, LANES), np.float32), np.zeros(LANES + 3)
+    rows = np.zeros((LANES + 3, LANES), np.float32)
+    numbers = np.zeros(LANES + 3)
     count = run_append(values.reshape(-1), rows.reshape(-1), numbers, 2)
     selected = values.T[values[0] > 0]
     assert count == 2 + len(selected)
@@ -87,7 +100,8 @@ def test_appended_rows_are_those_of_the_mask_in_their_order() -> None:
 
 @pytest.mark.parametrize("last", [17, 31, 32])
 def test_scattered_rows_end_with_the_last_one(last: int) -> None:
-    values, out = np.arange(1, 3 * LANES + 1, dtype=np.float32).reshape(3, LANES), np.zeros((40, 3), np.float32)
+    values = np.arange(1, 3 * LANES + 1, dtype=np.float32).reshape(3, LANES)
+    out = np.zeros((40, 3), np.float32)
     run_scatter(values.reshape(-1), out.reshape(-1), 16, last)
     assert np.array_equal(out[16:last], values.T[: last - 16])
     assert not out[:16].any()
@@ -95,7 +109,8 @@ def test_scattered_rows_end_with_the_last_one(last: int) -> None:
 
 
 def test_a_block_is_read_and_written_where_it_stands() -> None:
-    image, out = np.arange(11 * 9, dtype=np.float32).reshape(9, 11), np.zeros((9, 11), np.float32)
+    image = np.arange(11 * 9, dtype=np.float32).reshape(9, 11)
+    out = np.zeros((9, 11), np.float32)
     run_blocks(image.reshape(-1), out.reshape(-1), 3 * 11 + 5, 11)
     expected = np.zeros_like(image)
     expected[3:7, 5:9] = image[3:7, 5:9]

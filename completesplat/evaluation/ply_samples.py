@@ -24,7 +24,7 @@ LEAST_IN_FRONT = 0.1  # of a scene's Gaussians: with less, the axes are wrong
 FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 
 
-class SceneFiles(Scorer):
+class PlySamples(Scorer):
     """Scorer whose samples are the files `sample_*.ply` of each test scene.
 
     Args:
@@ -53,7 +53,7 @@ class SceneFiles(Scorer):
         return f"{self.folder.resolve().name if self.name is None else self.name} (read from files)"
 
     def find_files(self, scenes: Sequence[str], samples: int) -> None:
-        """Find the first `samples` files of these scenes, by name; raise CompleteSplatError if a scene has fewer."""
+        """Find the first `samples` files of these scenes, by name, or raise CompleteSplatError if a scene has fewer."""
         self.files = {}
         for scene in scenes:
             paths = (self.folder / safe_name(scene)).glob(FILES)
@@ -110,7 +110,7 @@ class SceneFiles(Scorer):
         return [replace(x, means=factor * x.means, scales=factor * x.scales) for x in sets]
 
     def _scale(self, gaussians: Gaussians, reference: Views) -> float | None:
-        """Return the factor that fits rendered depth to true depth best (least squares); None without common pixels."""
+        """Return the least-squares factor from rendered to true depth, or None without common pixels."""
         depth = self.render_from(gaussians[None], reference.cameras[None])[0, 0].surface_depth()
         true = torch.zeros_like(depth) if reference.depths is None else reference.depths
         mask = true.isfinite() & (true > 0) & (depth > 0)
@@ -123,7 +123,7 @@ class SceneFiles(Scorer):
         super().on_test_epoch_end()
 
     def facts(self) -> dict[str, object]:
-        """Return facts for the protocol; the checksum covers the sorted lines of `sha256sum` for the used files."""
+        """Return facts for the protocol. The checksum covers the sorted lines of `sha256sum` for the used files."""
         paths = [path.relative_to(self.folder) for scene in self.files.values() for path in scene]
         lines = sorted(f"{sha256_of(self.folder / path)}  {path.as_posix()}\n" for path in paths)
         checksum = hashlib.sha256("".join(lines).encode()).hexdigest()
