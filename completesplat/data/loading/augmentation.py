@@ -1,4 +1,4 @@
-"""Random augmentation of training scenes: colours of all views, the reference's camera, flips, boxes over its image."""
+"""Random augmentation of training scenes: colours and background of all views, the reference's camera, flips, boxes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -203,13 +203,20 @@ def augment(
     box_masks: BoxMasks | None,
     horizontal_flip: bool,
     camera_jitter: CameraJitter | None = None,
+    random_background: float = 0.0,
 ) -> SceneBatch:
     """Augment one scene (without batch axis): jitter colours and camera, flip with probability 0.5, hide boxes.
 
-    Jitter, flip, boxes and camera draw from four generators, spawned from `rng` in this order. So each is independent
-    of whether the others are on, and of what was drawn from `rng` before. Nothing is drawn from `rng` itself.
+    With probability `random_background`, one random colour takes the background's place in all views.
+
+    Jitter, flip, boxes, camera and background draw from five generators, spawned from `rng` in this order. So each is
+    independent of whether the others are on, and of what was drawn from `rng` before. Nothing is drawn from `rng`
+    itself.
     """
-    jitter_rng, flip_rng, boxes_rng, camera_rng = rng.spawn(4)
+    jitter_rng, flip_rng, boxes_rng, camera_rng, background_rng = rng.spawn(5)
+    if background_rng.random() < random_background:
+        color = torch.from_numpy(background_rng.uniform(size=3)).float()
+        scene = on_color(scene, color)
     if color_jitter is not None:
         images = color_jitter(scene.all_views().images, jitter_rng)
         reference, targets = replace(scene.reference, images=images[0]), replace(scene.targets, images=images[1:])
@@ -222,6 +229,15 @@ def augment(
         height, width = scene.reference.cameras.image_size
         scene = replace(scene, visible=box_masks(height, width, boxes_rng).to(scene.visible))
     return scene
+
+
+def on_color(scene: SceneBatch, color: Float[Tensor, "3"]) -> SceneBatch:
+    """Replace the background of all views (what their masks leave out) by one colour; without masks nothing changes."""
+
+    def composited(views: Views) -> Views:
+        return replace(views, images=torch.lerp(color[:, None, None], views.images, views.masks))
+
+    return replace(scene, reference=composited(scene.reference), targets=composited(scene.targets))
 
 
 def mirrored(scene: SceneBatch) -> SceneBatch:

@@ -33,7 +33,10 @@ from completesplat.settings.schema import Natural, Positive, Range, Share, Side,
 MOST_WORKERS = 4  # if data.workers is null
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
 
-UNCHANGED = "data.color_jitter=null data.camera_jitter=null data.horizontal_flip=false data.background=null"
+UNCHANGED = (
+    "data.color_jitter=null data.camera_jitter=null data.horizontal_flip=false data.background=null "
+    "data.random_background=0"
+)
 
 T = TypeVar("T")
 
@@ -62,10 +65,12 @@ class SceneDataModule(LightningDataModule):
         background: grey value that replaces the background of images with a mask ("Objects only"); None: it stays.
         color_jitter, box_masks, camera_jitter: settings of `ColorJitter`, `BoxMasks` and `CameraJitter`; None: off.
         horizontal_flip: mirror half of the training scenes horizontally.
+        random_background: share of the training scenes whose background is replaced by a random colour, the same in
+            all views; images without a mask stay as they are.
         workers: processes that load data; 0: none; None: one for each core, at most four.
         cache: keep decoded images in memory.
         latent_cache: folder of latents from which stage 2 is trained (`CachedTrainingScenes`), without colour jitter,
-            flips or `background`; validation and test read images.
+            flips, `background` or `random_background`; validation and test read images.
         on_bad: "skip" items that cannot be read (counted and reported), or "raise" the error.
         max_bad_fraction: share of an epoch's items that may be skipped; one always may, unless this is 0.
         allow_changed: a resumed run may continue with training data that have changed.
@@ -88,6 +93,7 @@ class SceneDataModule(LightningDataModule):
         box_masks: Mapping[str, Any] | None = None,
         camera_jitter: Mapping[str, Any] | None = None,
         horizontal_flip: bool = False,
+        random_background: Share = 0.0,
         workers: Annotated[int, Range(0, 256)] | None = 0,
         cache: bool = False,
         latent_cache: str | None = None,
@@ -98,9 +104,11 @@ class SceneDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         ranged = {"targets": targets, "mask_threshold": mask_threshold, "background": background}
+        ranged["random_background"] = random_background
         for name, value in (ranged | {"workers": workers, "on_bad": on_bad}).items():
             check_value(f"data.{name}", hints_of(SceneDataModule.__init__)[name], value)
-        if latent_cache is not None and (color_jitter or camera_jitter or horizontal_flip or background is not None):
+        changed = color_jitter or camera_jitter or horizontal_flip or random_background or background is not None
+        if latent_cache is not None and changed:
             raise CompleteSplatError(f"data.latent_cache is of images as they are: set {UNCHANGED}")
         self.root = local_root(root)
         self.image_size = image_size
@@ -117,6 +125,7 @@ class SceneDataModule(LightningDataModule):
             box_masks=self.box_masks,
             horizontal_flip=horizontal_flip,
             camera_jitter=_built(CameraJitter, camera_jitter),
+            random_background=random_background,
         )
         self.workers = min(MOST_WORKERS, usable_cores()) if workers is None else workers
         self.cache = cache
