@@ -160,8 +160,11 @@ class CaptureFit(Stage):
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
         gaussians, views, settings = self.gaussians(), self.in_world(scenes, "train"), self.fitting
-        images = self.render(gaussians[None], views.cameras)
-        total, terms = self.loss(Prediction(images, gaussians[None], None), views, self.global_step)
+        with torch.autocast(self.device.type, enabled=False):
+            rendering = self.rasterizer(gaussians[None], views.cameras)
+        images = rendering.over(self.background)
+        prediction = Prediction(images, rendering.alpha, gaussians[None], None)
+        total, terms = self.loss(prediction, views, self.global_step)
         total = total + settings.opacity_weight * gaussians.opacities.mean()
         total = total + settings.scale_weight * gaussians.scales.mean()
         logged = {f"train/{name}": value for name, value in terms.items()}
