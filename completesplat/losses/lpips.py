@@ -135,8 +135,11 @@ def load_heads() -> list[Head]:
 class PerceptualTerm:
     """Loss term: a `PerceptualDistance`, averaged over the views; always in float32.
 
-    The network is not part of the trained module, so no checkpoint holds it.
+    The network is not part of the trained module, so no checkpoint holds it. With `views`, so many views are drawn for
+    each batch, the same for all of its scenes, and the others do not count.
     """
+
+    views: int | None = None
 
     only_for_training = True
     """Whether a run is opened without this term, because its network's weights may be elsewhere."""
@@ -144,8 +147,9 @@ class PerceptualTerm:
     distance: PerceptualDistance
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        chosen = slice(None) if self.views is None else torch.randperm(truth.images.shape[1])[: self.views]
         with torch.autocast(prediction.images.device.type, enabled=False):
-            pair = (images.flatten(0, 1).float() for images in (prediction.images, truth.images))
+            pair = (images[:, chosen].flatten(0, 1).float() for images in (prediction.images, truth.images))
             return torch.mean(self.distance(*pair))
 
 
