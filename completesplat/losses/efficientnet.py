@@ -7,7 +7,7 @@ import torch
 
 from completesplat.errors import needing
 from completesplat.losses.lpips import Activations, PerceptualDistance, PerceptualTerm
-from completesplat.settings.schema import Positive
+from completesplat.quantities import Positive
 
 # The network takes colours as (255 x - 127) / 128 for x in [0, 1] (`efficientnet_lite_builder.py` of tensorflow/tpu).
 SHIFT = (-1 / 255,) * 3
