@@ -27,11 +27,12 @@ from completesplat.evaluation.mode_tables import mode_results_table
 from completesplat.evaluation.protocol import Config, describe_test, scored_data, set_metrics
 from completesplat.evaluation.records import MODEL, PROTOCOL, read_record
 from completesplat.evaluation.score_tables import evaluation_table
-from completesplat.evaluation.tables import show
-from completesplat.files import counted, printable, write_json
+from completesplat.evaluation.table_writers import show
+from completesplat.files import write_json
 from completesplat.settings.schema import EvaluationSettings, TestSettings
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.stopping import stopped_together
+from completesplat.wording import counted, printable
 
 METRIC = re.compile(r"\+*evaluation\.metrics\.(\w+)")
 

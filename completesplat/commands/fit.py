@@ -24,8 +24,8 @@ from completesplat.evaluation.provenance import checkpoint_facts
 from completesplat.evaluation.records import read_record
 from completesplat.evaluation.score_tables import evaluation_table
 from completesplat.evaluation.scorer import Scorer
-from completesplat.evaluation.tables import show
-from completesplat.files import counted, write_json
+from completesplat.evaluation.table_writers import show
+from completesplat.files import write_json
 from completesplat.settings import checks
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs
@@ -33,6 +33,7 @@ from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
 from completesplat.weights import RUN_WEIGHTS
 from completesplat.weights.checkpoint_reading import check_whole
+from completesplat.wording import counted
 
 logger = logging.getLogger(__name__)
 

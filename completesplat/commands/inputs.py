@@ -8,8 +8,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.files import printable
 from completesplat.weights import AUTO, check_name
+from completesplat.wording import printable
 
 SUFFIXES = (
     ".jpg",

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from completesplat.data.sequences import first_names
 from completesplat.errors import DataError
-from completesplat.files import counted
+from completesplat.wording import counted
 
 SPLITS = ("train", "val", "test")
 FEWEST_OBJECTS = 3  # one for each split

@@ -13,10 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.errors import ImageError, WeightsError
-from completesplat.files import printable
 from completesplat.photo.features import distance_to_training
 from completesplat.photo.reading import Framing, ImageLike, read_square
 from completesplat.weights import CONFIG_FILE, read_small, shipped
+from completesplat.wording import printable
 
 LOOKED_AT = 8  # images of many that weights are chosen by
 SAME_GREY = 0.1  # largest difference of a border's pixel from the background

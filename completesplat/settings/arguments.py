@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from hydra.core.override_parser.types import Quote, QuotedString
 
 from completesplat.errors import CompleteSplatError
-from completesplat.files import SHORT, printable
 from completesplat.settings.options import TASKS
+from completesplat.wording import SHORT, printable
 
 WORDS = {"predict": ("image",), "view": ("path",), "new": ("kind", "name"), "data import": ("folder",)}
 """By verb, or verb and task, the settings whose values are given as words without `=`."""

@@ -19,9 +19,10 @@ from completesplat.data.captures.turntable import TurntableSettings, import_turn
 from completesplat.data.sequences import first_names
 from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import DataError, refused_to
-from completesplat.files import atomic_folder, by_numbers, counted, folder_names
+from completesplat.files import atomic_folder
 from completesplat.photo import files, saving
 from completesplat.quantities import Positive
+from completesplat.wording import by_numbers, counted, folder_names
 
 logger = logging.getLogger(__name__)
 leave_out = partial(logger.warning, "left out: %s")

@@ -17,8 +17,8 @@ from completesplat.data.loading.scenes import EvaluationScenes, TrainingScenes
 from completesplat.data.loading.training_statistics import feature_moments
 from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.files import counted
 from completesplat.quantities import Natural, Positive, Range, Share
+from completesplat.wording import counted
 
 MOST_WORKERS = 4  # if data.workers is null
 SPLITS_OF_STAGE = {
