@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 from torch.optim import Adam
 
-from completesplat.baselines import fitting
+from completesplat.baselines import densification, fitting
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.sequences import PosedSequence, first_names
 from completesplat.errors import CompleteSplatError
@@ -170,10 +170,10 @@ class CaptureFit(Stage):
         (optimizer,) = self.trainer.optimizers
         count = int(self.count)
         rate = optimizer.param_groups[0]["lr"] / settings.position_rate
-        self.raw["means"][:count] += fitting.position_noise(self.gaussians(), rate)
+        self.raw["means"][:count] += densification.position_noise(self.gaussians(), rate)
         if step % settings.refine_every == 0 and step < REFINED_SHARE * total:
             grown = max(count, min(settings.most, int(count * (1 + settings.growth))))
-            changed = fitting.relocate(dict(self.raw.items()), count, grown)
+            changed = densification.relocate(dict(self.raw.items()), count, grown)
             for state in optimizer.state.values():
                 for key in ("exp_avg", "exp_avg_sq"):
                     state[key][changed] = 0
