@@ -12,8 +12,8 @@ from rich.progress import track
 
 from completesplat.data.sequences import first_names
 from completesplat.errors import DataError, refused_to
-from completesplat.files import counted, folder_names
 from completesplat.photo import files, saving
+from completesplat.wording import counted, folder_names
 
 logger = logging.getLogger(__name__)
 
