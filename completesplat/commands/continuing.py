@@ -97,11 +97,16 @@ def _refuse_earlier_end(out: Path, ends: Mapping[str, Any], earlier: Mapping[str
 
 
 def _differences(earlier: object, config: object, moved: tuple[str, str], key: str = "") -> set[str]:
-    """Return the keys of settings that differ by more than the folder's move."""
+    """Return the keys of settings that differ by more than the folder's move.
+
+    A setting that is off, and that the earlier run's version did not have, makes no difference.
+    """
     if isinstance(earlier, dict) and isinstance(config, dict):
         names: set[str] = set()
         for part in earlier.keys() | config.keys():
             place = f"{key}.{part}" if key else part
+            if part not in earlier and not config[part]:
+                continue
             names |= _differences(earlier.get(part), config.get(part), moved, place)
         return names
     if isinstance(earlier, str) and f"{earlier}/".startswith(f"{moved[0]}/"):

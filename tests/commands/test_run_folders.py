@@ -127,6 +127,11 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
 
     OmegaConf.save(config(), tmp_path / "config.yaml")
     assert continuing.is_finished(tmp_path, config())
+    # A setting of later versions, which the run did not have, may be there if it is off.
+    for off in (0.0, None, False):
+        assert continuing.is_finished(tmp_path, config() | {"later": off})
+    with pytest.raises(CompleteSplatError, match="a run with another later: "):
+        continuing.is_finished(tmp_path, config() | {"later": 0.5})
     for longer in ({"max_steps": 40, "test": True}, {"max_steps": -1}, {"max_time": {"hours": 1}, "max_steps": 21}):
         assert not continuing.is_finished(tmp_path, config(**longer))
     (moved := tmp_path / "moved").mkdir()
