@@ -1,4 +1,4 @@
-"""Ranges and choices of the values that users set, as annotations of arguments.
+"""Ranges and choices of the values that users set, as annotations of arguments, and suffixes of files of Gaussians.
 
 They hold no code. `completesplat.settings.schema` checks users' values against the annotations of what they set.
 """
@@ -39,4 +39,5 @@ Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], Entries(most=8)]
 Few = Annotated[int, Range(1, 16)]
 
 Format = Literal["ply", "splat", "glb", "mesh", "spz", "sog", "html"]  # of a scene's files
+SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")  # files of Gaussians that are read
 CameraPath = Literal["orbit", "swipe", "wobble"]  # of a video

@@ -53,7 +53,8 @@ class Sampling:
         seed: seed of all noise, or one for each image, whose samples then do not depend on the other images.
         color_fits: rounds of fitting to the image (`fit_front`); 0 in the paper.
         batch: the largest number of latents at a time; it changes only rounding. By default all, or fewer if a GPU's
-            memory does not suffice; a small denoiser on a CPU draws `part_of` them unless the steps are watched.
+            memory does not suffice. On a CPU, a small denoiser takes as many at a time as `part_of` returns, unless
+            `on_step` is given.
         bfloat16: compute the denoiser in bfloat16; a call with a photo does, where the device computes in it. Renders
             then change about as little as by rounding to 8 bits.
     """
@@ -209,7 +210,8 @@ class SceneModel(nn.Module):
     def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
         """Return near and far of the scene in a photo: those of the training set.
 
-        Weights of objects, which have one size, move it to where an object is as large in the photo as in training.
+        The objects in a training set have one size. Their weights move the range with the photo's field of view, so
+        that an object at the middle of its range is as large in the photo as in the training images.
         """
         before = (self.architecture.get("training") or {}).get("depth_before")
         if before is None:
@@ -264,8 +266,8 @@ class SceneModel(nn.Module):
         """Return how photos are framed for this model, which is how its training images were.
 
         The central square is enlarged where a cut-out or transparent object reaches beyond it. A model of objects on a
-        background gets such an object on it, as large as in training. It takes every image as of its training's field
-        of view, unless another one is given.
+        background gets such an object on it, as large as in training. It ignores EXIF records: unless a
+        field of view is given, it assumes that of its training images.
         """
         typical = self.fov_degrees.item()
         training = self.architecture.get("training") or {}

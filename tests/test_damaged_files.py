@@ -17,7 +17,7 @@ from splats_of_others import COMPRESSED, FILES, spz_with_axes
 
 from completesplat.baselines.splatter_image.model import STATE
 from completesplat.errors import CompleteSplatError, PlyError, WeightsError
-from completesplat.export.formats import RECORD
+from completesplat.export.splat import RECORD
 
 NAN = float("nan")
 INF = float("inf")

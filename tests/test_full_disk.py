@@ -20,9 +20,9 @@ from completesplat.commands import exit_status, refusal
 from completesplat.data.toy import write_objects, write_rooms
 from completesplat.data.validation.audit import AuditReport
 from completesplat.errors import DiskError
-from completesplat.export.formats import write_splat
 from completesplat.export.images import write_png
 from completesplat.export.ply import write_ply
+from completesplat.export.splat import write_splat
 from completesplat.export.video import write_video
 from completesplat.files import make_folder, write_json, write_text
 from completesplat.photo.saving import save_image

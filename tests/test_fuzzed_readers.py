@@ -41,9 +41,9 @@ from completesplat.data.co3d.depth_maps import read_depth
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.validation import read_points
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import write_splat
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.export.reading import read_gaussians
+from completesplat.export.splat import write_splat
 from completesplat.generator import CompleteSplat
 from completesplat.photo.exif import ORIENTATION
 from completesplat.photo.files import decode_image, stored_size

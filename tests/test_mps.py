@@ -10,7 +10,7 @@ from packed_sequences import contents
 from PIL import Image
 from support import round_gaussians, strict_json
 
-from completesplat.baselines.fitting import scale_of_copies
+from completesplat.baselines.densification import scale_of_copies
 from completesplat.commands import predict, trained
 from completesplat.export.ply import read_ply
 from completesplat.generator import CompleteSplat

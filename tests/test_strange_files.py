@@ -10,9 +10,9 @@ import torch
 from splats_of_others import COMPRESSED, DIRECTIONAL_FILES, SCENE, spz_with_axes
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import RECORD
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.export.reading import read_gaussians
+from completesplat.export.splat import RECORD
 from completesplat.geometry.cameras import Cameras
 from completesplat.viewer.sample import read_scene
 

@@ -20,7 +20,8 @@ class AutoDecoder(nn.Module):
     """Table of the training images' latent codes, and the reconstructor that they share.
 
     There is no prior on the codes. A code stands for one image with its camera, so colour augmentation and mirroring
-    should be off. The table has `rows * latent_channels * (image_size / 8)^2` numbers, thrice that with Adam's moments.
+    should be off. The table has `rows * latent_channels * (image_size / factor)^2` numbers, where `factor` is the
+    reconstructor's enlargement, and thrice as many with Adam's moments.
 
     Args:
         rows: images that the table has room for. Loading weights resizes the table to theirs.
@@ -57,7 +58,7 @@ class AutoDecoder(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *others)
 
     def codes_of(self, names: Sequence[str], frames: Int64[Tensor, " batch"]) -> Codes:
-        """Return the codes of images, given by sequence and place.
+        """Return the codes of images, given by sequence and frame.
 
         Raises:
             CompleteSplatError: the table is full.

@@ -1,8 +1,7 @@
 """Optimisation of 3D Gaussians for single scenes from posed views (Kerbl et al. 2023, "3D Gaussian Splatting").
 
-`fit_gaussians` keeps the number of Gaussians. `relocate` adds and moves them, as 3DGS-MCMC does (Kheradmand et al.
-2024), without gradients of image positions, so any rasterizer serves. Gaussians start from random pixels at random
-depths, or from points, where a data set has them.
+`fit_gaussians` keeps the number of Gaussians; `densification` adds and moves them. Gaussians start from random pixels
+at random depths, or from points, where a data set has them.
 """
 
 from collections.abc import Mapping
@@ -10,7 +9,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians
@@ -20,18 +19,15 @@ from completesplat.losses import Prediction, WeightedSum
 from completesplat.quantities import Positive, Range
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
-from completesplat.tensors import as_float64
 
+# 3DGS's learning rates for 30,000 steps (graphdeco-inria/gaussian-splatting, `arguments/__init__.py`).
 POSITION_RATE = 1.6e-4
+"""First learning rate of the positions, for a scene whose extent is 1."""
 POSITION_DECAY = 0.01
+"""Factor by which the positions' rate decays exponentially over all steps."""
 RATES = {"log_scales": 5e-3, "quaternions": 1e-3, "logits": 5e-2, "harmonics": 2.5e-3}
-"""3DGS's rates for 30,000 steps (graphdeco-inria/gaussian-splatting, `arguments/__init__.py`): the rate of the
-positions is relative to the scene's extent and decays exponentially to a hundredth."""
+"""Learning rates of the other parameters, which are constant."""
 
-DEAD_OPACITY = 0.005
-MOST_COPIES = 51  # as in the authors' code and gsplat
-NOISE = 5e5
-NOISE_STEEPNESS = 100.0
 NEIGHBOURS = 3
 Translucent = Annotated[float, Range(0.01, 0.99)]  # 0 and 1 have no finite logits
 Count = Annotated[int, Range(NEIGHBOURS + 1, 10**7)]  # of Gaussians; 3DGS's largest scenes have six million
@@ -153,8 +149,9 @@ def fit_gaussians(
             # Indexing copies the views, so autograd can use them even if they were made in inference mode.
             truth = views[:, chosen.to(views.images.device)]
             gaussians = raw.gaussians()
-            images = rasterizer(gaussians, truth.cameras).over(background)
-            total, _ = loss(Prediction(images, gaussians, None), truth, step)
+            rendering = rasterizer(gaussians, truth.cameras)
+            images = rendering.over(background)
+            total, _ = loss(Prediction(images, rendering.alpha, gaussians, None), truth, step)
             optimizer.zero_grad()
             torch.autograd.backward(total)
             optimizer.step()
@@ -163,7 +160,11 @@ def fit_gaussians(
 
 
 def adam(
-    raw: Mapping[str, Tensor], depth_ranges: Float[Tensor, "_ 2"], positions: float, opacities: float, others: float
+    raw: Mapping[str, Tensor],
+    depth_ranges: Float[Tensor, "_ 2"],
+    position_factor: float,
+    opacity_factor: float,
+    other_factor: float,
 ) -> torch.optim.Adam:
     """Return Adam for tensors of `RawGaussians` by name, the positions first, with factors on 3DGS's rates.
 
@@ -171,62 +172,8 @@ def adam(
     """
     # Half of the mean depth range: the spread of the initial Gaussians (3DGS uses the spread of the cameras).
     extent = (0.5 * (depth_ranges[:, 1] - depth_ranges[:, 0])).mean().item()
-    groups = [{"params": [raw["means"]], "lr": positions * POSITION_RATE * extent}]
+    groups = [{"params": [raw["means"]], "lr": position_factor * POSITION_RATE * extent}]
     for name, rate in RATES.items():
-        factor = opacities if name == "logits" else others
+        factor = opacity_factor if name == "logits" else other_factor
         groups.append({"params": [raw[name]], "lr": factor * rate})
     return torch.optim.Adam(groups, eps=1e-15)
-
-
-def opacity_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Return the opacity of each of several equal Gaussians that together are as opaque as one (3DGS-MCMC, Eq. 9)."""
-    return 1 - (1 - opacities) ** (1 / copies)
-
-
-def scale_of_copies(opacities: Float[Tensor, " n"], copies: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Return the factor on the scales of such copies, which preserves the integral of alpha along a line (Eq. 9).
-
-    Their double sum is written as one sum, by C(0, k) + ... + C(n - 1, k) = C(n, k + 1).
-    """
-    alpha = as_float64(opacities)
-    n = as_float64(copies)[:, None]
-    o = opacity_of_copies(alpha, copies.to(alpha.device))[:, None]
-    j = torch.arange(1, int(copies.max()) + 1, dtype=torch.float64, device=o.device)
-    logarithm = torch.lgamma(n + 1) - torch.lgamma(j + 1) - torch.lgamma((n - j).clamp(min=0) + 1)
-    terms = torch.where(j <= n, logarithm.exp() * o**j / j.sqrt(), 0) * (1 - 2 * ((j + 1) % 2))
-    return (alpha / terms.sum(-1)).to(opacities)
-
-
-@torch.no_grad()
-def relocate(raw: Mapping[str, Tensor], count: int, new_count: int) -> Int64[Tensor, " changed"]:
-    """Replace dead Gaussians, and fill rows `count` to `new_count`, by copies of living ones, drawn by opacity.
-
-    Args:
-        raw: tensors [row ...] of `RawGaussians` by name, which are changed.
-
-    Returns:
-        The rows that were changed, whose state in an optimizer is no longer true.
-    """
-    logits = raw["logits"]
-    opacities = logits[:count].sigmoid()
-    dead = opacities <= DEAD_OPACITY
-    vacant = torch.cat([dead.nonzero()[:, 0], torch.arange(count, new_count, device=logits.device)])
-    if len(vacant) == 0 or bool(dead.all()):
-        return vacant[:0]
-    sources = torch.multinomial(opacities.where(~dead, 0), len(vacant), replacement=True)
-    copies = sources.bincount(minlength=count) + 1
-    parents = (copies > 1).nonzero()[:, 0]
-    number = copies[parents].clamp(max=MOST_COPIES)
-    opacity = opacities[parents].clamp(max=1 - 1e-6)
-    raw["log_scales"][parents] += scale_of_copies(opacity, number).log()[:, None]
-    logits[parents] = opacity_of_copies(opacity, number).clamp(min=DEAD_OPACITY).logit()
-    for tensor in raw.values():
-        tensor[vacant] = tensor[sources]
-    return torch.cat([parents, vacant])
-
-
-def position_noise(gaussians: Gaussians, rate: float) -> Float[Tensor, "gaussian 3"]:
-    """Draw noise that moves transparent Gaussians along their covariance (3DGS-MCMC, Eq. 8), for a positions' rate."""
-    weights = torch.sigmoid(NOISE_STEEPNESS * (DEAD_OPACITY - gaussians.opacities)) * (NOISE * rate)
-    noise = torch.randn_like(gaussians.means) * weights[:, None]
-    return (gaussians.covariances() @ noise[..., None])[..., 0]

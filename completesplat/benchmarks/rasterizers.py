@@ -16,7 +16,8 @@ from completesplat.commands import quieten
 from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.provenance import machine
 from completesplat.evaluation.scorer import synchronized_time
-from completesplat.evaluation.tables import records_table, show
+from completesplat.evaluation.table_writers import show
+from completesplat.evaluation.tables import records_table
 from completesplat.files import write_json
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, pinhole, pixel_centers, unproject

@@ -19,6 +19,7 @@ from yaml import YAMLError
 from completesplat.commands import jobs, new
 from completesplat.commands.locks import hold_job_lock, one_of_several
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.records import CONFIG
 from completesplat.files import file_refusal
 from completesplat.settings import composition, help
 from completesplat.settings.arguments import SWEEP, for_hydra
@@ -43,7 +44,7 @@ def launch(verb: str, arguments: list[str]) -> None:
     # Lightning starts a further process of the job for each device.
     if arguments and arguments[0].startswith(jobs.PROCESS_OF_JOB):
         return _join_job(verb, arguments[0])
-    if any(flag in arguments for flag in help.FLAGS):
+    if any(flag in arguments for flag in help.HELP_FLAGS):
         return print(help.help_page(verb, arguments))
     if verb == "new":  # its files are the user's, and it has no folder for a job
         return new.run(composition.compose(verb, *arguments))
@@ -104,7 +105,7 @@ def _join_job(verb: str, argument: str) -> None:
     starter, _, out = argument.partition("=")[2].partition(":")
     end_with(int(starter))
     with ended_by_signals():
-        config = OmegaConf.load(Path(out, jobs.CONFIG))
+        config = OmegaConf.load(Path(out, CONFIG))
         assert isinstance(config, DictConfig)
         jobs.start(verb, config, Path(out))
 

@@ -1,15 +1,22 @@
-"""`completesplat data`: make, check, look at, prepare and encode data sets."""
+"""`completesplat data`: check data sets, show their statistics and images, prepare them, and encode them."""
 
 import logging
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import write_json
 from completesplat.quantities import Entries, Positive, Range
 from completesplat.weights import RUN_CHECKPOINT
+
+if TYPE_CHECKING:
+    from completesplat.data.loading.data_module import SceneDataModule
+    from completesplat.data.sequences import PosedSequence, SequenceSource
+    from completesplat.data.tolerance import ErrorTolerance
+else:  # Settings are checked against annotations before torch is imported, which these modules need.
+    SceneDataModule = PosedSequence = SequenceSource = ErrorTolerance = object
 
 logger = logging.getLogger(__name__)
 
@@ -17,7 +24,7 @@ SplitName = Literal["train", "val", "test"]
 SplitNames = Annotated[Sequence[SplitName], Entries(1)]
 
 
-def check(data: Any, splits: SplitNames, workers: Positive | None, out: Path) -> None:
+def check(data: SceneDataModule, splits: SplitNames, workers: Positive | None, out: Path) -> None:
     """Read everything once and write `check.json`.
 
     The exit status is 1 when no sequence is usable.
@@ -25,7 +32,7 @@ def check(data: Any, splits: SplitNames, workers: Positive | None, out: Path) ->
     from completesplat.data.validation import audit
 
     try:
-        sources = {split: data.select_sequences(split, source) for split, source in _sources(data, splits).items()}
+        sources = {split: data.select_sequences(split, source) for split, source in _open_sources(data, splits).items()}
         findings = audit.check(sources, workers, splits_share_sequences=data.splits_share_sequences)
     except DataError as error:  # concerns the data set as a whole
         findings = audit.AuditReport(0, 0, [error], {}, {})
@@ -36,13 +43,13 @@ def check(data: Any, splits: SplitNames, workers: Positive | None, out: Path) ->
         sys.exit(1)
 
 
-def stats(data: Any, splits: SplitNames, out: Path) -> None:
+def stats(data: SceneDataModule, splits: SplitNames, out: Path) -> None:
     """Write `stats.json` and `stats.png`, and print the numbers."""
     from rich.progress import track
 
     from completesplat.evaluation.studies.statistics import plot_statistics, show_statistics, statistics
 
-    sources = _sources(data, splits)
+    sources = _open_sources(data, splits)
     tracked_names = {split: track(source.names, f"reading cameras of {split}") for split, source in sources.items()}
     results = statistics({split: _readable(sources[split], names) for split, names in tracked_names.items()})
     write_json(out / "stats.json", results)
@@ -50,11 +57,13 @@ def stats(data: Any, splits: SplitNames, out: Path) -> None:
     show_statistics(results)
 
 
-def show(data: Any, split: SplitName, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path) -> None:
+def show(
+    data: SceneDataModule, split: SplitName, scenes: Annotated[int, Range(1, 8)], images: Positive, out: Path
+) -> None:
     """Write `show.png`: images of some sequences, evenly spread over a split."""
     from completesplat.evaluation.studies.contact_sheet import write_contact_sheet
 
-    source = _sources(data, [split])[split]
+    source = _open_sources(data, [split])[split]
     names = source.names
     chosen = [names[i * len(names) // scenes] for i in range(scenes)] if len(names) > scenes else names
     sequences = list(_readable(source, chosen))
@@ -65,7 +74,7 @@ def show(data: Any, split: SplitName, scenes: Annotated[int, Range(1, 8)], image
 
 
 def prepare(
-    data: Any,
+    data: SceneDataModule,
     splits: SplitNames,
     out: Path,
     codec: str,
@@ -86,7 +95,7 @@ def prepare(
     if Path(data.root).resolve().is_relative_to(out.resolve()):
         raise CompleteSplatError(f"out={out}: the data to be prepared lie there; choose another out=DIR")
     tolerance = ErrorTolerance(on_bad, max_bad_fraction)
-    sources = _sources(data, splits, tolerance)
+    sources = _open_sources(data, splits, tolerance)
     settings = data.packed_settings()
     preparation.prepare(sources, settings, out, codec, sequences_per_shard, workers, tolerance)
 
@@ -133,10 +142,12 @@ def latents(
     logger.info("standard deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 
-def _sources(data: Any, splits: Sequence[str], tolerance: Any = None) -> dict[str, Any]:
-    """Return the sources of the splits that exist.
+def _open_sources(
+    data: SceneDataModule, splits: Sequence[str], tolerance: ErrorTolerance | None = None
+) -> dict[str, SequenceSource]:
+    """Prepare the data, give them the tolerance of errors in files, and return the sources of the splits that exist.
 
-    By default each collects the errors in its files.
+    By default all errors are tolerated, and each source collects those in its files.
     """
     from completesplat.data.tolerance import SKIP_ALL
 
@@ -156,7 +167,8 @@ def _sources(data: Any, splits: Sequence[str], tolerance: Any = None) -> dict[st
     return sources
 
 
-def _readable(source: Any, names: Iterable[str]) -> Iterator[Any]:
+def _readable(source: SequenceSource, names: Iterable[str]) -> Iterator[PosedSequence]:
+    """Yield the sequences that can be read, and name the others."""
     for name in names:
         try:
             yield source.read(name)

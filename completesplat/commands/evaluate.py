@@ -15,7 +15,6 @@ from rich.console import Console
 from rich.progress import track
 
 from completesplat.commands import quieten
-from completesplat.commands.jobs import CONFIG, METRICS
 from completesplat.commands.trained import GivenScenes, RunCheckpoint, trained_model
 from completesplat.evaluation.mode_benchmark import (
     HiddenModesEvaluation,
@@ -25,13 +24,14 @@ from completesplat.evaluation.mode_benchmark import (
 )
 from completesplat.evaluation.mode_tables import mode_results_table
 from completesplat.evaluation.protocol import Config, describe_test, scored_data, set_metrics
-from completesplat.evaluation.records import MODEL, PROTOCOL, read_record
+from completesplat.evaluation.records import CONFIG, MODEL, PROTOCOL, SCORES, read_record
 from completesplat.evaluation.score_tables import evaluation_table
-from completesplat.evaluation.tables import show
-from completesplat.files import counted, printable, write_json
+from completesplat.evaluation.table_writers import show
+from completesplat.files import write_json
 from completesplat.settings.schema import EvaluationSettings, TestSettings
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.stopping import stopped_together
+from completesplat.wording import counted, printable
 
 METRIC = re.compile(r"\+*evaluation\.metrics\.(\w+)")
 
@@ -70,7 +70,7 @@ def run(
             return
         described = describe_test(evaluation, module, data, scores, out) | tested.facts()
         results = {PROTOCOL: described, **scores}
-        write_json(out / METRICS, results)
+        write_json(out / SCORES, results)
     label = module.method if isinstance(tested, GivenScenes) else MODEL
     show(evaluation_table(results, label), width=160)
     for name, reason in described["missing"].items():

@@ -5,8 +5,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import get_class
-from hydra.utils import instantiate as build
+import hydra.utils
 from lightning import Trainer, seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import WeightAveraging
@@ -15,24 +14,24 @@ from omegaconf import DictConfig, OmegaConf
 
 from completesplat.commands import quieten
 from completesplat.commands.evaluate import built_parts
-from completesplat.commands.jobs import LAST, METRICS
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.evaluation.protocol import describe_test, scored_data, set_metrics
 from completesplat.evaluation.provenance import checkpoint_facts
-from completesplat.evaluation.records import read_record
+from completesplat.evaluation.records import SCORES, read_record
 from completesplat.evaluation.score_tables import evaluation_table
 from completesplat.evaluation.scorer import Scorer
-from completesplat.evaluation.tables import show
-from completesplat.files import counted, write_json
+from completesplat.evaluation.table_writers import show
+from completesplat.files import write_json
 from completesplat.settings import checks
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
-from completesplat.weights import RUN_WEIGHTS
+from completesplat.weights import RUN_CHECKPOINT, RUN_WEIGHTS
 from completesplat.weights.checkpoint_reading import check_whole
+from completesplat.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -52,8 +51,8 @@ def instantiate(config: DictConfig) -> tuple[SceneDataModule, Scorer]:
     checks.check_parts(config)
     checks.check_image_size(config)
     checks.check_optimizer(config.optimizer)
-    data = build(config.data, _convert_="all")
-    module = build(config.model, _convert_="all")
+    data = hydra.utils.instantiate(config.data, _convert_="all")
+    module = hydra.utils.instantiate(config.model, _convert_="all")
     if config.test:
         set_metrics(module, config.evaluation)
     if isinstance(module, Stage):
@@ -76,7 +75,7 @@ def run(config: DictConfig, out: Path) -> None:
     tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
     callbacks = built_parts(config.get("callbacks"))
     loggers = built_parts(config.get("logger"))
-    trainer: Trainer = build(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
+    trainer: Trainer = hydra.utils.instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if tested is not None:
         tested.check_test()
@@ -92,7 +91,8 @@ def run(config: DictConfig, out: Path) -> None:
         for run_logger in loggers:  # a run shorter than the logging interval has its figures too
             run_logger.log_metrics(metrics, step=trainer.global_step)
             run_logger.save()
-        scores = module.test_results() if tested is not None else None  # all processes gather them
+        # Every process calls this, because per-scene fits gather their empty pixels in it.
+        scores = module.test_results() if tested is not None else None
         if not trainer.is_global_zero:
             return
         results: dict[str, object] = {"steps": trainer.global_step, "data.batch_per_process": share, **metrics}
@@ -103,7 +103,7 @@ def run(config: DictConfig, out: Path) -> None:
             results["upper_bound"] = module.upper_bound
             results["test"] = test
             show(evaluation_table(test), width=160)
-        write_json(out / METRICS, results)  # the last file, because it means that the job is done
+        write_json(out / SCORES, results)  # the last file, because it means that the job is done
 
 
 def _print_layers(module: Scorer) -> None:
@@ -140,7 +140,7 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
     if config.ckpt_path is None:
         return None
     if config.ckpt_path == "last":
-        newest = newest_whole(out / LAST)
+        newest = newest_whole(out / RUN_CHECKPOINT)
         if newest is None:
             logger.info("ckpt_path=last: there is no checkpoint in %s, so the training begins", out)
             return None
@@ -148,7 +148,7 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
     else:
         path = Path(config.ckpt_path)
     if path.is_dir():
-        path = path / LAST
+        path = path / RUN_CHECKPOINT
     if not path.is_file():
         raise WeightsError(f"{path}: no such checkpoint")
     check_whole(path)  # now, because data may be made first
@@ -157,12 +157,16 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
 
 
 def refuse_without_effect(config: DictConfig, out: Path) -> None:
-    """Raise CompleteSplatError for a setting of a command, not of a sweep, that its model does not use."""
-    stage = get_class(config.model._target_)
+    """Raise CompleteSplatError for a setting that the user gives to a single run, but that its model does not use.
+
+    The settings of a sweep are not refused, because they may be meant for another of its models.
+    """
+    stage = hydra.utils.get_class(config.model._target_)
     record = read_record(out)
     unused: tuple[str, ...] = getattr(stage, "unused_settings", ())
     if record.get("sweep") is not None:
         return
+    # A model that does not use the end of the training (`trainer.max_steps` and others) does not train.
     if "trainer.max_" in unused and not config.test:
         raise CompleteSplatError(f"test=false: {stage.__name__} only fits the scenes of a test; leave it out")
     for setting in record.get("overrides", []):
@@ -188,8 +192,8 @@ def _logged(trainer: Trainer) -> dict[str, float]:
 
 def _test(config: DictConfig, module: Scorer, data: SceneDataModule) -> dict[str, float]:
     """Score as `completesplat test` does, in the protocol's precision, and return all logged figures."""
-    progress = build(OmegaConf.select(config, "callbacks.progress"), _convert_="all")
-    trainer = build(
+    progress = hydra.utils.instantiate(OmegaConf.select(config, "callbacks.progress"), _convert_="all")
+    trainer = hydra.utils.instantiate(
         config.trainer,
         precision=config.evaluation.precision,
         callbacks=[] if progress is None else [progress],
@@ -203,7 +207,7 @@ def _test(config: DictConfig, module: Scorer, data: SceneDataModule) -> dict[str
 
 def _facts(trainer: Trainer, out: Path) -> dict[str, Any]:
     """Return facts of the scored weights: those of the last checkpoint, if one was written."""
-    facts = checkpoint_facts(out / LAST) if (out / LAST).is_file() else {}
+    facts = checkpoint_facts(out / RUN_CHECKPOINT) if (out / RUN_CHECKPOINT).is_file() else {}
     if facts.get("checkpoint", {}).get("step") == trainer.global_step:
         return facts
     callbacks: list[object] = trainer.callbacks  # type: ignore[attr-defined]

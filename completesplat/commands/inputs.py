@@ -8,8 +8,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.files import printable
 from completesplat.weights import AUTO, check_name
+from completesplat.wording import printable
 
 SUFFIXES = (
     ".jpg",
@@ -34,7 +34,8 @@ def check_inputs(verb: str, config: DictConfig) -> None:
     """Raise CompleteSplatError if an image, weights or a checkpoint are not there, or `test` is given no model."""
     if verb == "predict":
         find_images(config.image)
-    if verb in ("predict", "view") and config.weights != AUTO and ":" not in config.weights:  # published weights' names
+    # `auto` chooses weights when the image is read, and names of published weights (with a colon) are checked later.
+    if verb in ("predict", "view") and config.weights != AUTO and ":" not in config.weights:
         check_name(config.weights)
     if verb == "test":
         check_one_model(config.ckpt, config.weights, config.scenes)
@@ -57,6 +58,7 @@ def find_images(image: object) -> list[Path]:
     entries = entries_of(image)
     if not entries:
         raise CompleteSplatError("image=[]: name at least one image")
+    # Hydra reads a file name of digits as a whole number.
     if any(entry == "" or isinstance(entry, bool) or not isinstance(entry, str | int) for entry in entries):
         raise CompleteSplatError(f"image={image}: give an image, a folder, or a list of them")
     images = [path for entry in entries for path in _images_of(Path(str(entry)))]

@@ -15,7 +15,8 @@ from completesplat.settings.options import conf_folder
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
 KINDS = ("loss", "metric", "rasterizer", "encoder", "callback", "dataset", "ablation", "experiment")
-CHOICE = re.compile(r"completesplat \w+[\w ]*( [+\w.]+=[\w.]*\w)+")
+# Command in a template that uses the new part: `completesplat VERB WORDS KEY=VALUE ...`.
+USE = re.compile(r"completesplat \w+[\w ]*( [+\w.]+=[\w.]*\w)+")
 FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)  # line of a template that names the file which follows
 
 
@@ -31,10 +32,10 @@ def run(config: DictConfig) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, text)
         print(path)
-    choice = next(CHOICE.finditer("".join(files.values())))[0]
+    first_use = next(USE.finditer("".join(files.values())))[0]
     needed = "" if find_spec("pytest") else " (needs pip install pytest)"
     print("next:", shlex.join([sys.executable, "-m", "pytest", f"test_{kind}_{name}.py"]) + needed)
-    print("then:", choice)
+    print("then:", first_use)
 
 
 def new_files(kind: str, name: str) -> dict[Path, str]:

@@ -22,7 +22,8 @@ from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.provenance import machine
 from completesplat.evaluation.scorer import synchronized_time
-from completesplat.evaluation.tables import records_table, show
+from completesplat.evaluation.table_writers import show
+from completesplat.evaluation.tables import records_table
 from completesplat.files import write_json
 from completesplat.scene import Batch
 from completesplat.settings.checks import check_image_size, check_optimizer, remove_start_weights

@@ -28,7 +28,6 @@ from completesplat.export.prediction import write_prediction
 from completesplat.export.progress import PhotoProgress
 from completesplat.export.scene_files import OutputFiles
 from completesplat.export.splat_transform import find_splat_transform
-from completesplat.files import counted, folder_names, printable, safe_name
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.photo.reading import Photograph
@@ -38,6 +37,7 @@ from completesplat.scene_model import SceneModel
 from completesplat.settings.checks import REMOVE
 from completesplat.settings.composition import has_bfloat16
 from completesplat.weights import sha256_of
+from completesplat.wording import counted, folder_names, printable, safe_name
 
 logger = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.paper_tables import published_tables
 from completesplat.evaluation.records import find_results
 from completesplat.evaluation.sweep_summary import write_summary
-from completesplat.evaluation.tables import show, write_tables
+from completesplat.evaluation.table_writers import show, write_tables
 
 logger = logging.getLogger(__name__)
 

@@ -19,12 +19,14 @@ from completesplat.evaluation.studies.controls import OnProgress, controls_rows,
 from completesplat.evaluation.studies.depth import depth_rows, depth_strips
 from completesplat.evaluation.studies.ladder import ladder_rows
 from completesplat.evaluation.studies.samples import SampleRenderer, first_scenes
-from completesplat.evaluation.tables import records_table, show
+from completesplat.evaluation.table_writers import show
+from completesplat.evaluation.tables import records_table
 from completesplat.export.images import image_sheet, write_png
-from completesplat.files import counted, write_json
+from completesplat.files import write_json
 from completesplat.quantities import Entries, Positive, Range, Share
 from completesplat.scene import SceneBatch
 from completesplat.settings.schema import ModelSettings
+from completesplat.wording import counted
 
 Weights = Annotated[Sequence[Share], Entries(1)]
 

@@ -10,9 +10,10 @@ from omegaconf import DictConfig
 
 from completesplat.commands.locks import is_running
 from completesplat.errors import CompleteSplatError, needing
-from completesplat.files import SPLATS, printable
+from completesplat.quantities import SPLATS
 from completesplat.settings.checks import REMOVE, check_parts
 from completesplat.weights import AUTO, CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE, shipped
+from completesplat.wording import printable
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 WEIGHT_SUFFIXES = (".ckpt", ".pth", ".safetensors")

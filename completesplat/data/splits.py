@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 from completesplat.data.sequences import first_names
 from completesplat.errors import DataError
-from completesplat.files import counted
+from completesplat.wording import counted
 
 SPLITS = ("train", "val", "test")
-FEWEST_OBJECTS = 3  # one for each split
+FEWEST_SEQUENCES = 3  # one for each split
 
 ListedFrames = dict[str, set[tuple[str, int]]]
 """(sequence name, frame number) of each split."""
@@ -35,13 +35,14 @@ def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Lis
         DataError: there are too few sequences for three splits.
     """
     tests_all = rule.test_fraction >= 1
-    if len(frames) < FEWEST_OBJECTS and not tests_all:
-        objects = counted(len(frames), "object")
-        raise DataError(f"{objects} cannot be split into train, val and test; write a list (data.splits=FILE)")
-    least = 0 if tests_all else 1  # in training and in validation
-    rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.split_seed, 2 * least)
+    if len(frames) < FEWEST_SEQUENCES and not tests_all:
+        sequences = counted(len(frames), "sequence")
+        raise DataError(f"{sequences} cannot be split into train, val and test; write a list (data.splits=FILE)")
+    least_train = 0 if tests_all else 1
+    least_val = 0 if tests_all else 1
+    rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.split_seed, least_train + least_val)
     # The hashes of the remaining names lie above the test fraction, so validation gets the next interval.
-    train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.split_seed, least)
+    train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.split_seed, least_train)
     splits: ListedFrames = {}
     for split, names in zip(SPLITS, (train, val, test), strict=True):
         splits[split] = {(name, number) for name in names for number in frames[name]}
@@ -52,7 +53,8 @@ def split_by_hash(names: Sequence[str], fraction: float, seed: int, least: int =
     """Return training and held-out sequences in the order of `names`.
 
     A sequence's side depends only on its name and the seed, so it does not change when sequences are added. If no
-    sequence would be held out, the one with the smallest hash is. The `least` ones with the largest hashes train.
+    sequence would be held out, the one with the smallest hash is. The `least` ones with the largest hashes are training
+    sequences in any case.
     """
     position = {name: _position(name, seed) for name in names}
     below = sum(place < fraction for place in position.values())

@@ -42,8 +42,8 @@ def target(scheduler: ConfigMixin, latent: Latents, noise: Latents, timestep: In
     """
     kind = prediction_type(scheduler)
     if kind == "v_prediction":
-        signal, share = signal_and_noise(scheduler, timestep, latent)
-        return signal * noise - share * latent
+        signal_factor, noise_factor = signal_and_noise(scheduler, timestep, latent)
+        return signal_factor * noise - noise_factor * latent
     return {"epsilon": noise, "sample": latent, "flow": noise - latent}[kind]
 
 
@@ -54,12 +54,12 @@ def clean_estimate(scheduler: ConfigMixin, noisy: Latents, predicted: Latents, t
         CompleteSplatError: as `prediction_type`.
     """
     kind = prediction_type(scheduler)
-    signal, noise = signal_and_noise(scheduler, timestep, noisy)
+    signal_factor, noise_factor = signal_and_noise(scheduler, timestep, noisy)
     if kind == "epsilon":
-        return (noisy - noise * predicted) / signal
+        return (noisy - noise_factor * predicted) / signal_factor
     if kind == "v_prediction":
-        return signal * noisy - noise * predicted
-    return noisy - noise * predicted if kind == "flow" else predicted
+        return signal_factor * noisy - noise_factor * predicted
+    return noisy - noise_factor * predicted if kind == "flow" else predicted
 
 
 def is_flow(scheduler: object) -> bool:

@@ -20,10 +20,11 @@ from completesplat.evaluation.records import MODEL
 from completesplat.evaluation.scorer import Scorer
 from completesplat.evaluation.studies.samples import mean_over_scenes
 from completesplat.export.images import Sheet, SheetCell, image_sheet, write_png
-from completesplat.files import counted, write_json
+from completesplat.files import write_json
 from completesplat.metrics.mode_coverage import REJECTED, classify, draw_modes, mean_of, scores
 from completesplat.metrics.proper_scores import energy_score
 from completesplat.quantities import Natural, Positive, Range
+from completesplat.wording import counted
 
 
 class HiddenModesEvaluation(TypedDict):

@@ -14,7 +14,7 @@ from completesplat.evaluation.mode_tables import mode_tables
 from completesplat.evaluation.records import BEST_BY_METRIC, BEST_OF_K, HOW, MODES, SCORES, RunTree
 from completesplat.evaluation.sweep_jobs import Job, collect
 from completesplat.evaluation.sweep_summary import sweep_rows
-from completesplat.files import printable
+from completesplat.wording import printable
 
 FILE = Path(__file__).with_suffix(".yaml")
 PAPER = "Liao et al., Complete Gaussian Splats from a Single Image with Denoising Diffusion Models, 3DV 2026"

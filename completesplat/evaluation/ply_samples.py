@@ -13,11 +13,11 @@ from torch.nn.functional import pad
 from completesplat.errors import CompleteSplatError, PlyError
 from completesplat.evaluation.scorer import Scorer
 from completesplat.export.reading import read_gaussians
-from completesplat.files import by_numbers, safe_name
 from completesplat.gaussians import Gaussians
 from completesplat.scene import SceneBatch, Views
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
+from completesplat.wording import by_numbers, safe_name
 
 FILES = "sample_*.ply"
 LEAST_IN_FRONT = 0.1  # of a scene's Gaussians: with less, the axes are wrong

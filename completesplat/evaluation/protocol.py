@@ -40,7 +40,7 @@ PACKAGE_METRICS: dict[str, dict[str, object]] = {
 
 
 def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
-    """Return the data of a run's config, with the protocol's changes.
+    """Return the data of a run's config, with the protocol's changes, which are made in `run_config.data`, too.
 
     If the protocol scores at a larger size than the model's, the model still sees images of its size.
 
@@ -130,7 +130,7 @@ def metric_settings(config: Mapping[str, object], metric_format: MetricFormat) -
 def sampler_settings(module: Scorer) -> dict[str, object]:
     """Return the settings of the sampler, which are None for deterministic models and for scenes from files."""
     controls = ("skip_weight", "guidance_weight", "color_fits")
-    model = getattr(module, "completesplat", None)
+    model = getattr(module, "completesplat", None)  # modules that draw samples hold their model under this name
     if model is None:
         return dict.fromkeys(("sampler", "steps", *controls))
     described: dict[str, object] = {"sampler": type(model.sampler.scheduler).__name__, "steps": model.sampler.steps}

@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
 from completesplat.errors import CompleteSplatError
-from completesplat.files import printable
+from completesplat.wording import printable
 
 SCORES = "metrics.json"
 MODES = "hidden_modes.json"

@@ -34,8 +34,8 @@ from completesplat.evaluation.tables import (
     score_heading,
     shown_scores,
 )
-from completesplat.files import counted
 from completesplat.metrics import METRIC_FORMATS, MetricFormat
+from completesplat.wording import counted
 
 OURS = "completesplat: "  # not "ours", because the paper gives its rows that name
 COST = ("inference", "rendering")

@@ -83,13 +83,16 @@ class Scorer(LightningModule):
         self.background = background
         self.evaluation = SceneScores()
         self.seconds: dict[str, list[float]] = defaultdict(list)
-        """Seconds for each scene, by the name of the work."""
+        """Seconds by the name of the work: `inference` of a scene with all its samples, `rendering` of one sample."""
         # This is Lightning's name. One of several processes may have no test scene.
         self.allow_zero_length_dataloader_with_multiple_devices = True
 
     @abstractmethod
     def reconstruct(self, scenes: SceneBatch, seed: int) -> Gaussians:
-        """Return one set of Gaussians [batch] for each reference image, in its camera's frame."""
+        """Return one set of Gaussians [batch] for each reference image, in its camera's frame.
+
+        A model that draws samples draws one.
+        """
 
     def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int, batch: int | None = None) -> Gaussians:
         """Return `samples` sets for each image and its seed [batch * samples], but one each if nothing is drawn."""
@@ -158,11 +161,11 @@ class Scorer(LightningModule):
                 self.evaluation.missing["depth"] = reason
         self.scene_scored(name, samples, cameras, images, truth)
 
-    def timed(self, name: str, work: Callable[[], Result], scenes: int) -> Result:
-        """Do the work for this number of scenes, and note its seconds for each."""
+    def timed(self, name: str, work: Callable[[], Result], count: int) -> Result:
+        """Do the work, which is for `count` scenes or samples, and note the seconds for one of them."""
         start = synchronized_time()
         result = work()
-        self.seconds[name].append((synchronized_time() - start) / scenes)
+        self.seconds[name].append((synchronized_time() - start) / count)
         return result
 
     def scene_scored(self, name: str, gaussians: Gaussians, cameras: Cameras, images: Renders, truth: Views) -> None:
@@ -194,7 +197,7 @@ class Scorer(LightningModule):
                 self.log_dict({f"{prefix}/{region}/{view}/{name}": x for name, x in of_view.items() if x is not None})
 
     def test_results(self) -> dict[str, dict[str, Any]]:
-        """Return `SceneScores.results` of the last test, with the model's seconds for a scene."""
+        """Return `SceneScores.results` of the last test, with the medians of the model's `seconds`."""
         results = self.evaluation.results()
         model = results[MODEL]
         model["upper_bound"] = self.upper_bound

@@ -12,12 +12,12 @@ from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 
-from completesplat.evaluation import tables
+from completesplat.evaluation import table_writers, tables
 from completesplat.evaluation.provenance import machine, shell_command
 from completesplat.evaluation.records import MODEL, UPPER_BOUND, Record
 from completesplat.evaluation.score_tables import Entry, formats_of, group_by_protocol, score_rows
 from completesplat.evaluation.sweep_jobs import SEED, Job, collect
-from completesplat.files import printable
+from completesplat.wording import printable
 
 # Hydra imports this file for every run, even to print the help. So torch and rich are imported when a job has ended.
 log = logging.getLogger(__name__)
@@ -52,7 +52,7 @@ def _summarize(config: Any, last: bool) -> None:
         folder = Path(config.hydra.sweep.dir)
         table = write_summary(folder)
         if last:
-            tables.show(table, width=160)
+            table_writers.show(table, width=160)
             print(folder / "summary.md")
     except Exception as error:  # no error of a summary may stop the remaining jobs
         log.warning("no summary of the sweep: %s: %s", type(error).__name__, error)
@@ -178,6 +178,6 @@ def write_summary(folder: Path, *parts: Path) -> tables.Table:
         for name in names:
             line += [row.scores.get(name), row.deviations.get(name)]
         lines.append(line)
-    tables.write_csv(folder / "summary.csv", header, lines)
-    tables.write_documents([table], folder / "summary")
+    table_writers.write_csv(folder / "summary.csv", header, lines)
+    table_writers.write_documents([table], folder / "summary")
     return table

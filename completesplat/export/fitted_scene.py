@@ -11,7 +11,7 @@ from completesplat.export.images import SheetCell, image_sheet, strip, write_png
 from completesplat.export.placed_scene import PlacedScene
 from completesplat.export.ply import write_ply
 from completesplat.export.video import Frames
-from completesplat.files import printable
+from completesplat.wording import printable
 
 logger = logging.getLogger(__name__)
 

@@ -20,8 +20,8 @@ from jaxtyping import Float, UInt8
 
 from completesplat.errors import PlyError
 from completesplat.export.cleaning import bounded, cleaned
-from completesplat.export.formats import RECORD
 from completesplat.export.ply import read_ply
+from completesplat.export.splat import RECORD
 from completesplat.export.splat_transform import PROGRAM, convert
 from completesplat.gaussians import DirectionalGaussians, Gaussians
 from completesplat.geometry.harmonics import LARGEST_DEGREE, SH_C0, coefficients, rotated

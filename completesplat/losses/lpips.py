@@ -140,15 +140,19 @@ def load_heads() -> list[Head]:
 class PerceptualTerm:
     """Loss term: a `PerceptualDistance`, averaged over the views, always in float32.
 
-    The network is not part of the trained module, so no checkpoint holds it.
+    The network is not part of the trained module, so no checkpoint holds it. With `views`, so many views are drawn for
+    each batch, the same for all of its scenes, and the others do not count.
     """
+
+    views: int | None = None
 
     distance: PerceptualDistance
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        chosen = slice(None) if self.views is None else torch.randperm(truth.images.shape[1])[: self.views]
         with torch.autocast(prediction.images.device.type, enabled=False):
-            predicted = prediction.images.flatten(0, 1).float()
-            true = truth.images.flatten(0, 1).float()
+            predicted = prediction.images[:, chosen].flatten(0, 1).float()
+            true = truth.images[:, chosen].flatten(0, 1).float()
             return torch.mean(self.distance(predicted, true))
 
 

@@ -19,9 +19,13 @@ from completesplat.tensors import TensorDataclass
 
 @dataclass(frozen=True)
 class Prediction(TensorDataclass):
-    """Rendered images of the reference and all targets (sRGB), their Gaussians, and the posterior if any."""
+    """Rendered images of the reference and all targets (sRGB), their Gaussians, and the posterior if any.
+
+    `alphas` are the opacities of the rendered pixels: what lies behind the Gaussians shows with the rest.
+    """
 
     images: Float[Tensor, "batch view 3 height width"]
+    alphas: Float[Tensor, "batch view 1 height width"]
     gaussians: Gaussians
     posterior: Posterior | None
 
@@ -95,6 +99,17 @@ class StructuralDissimilarity:
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
         return 1 - structural_similarity(prediction.images.flatten(0, 1), truth.images.flatten(0, 1)).mean()
+
+
+class Translucency:
+    """Mean of 1 - opacity over what the masks show, so that objects are solid from all sides.
+
+    Pixels outside of the masks do not count, because a background may be painted by Gaussians, too.
+    """
+
+    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        missing = (1 - prediction.alphas) * truth.masks
+        return missing.sum() / truth.masks.sum().clamp(min=1)
 
 
 class KullbackLeibler:

@@ -13,12 +13,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.errors import ImageError, WeightsError
-from completesplat.files import printable
 from completesplat.photo.features import distance_to_training
 from completesplat.photo.reading import Framing, ImageLike, read_square
 from completesplat.weights import CONFIG_FILE, read_small, shipped
+from completesplat.wording import printable
 
-LOOKED_AT = 8  # images of many that weights are chosen by
+LOOKED_AT = 8  # at most this many of the images are examined
 SAME_GREY = 0.1  # largest difference of a border's pixel from the background
 BACKGROUND_SHARE = 0.5  # of the border's pixels, at least, if an object lies on the background
 
@@ -83,8 +83,10 @@ def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str
             continue
         distance = distance_to_training(read_square(square, Framing(config["image_size"])).image, training)
         if distance is not None:
-            deviations = torch.tensor(training["picture_std"])
-            density = -deviations.log().sum().item() - len(deviations) * distance**2 / 2
+            standard_deviations = torch.tensor(training["picture_std"])
+            # Log density of independent normal features, without its constant. `distance` squared is the mean over the
+            # features of their squared distances from the mean, in standard deviations.
+            density = -standard_deviations.log().sum().item() - len(standard_deviations) * distance**2 / 2
             distances[name] = distance
             logarithms.append(density + training.get("log_odds", 0.0))
     probabilities = torch.tensor(logarithms, dtype=torch.float64).softmax(0).tolist()
@@ -93,7 +95,11 @@ def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str
 
 
 def shipped_configs() -> dict[str, Any]:
-    """Return the configs of the weights in the package by name, those for photos of anything first."""
+    """Return the configs of the weights in the package by name, those for photos of anything first.
+
+    Only specialised weights store `log_odds`, how likely a photo is of their kind before it is seen. The weights for
+    photos of anything are what the odds compare them with, so they store none.
+    """
     configs = {name: json.loads(read_small(folder / CONFIG_FILE)) for name, folder in shipped().items()}
     return dict(sorted(configs.items(), key=lambda item: "log_odds" in item[1]["training"]))
 

@@ -12,8 +12,8 @@ import numpy as np
 from PIL import Image, ImageFile, UnidentifiedImageError
 
 from completesplat.errors import BadImage, ImageError, MissingFile
-from completesplat.files import by_numbers
 from completesplat.photo.exif import ORIENTATION, TRANSPOSITIONS, Tags, read_exif
+from completesplat.wording import by_numbers
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 HEIC = (".heic", ".heif")

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from completesplat.files import printable
 from completesplat.photo.reading import Framing, ImageLike, Photograph, read_square
 from completesplat.photo.visible import visible_part
 from completesplat.photo.warnings import photo_warnings
+from completesplat.wording import printable
 
 logger = logging.getLogger(__name__)
 

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from hydra.core.override_parser.types import Quote, QuotedString
 
 from completesplat.errors import CompleteSplatError
-from completesplat.files import SHORT, printable
 from completesplat.settings.options import TASKS
+from completesplat.wording import SHORT, printable
 
 WORDS = {"predict": ("image",), "view": ("path",), "new": ("kind", "name"), "data import": ("folder",)}
 """By verb, or verb and task, the settings whose values are given as words without `=`."""
 SWEEP = ("-m", "--multirun")
-FLAGS = (*SWEEP, "--resolve")
+HYDRA_FLAGS = (*SWEEP, "--resolve")
 FLAGS_WITH_VALUE = ("--cfg", "--config-dir")
 SHOWN_CONFIGS = ("job", "hydra", "all")
 
@@ -57,7 +57,7 @@ def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
         name, equals, value = argument.partition("=")
         if not argument.startswith("-"):
             others.append(argument)
-        elif argument in FLAGS:
+        elif argument in HYDRA_FLAGS:
             flags.append(argument)
         elif name in FLAGS_WITH_VALUE:
             flags.append(f"{name}={value if equals else next(remaining, '')}")

@@ -7,7 +7,7 @@ from typing import Any
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.options import LOADER, TASKS, conf_folder, conf_text, did_you_mean, options
 
-FLAGS = ("--help", "-h")
+HELP_FLAGS = ("--help", "-h")
 NO_SETTINGS = ("defaults", "verb", "description", "hydra", "task")
 """Keys of a file that are no settings of its verb."""
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 from torch.optim import Adam
 
-from completesplat.baselines import fitting
+from completesplat.baselines import densification, fitting
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.sequences import PosedSequence, first_names
 from completesplat.errors import CompleteSplatError
@@ -170,10 +170,10 @@ class CaptureFit(Stage):
         (optimizer,) = self.trainer.optimizers
         count = int(self.count)
         rate = optimizer.param_groups[0]["lr"] / settings.position_rate
-        self.raw["means"][:count] += fitting.position_noise(self.gaussians(), rate)
+        self.raw["means"][:count] += densification.position_noise(self.gaussians(), rate)
         if step % settings.refine_every == 0 and step < REFINED_SHARE * total:
             grown = max(count, min(settings.most, int(count * (1 + settings.growth))))
-            changed = fitting.relocate(dict(self.raw.items()), count, grown)
+            changed = densification.relocate(dict(self.raw.items()), count, grown)
             for state in optimizer.state.values():
                 for key in ("exp_avg", "exp_avg_sq"):
                     state[key][changed] = 0
@@ -183,8 +183,10 @@ class CaptureFit(Stage):
         gaussians = self.gaussians()
         views = self.in_world(scenes, "train")
         settings = self.fitting
-        images = self.render(gaussians[None], views.cameras)
-        total, terms = self.loss(Prediction(images, gaussians[None], None), views, self.global_step)
+        with torch.autocast(self.device.type, enabled=False):
+            rendering = self.rasterizer(gaussians[None], views.cameras)
+        prediction = Prediction(rendering.over(self.background), rendering.alpha, gaussians[None], None)
+        total, terms = self.loss(prediction, views, self.global_step)
         total = total + settings.opacity_weight * gaussians.opacities.mean()
         total = total + settings.scale_weight * gaussians.scales.mean()
         figures = {f"train/{name}": value for name, value in terms.items()}

@@ -26,9 +26,9 @@ from completesplat.data.packed.manifest import MANIFEST
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.files import counted
 from completesplat.scene import SceneBatch
 from completesplat.signals import leave_to_parent
+from completesplat.wording import counted
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 Moments = Float[np.ndarray, "row channel _ _"]

@@ -51,6 +51,7 @@ class MetricsFile(ExperimentWriter):
         super().__init__(log_dir)
         self.path = Path(self.metrics_file_path)
         self.has_header = False  # written by this process
+        # Step of the checkpoint that the run goes on from, which `Checkpoints` sets. None: there is none.
         self.goes_on_from: int | None = None
 
     def _check_log_dir_exists(self) -> None:
@@ -137,7 +138,7 @@ class WandbRun(WandbLogger):
         if self._experiment is None:
             run = self._begin()
             self._experiment = run
-            write_text(self.folder / "wandb_id", f"{run.id}\n")  # a sweep's agent sets another one (WANDB_RUN_ID)
+            write_text(self.folder / "wandb_id", f"{run.id}\n")  # not always ours: a sweep's agent sets WANDB_RUN_ID
             run.define_metric(AXIS)
             run.define_metric("*", step_metric=AXIS, step_sync=True)
         return self._experiment

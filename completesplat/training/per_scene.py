@@ -22,7 +22,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.scorer import Renders, Scorer
 from completesplat.export.fitted_scene import FittedViews, write_fitted_scene
 from completesplat.export.placed_scene import PlacedScene
-from completesplat.files import counted, make_folder, safe_name, write_bytes
+from completesplat.files import make_folder, write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.rotations import normalize_quaternion
@@ -32,6 +32,7 @@ from completesplat.scene import SceneBatch, Views
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import stack
 from completesplat.training.stage import Stage
+from completesplat.wording import counted, safe_name
 
 logger = logging.getLogger(__name__)
 

@@ -21,15 +21,17 @@ from completesplat.export.images import to_pixels
 from completesplat.export.prediction import PHOTO_FILE
 from completesplat.export.splat_transform import PageView
 from completesplat.export.video import orbit_views, render_views, write_video
-from completesplat.files import SPLATS, printable, write_text
+from completesplat.files import write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit
 from completesplat.photo.files import open_image, refused_as_bad
+from completesplat.quantities import SPLATS
 from completesplat.rasterizers import Rasterizer
 from completesplat.viewer import panel
 from completesplat.viewer.access import GuardedServer, show_status, stop_server, with_head
 from completesplat.viewer.sample import Sample, read_scene
 from completesplat.viewer.splat_view import SplatView
+from completesplat.wording import printable
 
 Task = Callable[[], None]
 

@@ -14,9 +14,9 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from completesplat.diffusion.sampling import Sampler
-from completesplat.files import SPLATS
 from completesplat.generator import CompleteSplat
 from completesplat.photo.saving import image_bytes
+from completesplat.quantities import SPLATS
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.sample import MOST_LAYERS
 

@@ -15,9 +15,9 @@ from completesplat.errors import CompleteSplatError, errors_at
 from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.description import SCENE_FILE, UP, described_camera, described_up, is_described
 from completesplat.export.reading import read_gaussians
-from completesplat.files import by_numbers
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
+from completesplat.wording import by_numbers
 
 NEWEST_FILE = "scenes.json"
 MOST_LAYERS = 16

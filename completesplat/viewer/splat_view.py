@@ -13,8 +13,8 @@ import viser
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.export.formats import round_to_uint8
 from completesplat.export.images import color_depth
+from completesplat.export.splat import round_to_uint8
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.rotations import matrix_to_quaternion

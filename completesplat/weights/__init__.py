@@ -14,7 +14,8 @@ from pathlib import Path
 from urllib.parse import urlparse
 
 from completesplat.errors import WeightsError
-from completesplat.files import printable, write_text
+from completesplat.files import write_text
+from completesplat.wording import printable
 
 SHIPPED = Path(__file__).parent
 CONFIG_FILE = "config.json"

@@ -25,11 +25,11 @@ from huggingface_hub import constants
 from hydra.utils import get_object
 
 from completesplat.errors import WeightsError
-from completesplat.files import SHORT, printable
 from completesplat.quantities import Entries, Range, Share
 from completesplat.settings.checks import HYDRA_KEYS, START_WEIGHTS
 from completesplat.settings.options import LOADER, conf_folder
 from completesplat.settings.schema import hints_of, violations
+from completesplat.wording import SHORT, printable
 
 # Groups of `conf/` that weights may name parts of, and those that only runs may name parts of.
 GROUPS_OF_WEIGHTS = ("autoreconstructor", "conditioning", "denoiser", "posterior", "regressor", "sampler")

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from completesplat.errors import TensorFileError, WeightsError
-from completesplat.files import SHORT, printable
+from completesplat.wording import SHORT, printable
 
 ZIP = b"PK\3\4"
 DIRECTORY = 0x10  # attribute of a record

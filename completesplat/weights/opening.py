@@ -10,11 +10,11 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from completesplat.errors import WeightsError
-from completesplat.files import SHORT, printable
 from completesplat.weights import CAMERA, CONFIG_FILE, RUN_WEIGHTS, SCENES, WEIGHTS_FILE, locate, read_small
 from completesplat.weights.allowed import ConfigOrigin, check_architecture, check_names, stored_config
 from completesplat.weights.checkpoint_reading import read_checkpoint
 from completesplat.weights.runs import read_run_config
+from completesplat.wording import SHORT, printable
 
 # The classes of runs whose models make scenes from photos: the setting of the model, which begins its tensors' names.
 STAGES = {"LatentDiffusion": "completesplat", "ReconstructionModule": "model"}

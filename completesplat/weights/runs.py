@@ -1,4 +1,4 @@
-"""Configs of runs of `fit`, from their folders and checkpoints, after `check_names` has held them to the list."""
+"""Configs of runs of `fit`, read from their folders and checkpoints. `check_names` checks the names in them."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -39,7 +39,8 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
 def config_of_checkpoint(checkpoint: Path, contents: Mapping[str, Any], trust: bool) -> dict[str, Any]:
     """Return the config of the model in the contents of a checkpoint; raise WeightsError if `check_names` refuses it.
 
-    The run's folder is the one above the checkpoint's.
+    The run's folder is the one above the checkpoint's. Links are followed, because the config is in the file itself:
+    a link in the user's folder does not make another person's file the user's own.
     """
     config = contents.get(CONFIG)
     if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
@@ -51,6 +52,8 @@ def config_of_checkpoint(checkpoint: Path, contents: Mapping[str, Any], trust: b
 
 def read_run_config(checkpoint: Path) -> tuple[Path, dict[str, Any]]:
     """Return the path of the config of a checkpoint's run, and its sections `model` and `data` as plain containers.
+
+    A link to a checkpoint is not followed, because the config lies in the folder of the run that has the link.
 
     Raises:
         WeightsError: the config is missing, unreadable, or not that of a run of `fit`.
@@ -70,6 +73,7 @@ def read_run_config(checkpoint: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def _changed(config: Any, overrides: list[str]) -> Any:
+    """Return the config with overrides of `model` and `data`, which are checked as `fit` checks its settings."""
     try:
         changes = OmegaConf.from_dotlist(overrides)
         others = [str(key) for key in changes if key not in SECTIONS]

@@ -6,7 +6,8 @@ import pytest
 import torch
 from support import some_gaussians
 
-from completesplat.baselines.fitting import RawGaussians, opacity_of_copies, position_noise, relocate, scale_of_copies
+from completesplat.baselines.densification import opacity_of_copies, position_noise, relocate, scale_of_copies
+from completesplat.baselines.fitting import RawGaussians
 
 
 @pytest.mark.parametrize("copies", [1, 2, 3, 10, 51])

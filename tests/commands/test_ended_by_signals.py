@@ -126,7 +126,7 @@ def test_lightning_starts_processes_that_know_which_one_started_them(command, to
 
 
 def test_a_signal_while_a_run_s_own_files_are_written_leaves_no_half_one(command, toy_root, tmp_path, monkeypatch):
-    monkeypatch.setattr("completesplat.commands.jobs._record", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    monkeypatch.setattr("completesplat.commands.continuing._record", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
     finished = command("fit", *FIT, f"data.root={toy_root}", f"out={tmp_path / 'run'}")
     assert finished.status == 143
     assert message(finished, signal.SIGTERM)[0] == ""

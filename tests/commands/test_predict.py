@@ -9,7 +9,9 @@ from support import python, strict_json
 
 FEW = ["samples=2", "frames=4", "steps=2", "color_fits=1"]
 UNNEEDED = ["lightning", "matplotlib", "pandas", "torchmetrics", "viser", "wandb"]
-UNNEEDED += [f"completesplat.{part}" for part in ("data.captures", "data.loading", "metrics", "evaluation.scorer", "training")]
+UNNEEDED += [
+    f"completesplat.{part}" for part in ("data.captures", "data.loading", "metrics", "evaluation.scorer", "training")
+]
 
 
 @pytest.fixture

@@ -11,12 +11,13 @@ import pytest
 from omegaconf import OmegaConf
 from support import SMALL, interrupted_at, strict_json
 
-from completesplat.commands import jobs
+from completesplat.commands import continuing
 from completesplat.commands.locks import hold_job_lock
 from completesplat.data.toy import write_objects
 from completesplat.errors import CompleteSplatError
 from completesplat.files import atomic_path
 from completesplat.training.reconstruction import ReconstructionModule
+from completesplat.weights import RUN_CHECKPOINT
 
 # Its child, as a loader's worker, outlives it for a while.
 HOLDER = """
@@ -118,29 +119,34 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     for name, content in (("run.json", {"started": "then", "command": ["first"]}), ("metrics.json", {"steps": 20})):
         (tmp_path / name).write_text(json.dumps(content))
     (tmp_path / "checkpoints").mkdir()
-    (tmp_path / jobs.LAST).touch()
+    (tmp_path / RUN_CHECKPOINT).touch()
 
     def config(rate=1, test=False, **end):
         trainer, model = {"max_steps": 20, "max_time": None} | end, {"_target_": "a.A", "optimizer": {"lr": rate}}
         return {"ckpt_path": "last", "test": test, "optimizer": {"lr": rate}, "trainer": trainer, "model": model}
 
     OmegaConf.save(config(), tmp_path / "config.yaml")
-    assert jobs.is_finished(tmp_path, config())
+    assert continuing.is_finished(tmp_path, config())
+    # A setting of later versions, which the run did not have, may be there if it is off.
+    for off in (0.0, None, False):
+        assert continuing.is_finished(tmp_path, config() | {"later": off})
+    with pytest.raises(CompleteSplatError, match="a run with another later: "):
+        continuing.is_finished(tmp_path, config() | {"later": 0.5})
     for longer in ({"max_steps": 40, "test": True}, {"max_steps": -1}, {"max_time": {"hours": 1}, "max_steps": 21}):
-        assert not jobs.is_finished(tmp_path, config(**longer))
+        assert not continuing.is_finished(tmp_path, config(**longer))
     (moved := tmp_path / "moved").mkdir()
     (moved / "checkpoints").mkdir()
-    (moved / jobs.LAST).touch()
+    (moved / RUN_CHECKPOINT).touch()
     placed = {out: config() | {"out": str(out), "folder": f"{out}/checkpoints"} for out in (tmp_path, moved)}
     OmegaConf.save(placed[tmp_path], moved / "config.yaml")
-    assert not jobs.is_finished(moved, placed[moved])
+    assert not continuing.is_finished(moved, placed[moved])
     with pytest.raises(CompleteSplatError, match="a run with another folder: "):
-        jobs.is_finished(moved, placed[moved] | {"folder": "elsewhere"})
+        continuing.is_finished(moved, placed[moved] | {"folder": "elsewhere"})
     # Another folder that begins with the same letters did not move.
-    assert not jobs._differences({"a": "/r/run_data"}, {"a": "/r/run_data"}, ("/r/run", "/r/run2"))
-    (moved / jobs.LAST).rename(moved / "checkpoints/step=9.ckpt")
+    assert not continuing._differences({"a": "/r/run_data"}, {"a": "/r/run_data"}, ("/r/run", "/r/run2"))
+    (moved / RUN_CHECKPOINT).rename(moved / "checkpoints/step=9.ckpt")
     with pytest.raises(CompleteSplatError, match="a run with another folder: "):
-        jobs.is_finished(moved, placed[moved] | {"folder": "elsewhere"})
+        continuing.is_finished(moved, placed[moved] | {"folder": "elsewhere"})
     shutil.rmtree(moved)
     advice = f"give all settings of {tmp_path}/run.json again, or continue in another folder"
     again = f"completesplat fit optimizer.lr=2 ckpt_path={tmp_path}/checkpoints/last.ckpt out=MORE"
@@ -150,20 +156,21 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
         (config(test=True), f"is finished, without a test: completesplat test ckpt={tmp_path}$"),
         (config(rate=2, max_steps=40), f"another optimizer.lr: {advice}: {again}$"),
         (config(rate=2) | {"a": 1, "b": 2, "c": 3, "d": 4}, "another a, b, c and 2 more: "),
+        (config() | {"test_seed": 1}, "another test_seed: "),  # only `test` and settings below it may differ
         (config() | {"model": {"_target_": "a.B"}}, "another model: choose another out=DIR"),
     ):
         with pytest.raises(CompleteSplatError, match=message):
-            jobs.is_finished(tmp_path, changed, ["out=R", "optimizer.lr=2", "ckpt_path=last"])
-    jobs._record(tmp_path, {"command": ["second"]}, config(max_steps=40))
+            continuing.is_finished(tmp_path, changed, ["out=R", "optimizer.lr=2", "ckpt_path=last"])
+    continuing._record(tmp_path, {"command": ["second"]}, config(max_steps=40))
     record = strict_json(tmp_path / "run.json")
     assert (record["started"], record["command"], len(record["continued"])) == ("then", ["second"], 1)
     (earlier,) = record["earlier_ends"]
     assert (earlier["command"], earlier["trainer.max_steps"]) == (["first"], 20)
     assert {path.name for path in tmp_path.glob("metrics*")} == {"metrics_20_steps.json"}
     (tmp_path / "metrics_20_steps.json").rename(tmp_path / "metrics.json")
-    (tmp_path / jobs.LAST).unlink()
+    (tmp_path / RUN_CHECKPOINT).unlink()
     with pytest.raises(CompleteSplatError, match=r"has no checkpoints/last\.ckpt to continue from: choose another out"):
-        jobs.is_finished(tmp_path, config(max_steps=40))
+        continuing.is_finished(tmp_path, config(max_steps=40))
 
 
 FIT = [*SMALL, "experiment=toy_var", "test=false", "trainer.max_steps=2", "trainer.log_every_n_steps=1"]

@@ -17,7 +17,7 @@ from completesplat.evaluation.paper_tables import published_tables
 from completesplat.evaluation.ply_samples import PlySamples
 from completesplat.evaluation.records import find_results, flat_scores
 from completesplat.evaluation.scorer import Scorer
-from completesplat.evaluation.tables import as_markdown
+from completesplat.evaluation.table_writers import as_markdown
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.gaussians import Gaussians
 from completesplat.rasterizers.reference import ReferenceRasterizer

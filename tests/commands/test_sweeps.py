@@ -15,7 +15,8 @@ from omegaconf import OmegaConf
 from support import LIMIT, SMALL, call, script, strict_json
 from vgg_weights import blank, saved
 
-from completesplat.commands.jobs import is_finished, optimized
+from completesplat.commands.continuing import is_finished
+from completesplat.commands.jobs import optimized
 from completesplat.errors import CompleteSplatError
 from completesplat.losses.lpips import load_vgg16
 from completesplat.settings.composition import LONGEST_NAME, job_name, shard_folder, swept_keys

@@ -88,6 +88,43 @@ def test_no_part_depends_on_whether_the_others_are_switched_on(seed: int) -> Non
     assert torch.equal(everything.all_views().images, expected.all_views().images)
 
 
+def test_one_random_color_replaces_what_the_masks_leave_out_in_all_views() -> None:
+    before = scene()
+    views = before.all_views()
+    first, other = (Augmentation(random_background=1)(before, rng(seed)) for seed in (0, 1))
+    after = first.all_views()
+    colors = (after.images - views.masks * views.images) / (1 - views.masks)
+    torch.testing.assert_close(colors, colors[:1, :, :1, :1].expand_as(colors), atol=1e-3, rtol=0)
+    assert 0 <= colors.min() <= colors.max() <= 1
+    assert not torch.equal(first.reference.images, other.reference.images)
+    assert same(replace(first, reference=before.reference, targets=before.targets), before)
+    assert torch.equal(after.masks, views.masks)
+
+
+def test_a_random_background_leaves_images_without_masks_and_other_draws_as_they_are() -> None:
+    def whole(views: Views) -> Views:
+        return replace(views, masks=torch.ones_like(views.masks))
+
+    everywhere = replace(scene(), reference=whole(scene().reference), targets=whole(scene().targets))
+    changed = Augmentation(random_background=1)(everywhere, rng())
+    assert same(changed, everywhere)
+    plain, colored = (
+        Augmentation(None, BoxMasks(1.0), True, CameraJitter(), share)(scene(), rng(3)) for share in (0, 1)
+    )
+    assert not torch.equal(colored.targets.images, plain.targets.images)
+    assert torch.equal(colored.visible, plain.visible)
+    assert torch.equal(colored.targets.masks, plain.targets.masks)
+    assert torch.equal(colored.reference.masks, plain.reference.masks)
+
+
+def test_so_large_a_share_of_the_scenes_gets_another_background() -> None:
+    """The number among 100 draws lies within 4 standard deviations of its mean."""
+    before = scene()
+    after = (Augmentation(random_background=0.3)(before, rng(seed)) for seed in range(100))
+    count = sum(not torch.equal(one.reference.images, before.reference.images) for one in after)
+    assert abs(count - 30) < 4 * (100 * 0.3 * 0.7) ** 0.5
+
+
 def test_every_other_scene_is_mirrored() -> None:
     """The number among 100 draws lies within 4 standard deviations of its mean."""
     count = sum(was_mirrored(Augmentation(None, None, horizontal_flip=True)(scene(), rng(seed))) for seed in range(100))

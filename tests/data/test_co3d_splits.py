@@ -79,7 +79,7 @@ def test_three_sequences_are_one_for_each_split_and_fewer_are_refused(tmp_path):
         parts = read(tmp_path / "3", None, SeededSplit(0.05, 0.3, seed))
         assert [len(taken) for taken in names(parts).values()] == [1, 1, 1]
     annotate(tmp_path / "2", many(2))
-    with pytest.raises(DataError, match="2 objects cannot be split"):
+    with pytest.raises(DataError, match="2 sequences cannot be split"):
         read(tmp_path / "2", subset=None)
 
 

@@ -17,7 +17,7 @@ from PIL import Image, PpmImagePlugin
 from scipy.spatial.transform import Rotation
 from support import write_capture
 
-from completesplat.data.captures import importing
+from completesplat.data.captures import capture_images, importing
 from completesplat.data.captures.captured_frames import CapturedFrame
 from completesplat.data.captures.importing import image_pairs, import_capture
 from completesplat.data.captures.module import read_capture
@@ -99,7 +99,7 @@ def test_all_pairs_are_matched_or_those_of_neighbours_in_a_ring():
 def copied(photos: Path, images: Path) -> list[str]:
     """Names of the images that an import would use."""
     images.mkdir()
-    importing._copy_photos(photos, images)
+    capture_images.copy_photos(photos, images)
     return sorted(path.relative_to(images).as_posix() for path in images.glob("**/*.*"))
 
 
@@ -125,9 +125,9 @@ def test_photos_become_upright_keep_their_focal_length_and_the_unusable_are_name
     assert "left out: 1 file of other formats: notes.txt" in caplog.text
     assert f"left out: {tmp_path / 'cut.jpg'}: cannot be decoded" in caplog.text
     full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
-    monkeypatch.setattr(importing.saving, "save_image", full)
+    monkeypatch.setattr(capture_images.saving, "save_image", full)
     with pytest.raises(OSError, match="No space left"):
-        importing._copy_photos(tmp_path, images)
+        capture_images.copy_photos(tmp_path, images)
 
 
 def test_photos_are_written_in_a_format_that_holds_them_whatever_their_names_say(tmp_path):
@@ -162,12 +162,12 @@ def test_a_video_is_split_into_evenly_spread_frames_unless_they_are_too_large(tm
     grey = np.arange(40, dtype=np.uint8) * 6
     imageio.imwrite(tmp_path / "a.mp4", np.broadcast_to(grey[:, None, None, None], (40, 64, 64, 3)), fps=10)
     (images := tmp_path / "100%d images").mkdir()
-    importing._split_video(tmp_path / "a.mp4", images, asked)
+    capture_images.split_video(tmp_path / "a.mp4", images, asked)
     means = [np.asarray(Image.open(path)).mean() for path in sorted(images.iterdir())]
     np.testing.assert_allclose(means, 6 * np.array(expected), atol=2)
-    monkeypatch.setattr(importing.files, "MOST_PIXELS", 64 * 64 - 1)
+    monkeypatch.setattr(capture_images.files, "MOST_PIXELS", 64 * 64 - 1)
     with pytest.raises(DataError, match=r"a\.mp4: ffmpeg finds no video of at most 4,095 pixels there"):
-        importing._split_video(tmp_path / "a.mp4", images, asked)
+        capture_images.split_video(tmp_path / "a.mp4", images, asked)
 
 
 def test_what_makes_no_capture_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):

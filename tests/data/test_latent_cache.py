@@ -113,7 +113,11 @@ def test_features_are_given_as_they_were_stored_and_cannot_be_changed(tmp_path):
     from_images, cached = rooms(root).train_dataloader(), rooms(root, latent_cache=str(out)).train_dataloader()
     expected = Halves()(from_images.dataset[0, 1].scenes.reference.images)
     torch.testing.assert_close(cached.dataset[0, 1].scenes.condition, expected)
-    for changes in ({"color_jitter": dict.fromkeys(STRENGTHS, 0.1)}, {"horizontal_flip": True}):
+    for changes in (
+        {"color_jitter": dict.fromkeys(STRENGTHS, 0.1)},
+        {"horizontal_flip": True},
+        {"random_background": 0.5},
+    ):
         with pytest.raises(CompleteSplatError, match=r"data\.color_jitter=null"):
             rooms(root, latent_cache=str(out), **changes)
     masked = rooms(root, latent_cache=str(out), box_masks=BOXES)

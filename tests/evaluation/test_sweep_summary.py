@@ -22,7 +22,8 @@ from completesplat.evaluation.provenance import machine
 from completesplat.evaluation.records import job_entries
 from completesplat.evaluation.score_tables import Entry, score_rows, time_cell
 from completesplat.evaluation.sweep_summary import IDENTITY, summarize, write_summary
-from completesplat.evaluation.tables import SSIM_NOTE, Notes, as_markdown, escape, show
+from completesplat.evaluation.table_writers import as_markdown, escape, show
+from completesplat.evaluation.tables import SSIM_NOTE, Notes
 from completesplat.files import write_json
 
 FILES = ["summary.csv", "summary.md", "summary.tex"]

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from completesplat.evaluation import tables
+from completesplat.evaluation import table_writers, tables
 from completesplat.evaluation.paper_tables import printed_rows, published_tables, read_tables
 from completesplat.evaluation.records import find_results
 from completesplat.evaluation.score_tables import evaluation_table
@@ -18,7 +18,7 @@ def written(runs, run, tmp_path):
     run("a", 17.123456, name="co3d", data_set="co3d/hydrant", resolution=128, **whole)
     run("b_100%|", 20.0)
     made = published_tables(find_results(runs))
-    tables.write_tables(made, tmp_path / "out")
+    table_writers.write_tables(made, tmp_path / "out")
     return made, tmp_path / "out"
 
 
@@ -46,10 +46,10 @@ def test_latex_is_balanced_and_all_rows_have_the_columns_of_their_table(written)
     assert opened == []
     assert len(re.findall(r"(?<!\\)\{", text)) == len(re.findall(r"(?<!\\)\}", text))
     for each in made:
-        latex = tables.as_latex(each)
+        latex = table_writers.as_latex(each)
         (columns,) = re.findall(r"\\begin\{tabular\}\{(\w+)\}", latex)
         assert {width(row) for row in rows_of_latex(latex)} == {len(columns)} == {len(each.headings)}
-        lines = [line for line in tables.as_markdown(each).splitlines() if line.startswith("|")]
+        lines = [line for line in table_writers.as_markdown(each).splitlines() if line.startswith("|")]
         assert {len(re.split(r"(?<!\\)\|", line)) - 2 for line in lines} == {len(each.headings)}
     uncommented = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
     assert re.findall(r"(?<!\\)[%#](?!$)", uncommented, re.MULTILINE) == []
@@ -59,7 +59,7 @@ def test_latex_is_balanced_and_all_rows_have_the_columns_of_their_table(written)
 def test_bars_in_headings_and_cells_make_no_columns_in_markdown() -> None:
     row = tables.TableRow("ours", [tables.Cell("1|2")])
     made = tables.Table("name", "title", [tables.Heading("|error|")], [row], [])
-    assert tables.as_markdown(made).splitlines()[2:5] == [r"| \|error\| |", "| ---: |", r"| 1\|2 |"]
+    assert table_writers.as_markdown(made).splitlines()[2:5] == [r"| \|error\| |", "| ---: |", r"| 1\|2 |"]
 
 
 def test_all_files_have_the_published_figures_as_printed_and_the_csv_all_digits_of_ours(written, capsys) -> None:
@@ -71,7 +71,7 @@ def test_all_files_have_the_published_figures_as_printed_and_the_csv_all_digits_
         texts = {line["text"] for line in lines if line["table"] == known.name and line["source"] == "paper"}
         for cell in (cell for row in printed_rows(known) for cell in row):
             assert cell.text in markdown
-            assert tables.escape(cell.text) in latex
+            assert table_writers.escape(cell.text) in latex
             assert cell.text in texts or cell.text == tables.BLANK
     assert "| **17.93** | 0.54 | 180.20 | 0.14 |" in markdown
     assert r"PixelNeRF $\dagger$ & Offline & 5.0 sec" in latex
@@ -80,22 +80,24 @@ def test_all_files_have_the_published_figures_as_printed_and_the_csv_all_digits_
     assert all(line["text"] for line in lines)
     (line,) = (line for line in lines if line["text"] == "17.12")
     assert (float(line["value"]), line["table"], line["column"]) == (17.123456, "full_images", "Hydrants PSNR ↑")
-    tables.show(*made, width=240)
+    table_writers.show(*made, width=240)
     printed = capsys.readouterr().out
     for each in made:
         assert all(line[:40] in printed for line in (each.title, *each.below()))
 
 
 def test_latex_prints_special_characters_literally() -> None:
-    assert tables.escape(r"a_b 50% & #1 {$c} a\b 1 ± 2") == r"a\_b 50\% \& \#1 \{\$c\} a\textbackslash{}b 1 $\pm$ 2"
-    assert tables.escape("x^2~y") == r"x\textasciicircum{}2\textasciitilde{}y"
+    assert (
+        table_writers.escape(r"a_b 50% & #1 {$c} a\b 1 ± 2") == r"a\_b 50\% \& \#1 \{\$c\} a\textbackslash{}b 1 $\pm$ 2"
+    )
+    assert table_writers.escape("x^2~y") == r"x\textasciicircum{}2\textasciitilde{}y"
 
 
 def test_missing_entries_of_records_stay_empty(capsys) -> None:
     columns = {"name": tables.Heading("name", figures=False), "figure": tables.Heading("figure", form=".1f")}
     shown = tables.records_table("Title", [{"name": "[red]"}, {"figure": 1.25}], columns)
     assert [[cell.text for cell in row.cells] for row in shown.rows] == [["[red]", ""], ["", "1.2"]]
-    tables.show(shown)
+    table_writers.show(shown)
     assert "[red]" in capsys.readouterr().out
 
 
@@ -103,7 +105,7 @@ def test_an_evaluation_shows_every_predictor_with_all_digits_in_any_width(capsys
     views = {"psnr": 20.0, "ssim": 0.5, "lpips": 0.125, "fid": 101.25, "kid": 0.0123, "sharpness": 0.6225}
     entry = {"scenes": 2, "views": 4, "full": {"novel": views, "reference": views}, "seconds": {"inference": 7.0}}
     entry["object"] = {"novel": views | {"psnr": 24.0}, "reference": views}
-    tables.show(evaluation_table({"model": entry, "mirrored_reference": entry}), width=160)
+    table_writers.show(evaluation_table({"model": entry, "mirrored_reference": entry}), width=160)
     printed = capsys.readouterr().out
     assert "2 scenes, 4 novel views" in printed
     assert all(
@@ -119,7 +121,7 @@ def test_an_evaluation_shows_every_predictor_with_all_digits_in_any_width(capsys
 def test_tables_break_no_word_in_any_width_and_show_all_columns(runs, run, capsys, width) -> None:
     run("a", 20.0, {"copy_reference": 10.0})
     for table in published_tables(find_results(runs)):
-        tables.show(table, width=width)
+        table_writers.show(table, width=width)
         printed = capsys.readouterr().out
         assert max(map(len, printed.splitlines()[: -len(table.below())])) <= width
         shown = set(re.split(r"[\s│┃]+", printed))

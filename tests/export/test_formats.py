@@ -12,8 +12,10 @@ from fake_converter import COPY, calls, install
 from support import some_gaussians
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import FORMATS, write_format, write_glb, write_splat
+from completesplat.export.formats import FORMATS, write_format
+from completesplat.export.gltf import write_glb
 from completesplat.export.ply import read_ply, write_ply
+from completesplat.export.splat import write_splat
 from completesplat.export.splat_transform import PageView, upright_rotation, viewer_settings
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole

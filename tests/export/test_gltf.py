@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import write_glb
+from completesplat.export.gltf import write_glb
 from completesplat.gaussians import Gaussians
 
 # By the extension's text: component types (here floats) and numbers of components of the attributes that it requires.

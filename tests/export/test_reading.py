@@ -8,9 +8,9 @@ import torch
 from splats_of_others import DIRECTIONAL, DIRECTIONAL_FILES, FILES, SCENE
 
 from completesplat.errors import PlyError
-from completesplat.export.formats import write_splat
 from completesplat.export.ply import write_ply
 from completesplat.export.reading import read_gaussians
+from completesplat.export.splat import write_splat
 from completesplat.gaussians import Gaussians
 
 

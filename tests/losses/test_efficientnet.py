@@ -73,6 +73,32 @@ def test_images_get_a_finite_gradient_and_the_network_none(term):
     assert all(parameter.grad is None for parameter in term.distance.parameters())
 
 
+def test_of_all_views_so_many_are_drawn_for_each_batch_and_the_others_do_not_count(term, monkeypatch):
+    views = scene_batch(2, 4, size=32).all_views()
+    predicted = (0.5 * views.images).requires_grad_()
+    monkeypatch.setattr(term, "views", 2)
+    seen = set()
+    for seed in range(6):
+        torch.manual_seed(seed)
+        (gradient,) = torch.autograd.grad(term(prediction(predicted), views), predicted)
+        of_views = gradient.flatten(2).ne(0).any(2)
+        assert torch.equal(of_views[0], of_views[1])
+        assert of_views[0].sum() == 2
+        seen |= {tuple(of_views[0].tolist())}
+    assert len(seen) > 2
+    monkeypatch.setattr(term, "views", 9)  # more than there are
+    all_of_them = term(prediction(predicted), views)
+    monkeypatch.undo()
+    torch.testing.assert_close(all_of_them, term(prediction(predicted), views))
+
+
+def test_the_loss_for_things_draws_views_and_makes_them_solid():
+    config = compose_config("fit", "loss=things").loss
+    terms = instantiate(config, _convert_="all").terms
+    assert terms["efficientnet"]["term"].views == 3
+    assert set(terms) == {*compose_config("fit", "loss=perceptual").loss.terms, "translucency"}
+
+
 @pytest.mark.slow
 def test_the_loss_has_the_term_in_the_place_of_lpips_and_trains():
     tiny = ["data.image_size=32", *NETWORKS, "rasterizer=reference", "model.checkpoint=null"]

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
@@ -12,7 +14,7 @@ from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.losses.ssim import structural_similarity
-from completesplat.losses.terms import KullbackLeibler, MeanSquaredError, StructuralDissimilarity
+from completesplat.losses.terms import KullbackLeibler, MeanSquaredError, StructuralDissimilarity, Translucency
 from completesplat.scene import Views
 
 SHAPE = (2, 3, 3, 24, 24)
@@ -45,6 +47,20 @@ def test_ssim_is_computed_in_full_precision_and_a_training_may_follow_a_test(pai
         assert term(prediction(images.requires_grad_()), truth) == full
     term(prediction(images), truth).backward()
     assert term(prediction(truth.images), truth).item() == pytest.approx(0, abs=1e-5)
+
+
+def test_translucency_is_what_opacity_lacks_within_the_masks_alone(pair):
+    alphas, masks = (torch.rand(2, 3, 1, 24, 24, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2))
+    predicted = replace(prediction(pair[0]), alphas=alphas.requires_grad_())
+    halves = masks.round()
+    truth = replace(views(pair[1]), masks=halves)
+    value = Translucency()(predicted, truth)
+    assert value.item() == pytest.approx((1 - alphas[halves > 0]).mean().item(), rel=1e-5)
+    value.backward()
+    assert (alphas.grad[halves > 0] < 0).all()
+    assert (alphas.grad[halves == 0] == 0).all()
+    assert Translucency()(predicted, replace(truth, masks=torch.zeros_like(masks))) == 0
+    assert Translucency()(replace(predicted, alphas=torch.ones_like(alphas)), replace(truth, masks=masks)) == 0
 
 
 @pytest.mark.parametrize("size", [16, 64])

@@ -8,7 +8,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.arguments import FLAGS, FLAGS_WITH_VALUE, SHOWN_CONFIGS, for_hydra
+from completesplat.settings.arguments import FLAGS_WITH_VALUE, HYDRA_FLAGS, SHOWN_CONFIGS, for_hydra
 
 NAMES = ["a.jpg", "a,b.jpg", "[a].jpg", "{a:1}.jpg", "a=b.jpg", "seed=1.jpg", " (1) .jpg", "it's.jpg", '"a".jpg']
 NAMES += ["a\\.jpg", "a\\", "a\\'.jpg", "é ü 写真.jpg", "a${seed}.jpg", "a\\${b.jpg", "$x.jpg", "new\nline.jpg"]
@@ -73,6 +73,6 @@ def test_arguments_that_are_none_are_refused(verb, typed, message):
 
 def test_the_flags_are_hydras():
     actions = {name: action for action in get_args_parser()._actions for name in action.option_strings}
-    assert all(actions[name].nargs == 0 for name in FLAGS)
+    assert all(actions[name].nargs == 0 for name in HYDRA_FLAGS)
     assert all(actions[name].nargs is None for name in FLAGS_WITH_VALUE)
     assert tuple(actions["--cfg"].choices) == SHOWN_CONFIGS

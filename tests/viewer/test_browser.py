@@ -14,7 +14,7 @@ from PIL import Image
 from support import LIMIT, tiny_generator, waited_for
 from viewer_scenes import BALLS, SETTINGS, balls_sample
 
-from completesplat.export.formats import write_splat
+from completesplat.export.splat import write_splat
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 

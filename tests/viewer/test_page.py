@@ -19,10 +19,10 @@ from viewer_scenes import SETTINGS, balls_sample
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.description import write_scene_json
-from completesplat.export.formats import write_splat
 from completesplat.export.images import to_pixels
 from completesplat.export.mesh import Mesh
 from completesplat.export.ply import read_ply, write_ply
+from completesplat.export.splat import write_splat
 from completesplat.geometry.cameras import look_at
 from completesplat.rasterizers.reference import ReferenceRasterizer
 

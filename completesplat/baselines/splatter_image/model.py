@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
 from completesplat.baselines.splatter_image.network import SongUNet
 from completesplat.errors import CompleteSplatError, TensorFileError, WeightsError
-from completesplat.files import SHORT, atomic_path, make_folder, printable, write_text
+from completesplat.files import atomic_path, make_folder, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.photo.reading import Framing, ImageLike, Photograph
@@ -34,6 +34,7 @@ from completesplat.settings.schema import violations
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.weights import RUN_WEIGHTS, from_hub, read_small
 from completesplat.weights.checkpoint_reading import mismatch, read_tensor_file
+from completesplat.wording import SHORT, printable
 
 OBJECT_SIZE = 2 * 0.57
 """Largest extent of the captured objects, in scene units (`preprocess_co3d.py`: 1.2 * 0.95)."""

@@ -18,10 +18,10 @@ from PIL import Image
 from completesplat.data.sequences import first_names
 from completesplat.data.validation import LARGEST, require_file
 from completesplat.errors import BadAnnotation, BadCamera, BadImage, ImageError, TooFewFrames, errors_at, needing
-from completesplat.files import by_numbers
 from completesplat.geometry.cameras import Cameras
 from completesplat.photo import files
 from completesplat.photo.exif import ORIENTATION, TRANSPOSITIONS, read_exif
+from completesplat.wording import by_numbers
 
 if TYPE_CHECKING:
     from pycolmap import Camera

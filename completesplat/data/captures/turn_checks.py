@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
 from completesplat.errors import DataError
-from completesplat.files import printable
 from completesplat.geometry.cameras import Cameras, crop_resize, project
 from completesplat.photo.saving import label_font, save_image, to_uint8
+from completesplat.wording import printable
 
 Photos = Float[Tensor, "photo 3 size size"]
 Masks = Float[Tensor, "photo 1 size size"]

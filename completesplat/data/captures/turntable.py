@@ -23,12 +23,13 @@ from completesplat.data.captures.capture_set import SPLITS_FILE, read_splits
 from completesplat.data.captures.turn_checks import Turn, examine, write_sheet
 from completesplat.data.validation import field, read_json
 from completesplat.errors import BadAnnotation, BadImage, DataError, ImageError, MissingFile, TooFewFrames, refused_to
-from completesplat.files import counted, writing
+from completesplat.files import writing
 from completesplat.geometry.cameras import Cameras, invert_rigid, look_at, mirror
 from completesplat.photo import files, saving
 from completesplat.photo.background import without_background
 from completesplat.photo.crop import Square, cut_square
 from completesplat.quantities import Range
+from completesplat.wording import counted
 
 logger = logging.getLogger(__name__)
 

@@ -35,10 +35,10 @@ class CO3DDataModule(ObjectDataModule):
     """
 
     record = ""
-    """File of a sequence that tells its mode, for data with hidden modes."""
+    """Name of the file in a sequence's folder that tells the mode of its images, in data with hidden modes."""
 
     chances: ClassVar[Mapping[str, float]] = {}
-    """Probabilities of these modes by name."""
+    """Probabilities of all modes by name, for sequences whose record gives none. Empty: the data have no modes."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class CO3DDataModule(ObjectDataModule):
         """Open all splits at once, because they share the annotations. Sequences without images are left out.
 
         Raises:
-            DataError: more sequences have no images than the policy allows; else as `read_category`.
+            DataError: more sequences have no images than `max_bad_fraction` allows; else as `read_category`.
         """
         splits, files, refused = read_category(
             self.root, self.category, self.subset, self.seeded, self.filters, self.allow_shared_sequences
@@ -110,7 +110,12 @@ class CO3DDataModule(ObjectDataModule):
         return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}
 
     def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
-        """Return the test scenes with the modes that were written beside their images."""
+        """Return the test scenes with the modes that were written beside their images.
+
+        Raises:
+            MissingFile: no test scene has images of its modes.
+            CompleteSplatError: the data set has no hidden modes.
+        """
         if not self.chances:
             return super().hidden_modes(views, spread_views)
         store = self.store("test")

@@ -1,4 +1,4 @@
-"""Random augmentation of training scenes: colours of all views, the reference's camera, flips, boxes over its image."""
+"""Random augmentation of training scenes: colours and background of all views, the reference's camera, flips, boxes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -221,13 +221,15 @@ def _built(kind: Callable[..., T], settings: Mapping[str, Any] | None) -> T | No
 class Augmentation:
     """Random changes of a training scene: jitter of colours and camera, mirroring with probability 0.5, and boxes.
 
-    Each is off if it is None or false. The order of the fields is not that of the changes.
+    With probability `random_background`, one random colour takes the background's place in all views. Each change is
+    off if it is None, false or 0. The order of the fields is not that of the changes.
     """
 
     color_jitter: ColorJitter | None = None
     box_masks: BoxMasks | None = None
     horizontal_flip: bool = False
     camera_jitter: CameraJitter | None = None
+    random_background: float = 0.0
 
     @staticmethod
     def of_settings(
@@ -235,6 +237,7 @@ class Augmentation:
         box_masks: Mapping[str, Any] | None,
         camera_jitter: Mapping[str, Any] | None,
         horizontal_flip: bool,
+        random_background: float,
     ) -> "Augmentation":
         """Build the parts of an augmentation from their settings. None: the part is off.
 
@@ -246,6 +249,7 @@ class Augmentation:
             box_masks=_built(BoxMasks, box_masks),
             horizontal_flip=horizontal_flip,
             camera_jitter=_built(CameraJitter, camera_jitter),
+            random_background=random_background,
         )
 
     def active(self) -> list[str]:
@@ -259,10 +263,12 @@ class Augmentation:
     def __call__(self, scene: SceneBatch, rng: np.random.Generator) -> SceneBatch:
         """Augment one scene (without batch axis).
 
-        Colours, flip, boxes and camera draw from four generators, spawned from `rng` in this order. So each is
-        independent of whether the others are on, and of what was drawn from `rng` before. Nothing is drawn from `rng`.
+        Colours, flip, boxes, camera and background draw from five generators, spawned from `rng` in this order. So each
+        is independent of whether the others are on, and of what was drawn from `rng` before. Nothing is drawn from it.
         """
-        jitter_rng, flip_rng, boxes_rng, camera_rng = rng.spawn(4)
+        jitter_rng, flip_rng, boxes_rng, camera_rng, background_rng = rng.spawn(5)
+        if background_rng.random() < self.random_background:
+            scene = on_color(scene, torch.from_numpy(background_rng.uniform(size=3)).float())
         if self.color_jitter is not None:
             images = self.color_jitter(scene.all_views().images, jitter_rng)
             reference = replace(scene.reference, images=images[0])
@@ -276,6 +282,15 @@ class Augmentation:
             height, width = scene.reference.cameras.image_size
             scene = replace(scene, visible=self.box_masks(height, width, boxes_rng).to(scene.visible))
         return scene
+
+
+def on_color(scene: SceneBatch, color: Float[Tensor, "3"]) -> SceneBatch:
+    """Replace the background of all views (what their masks leave out) by one colour; without masks nothing changes."""
+
+    def composited(views: Views) -> Views:
+        return replace(views, images=torch.lerp(color[:, None, None], views.images, views.masks))
+
+    return replace(scene, reference=composited(scene.reference), targets=composited(scene.targets))
 
 
 def mirrored(scene: SceneBatch) -> SceneBatch:

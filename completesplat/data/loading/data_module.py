@@ -17,8 +17,8 @@ from completesplat.data.loading.scenes import EvaluationScenes, TrainingScenes
 from completesplat.data.loading.training_statistics import feature_moments
 from completesplat.data.validation.processes import usable_cores
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.files import counted
-from completesplat.quantities import Natural, Positive, Range
+from completesplat.quantities import Natural, Positive, Range, Share
+from completesplat.wording import counted
 
 MOST_WORKERS = 4  # if data.workers is null
 SPLITS_OF_STAGE = {
@@ -27,7 +27,10 @@ SPLITS_OF_STAGE = {
     "test": ("test",),
     "predict": ("test",),
 }
-UNCHANGED = "data.color_jitter=null data.camera_jitter=null data.horizontal_flip=false data.background=null"
+UNCHANGED = (
+    "data.color_jitter=null data.camera_jitter=null data.horizontal_flip=false data.background=null "
+    "data.random_background=0"
+)
 
 logger = logging.getLogger(__name__)
 
@@ -44,9 +47,11 @@ class SceneDataModule(SceneDataSet, LightningDataModule):
         references_per_sequence: training items of a sequence in one epoch.
         color_jitter, box_masks, camera_jitter: settings of `ColorJitter`, `BoxMasks` and `CameraJitter`; None: off.
         horizontal_flip: mirror half of the training scenes horizontally.
+        random_background: share of the training scenes whose background is replaced by a random colour, the same in
+            all views; images without a mask stay as they are.
         workers: processes that load data; 0: none; None: one for each core, at most four.
         latent_cache: folder of latents from which stage 2 is trained (`CachedTrainingScenes`), without colour jitter,
-            flips or `background`; validation and test read images.
+            flips, `background` or `random_background`; validation and test read images.
         allow_changed: a resumed run may continue with training data that have changed.
         **reading: settings of `SceneDataSet`.
     """
@@ -62,6 +67,7 @@ class SceneDataModule(SceneDataSet, LightningDataModule):
         box_masks: Mapping[str, Any] | None = None,
         camera_jitter: Mapping[str, Any] | None = None,
         horizontal_flip: bool = False,
+        random_background: Share = 0.0,
         workers: Annotated[int, Range(0, 256)] | None = 0,
         latent_cache: str | None = None,
         allow_changed: bool = False,
@@ -73,7 +79,9 @@ class SceneDataModule(SceneDataSet, LightningDataModule):
         self.targets = targets
         self.evaluation_batch_size = evaluation_batch_size
         self.references_per_sequence = references_per_sequence
-        self.augmentation = Augmentation.of_settings(color_jitter, box_masks, camera_jitter, horizontal_flip)
+        self.augmentation = Augmentation.of_settings(
+            color_jitter, box_masks, camera_jitter, horizontal_flip, random_background
+        )
         self.workers = min(MOST_WORKERS, usable_cores()) if workers is None else workers
         self.latent_cache = None if latent_cache is None else Path(latent_cache)
         self.allow_changed = allow_changed

@@ -153,7 +153,12 @@ class TrainingScenes(Dataset[LoadedScenes]):
         return groups
 
     def check(self, batch_size: int) -> None:
-        """Raise CompleteSplatError if an epoch has fewer scenes than a batch, or no sequence has enough frames."""
+        """Check that scenes and batches can be made.
+
+        Raises:
+            CompleteSplatError: an epoch has fewer scenes than a batch, or sequences can be read, but none has enough
+                frames.
+        """
         names = self.store.names
         if batch_size > len(self):
             scenes = f"{len(self)} scenes (data.references_per_sequence of each of {len(names)} sequences)"
@@ -164,6 +169,7 @@ class TrainingScenes(Dataset[LoadedScenes]):
                 most = max(most, len(self.store.source.read(name).frames))
             if most > self.targets:
                 return
+        # Else no sequence can be read, or none has two frames. Loading tells why, for each sequence.
         if most > 1:
             message = f"a scene needs {self.targets + 1} frames, training sequences have at most {most} frames"
             raise CompleteSplatError(f"data.targets={self.targets}: {message}")

@@ -50,14 +50,19 @@ def world_up(cameras: Cameras) -> Float[Tensor, "3"]:
     """
     horizontal = cameras.world_to_camera[:, 0, :3]
     down = cameras.world_to_camera[:, 1, :3]
-    _, lengths, axes = torch.linalg.svd(horizontal)
-    if not (lengths[1:2] > LEAST_TURN * len(horizontal) ** 0.5).any():
+    _, singular_values, axes = torch.linalg.svd(horizontal)
+    # One camera has no second value.
+    if not (singular_values[1:2] > LEAST_TURN * len(horizontal) ** 0.5).any():
         return -torch.nn.functional.normalize(down.mean(dim=0), dim=0)
     return torch.where(down.mean(dim=0) @ axes[-1] > 0, -axes[-1], axes[-1])
 
 
 def mean_camera(store: SceneStore) -> TypicalCamera:
-    """Return the typical camera of at most 8,192 frames from the first 400 sequences, of which one must be readable."""
+    """Return the typical camera of the `excerpts`.
+
+    Raises:
+        DataError: none of their sequences can be read.
+    """
     cameras = []
     depth_ranges = []
     for sequence, frames in excerpts(store):
@@ -69,7 +74,7 @@ def mean_camera(store: SceneStore) -> TypicalCamera:
 
 
 def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]:
-    """Average the images of the same frames. The mean is black if none can be read."""
+    """Average the images of the frames that `mean_camera` takes. The mean is black if none can be read."""
     total = torch.zeros(3, size, size, dtype=torch.float64)
     count = 0
     for image in _images(store, IMAGES):
@@ -96,7 +101,10 @@ def _images(store: SceneStore, images: int) -> Iterator[UInt8[Tensor, "3 height 
 
 
 def excerpts(store: SceneStore, images: int = IMAGES) -> Iterator[tuple[PosedSequence, list[int]]]:
-    """Yield the first sequences that can be read, each with evenly spaced frames, about `images` frames in total."""
+    """Yield those of the first 400 sequences that can be read, each with evenly spaced frames.
+
+    Together they have at most `images` frames. The store must have sequences, as those of `SceneDataSet.store` have.
+    """
     names = store.names[:SEQUENCES]
     most = images // len(names)
     for name in names:

@@ -36,8 +36,9 @@ from completesplat.data.tolerance import ErrorTolerance
 from completesplat.data.validation import field, parsed, read_json
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import CompleteSplatError, DataError, TooFewFrames, refused_to
-from completesplat.files import atomic_path, counted, write_json
+from completesplat.files import atomic_path, write_json
 from completesplat.weights import sha256_of
+from completesplat.wording import counted
 
 FEWEST_FRAMES = 2
 UNFINISHED = ".unfinished"

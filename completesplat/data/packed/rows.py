@@ -42,7 +42,8 @@ SCHEMA = pa.schema(
 """Columns of a store. Values of all frames are flattened in row-major order.
 
 `picture_checksums` are the CRC-32 of each frame's image and mask, because Pillow ignores PNG's checksums and JPEG has
-none. `checksum` covers the other columns. A mask may be null. Types are large because rows can exceed 2 GB.
+none. The name stays as it is because stores have it. `checksum` covers the other columns. A mask may be null. Types are
+large because rows can exceed 2 GB.
 """
 
 
@@ -109,10 +110,7 @@ def to_row(sequence: PosedSequence, usable: Sequence[int], images: Sequence[Enco
     row = {
         "name": sequence.name,
         "size": size,
-        "frames": numbers["frames"],
-        "world_to_camera": numbers["world_to_camera"],
-        "intrinsics": numbers["intrinsics"],
-        "depth_ranges": numbers["depth_ranges"],
+        **numbers,
         "images": [encoded.image for encoded in images],
         "masks": [encoded.mask for encoded in images],
         "picture_checksums": [encoded.checksum() for encoded in images],

@@ -31,8 +31,9 @@ def paint_back(objects: list[Any], toward: list[float], least: float) -> Any:
     """Paint all faces that point away from a camera, and return the socket of the paint's colour.
 
     These are the faces whose normal n has n . d < -`least`, for the direction d `toward` the camera. A camera at e sees
-    of both sides of a face at p the one with n . (e - p) > 0. In the unit ball this means n . d > -1 / |e|. So with
-    `least` = 1 / |e| the camera at e sees no paint. Nor does light: it is reflected as if there was no paint.
+    the side of a face at p if the side's normal n has n . (e - p) > 0. All points are in the unit ball, so n . p >= -1
+    and such an n has n . d > -1 / |e|. With `least` = 1 / |e|, the camera at e therefore sees no paint. Nor does light:
+    it is reflected as if there was no paint.
     """
     group = bpy.data.node_groups.new("back", "ShaderNodeTree")
     for side in ("INPUT", "OUTPUT"):
@@ -236,21 +237,25 @@ def set_up_outputs(folder: Path) -> dict[str, Any]:
 
 
 def render(folder: Path, views: list[dict[str, Any]], samples: int, paint: Any, colors: list[list[float]]) -> None:
-    """Render all views with every colour of the paint (`[]`: without), then geometry at the pixels' centres."""
+    """Render all views with every colour of the paint (`[]`: without), then geometry at the pixels' centres.
+
+    Each round over the views writes one of the outputs of `set_up_outputs`, or none (""), and its images.
+    """
     scene = bpy.context.scene
     outputs = set_up_outputs(folder)
-    tasks: list[tuple[str, str, list[float] | None]] = [("coverage", "", colors[0] if colors else None)]
-    tasks += [("", f"{index}_", color) for index, color in enumerate(colors) if index]
-    tasks.append(("geometry", "", None))
-    for task, prefix, color in tasks:
-        images = task != "geometry"
+    # Output, prefix of the images' names, and colour of the paint (None: as it is).
+    rounds: list[tuple[str, str, list[float] | None]] = [("coverage", "", colors[0] if colors else None)]
+    rounds += [("", f"{index}_", color) for index, color in enumerate(colors) if index]
+    rounds.append(("geometry", "", None))
+    for written, prefix, color in rounds:
+        images = written != "geometry"
         scene.cycles.samples = samples if images else 1
         scene.cycles.use_denoising = images
         scene.cycles.max_bounces = BOUNCES if images else 0
         scene.cycles.pixel_filter_type = "BLACKMAN_HARRIS" if images else "GAUSSIAN"
         scene.cycles.filter_width = 1.5 if images else TINY_FILTER
         for name, output in outputs.items():
-            output.mute = name != task
+            output.mute = name != written
         if color:
             paint.default_value = (*color, 1.0)
         for number, view in enumerate(views):

@@ -12,7 +12,7 @@ from urllib.parse import unquote
 
 from completesplat.data.rendered.blender import Blender, run_job
 from completesplat.errors import CompleteSplatError, MissingFile
-from completesplat.files import folder_names
+from completesplat.wording import folder_names
 
 SUFFIXES = ("glb", "gltf", "obj", "ply", "stl", "fbx", "usd", "usda", "usdc", "usdz")
 MOST_OPTIONS = 30  # words before the name of a texture

@@ -29,10 +29,11 @@ from completesplat.data.rendered.random_scenes import PAINTS, RenderSettings, ch
 from completesplat.data.validation import read_points
 from completesplat.data.validation.processes import share_of, usable_cores
 from completesplat.errors import CompleteSplatError, DataError, UnreadableFile
-from completesplat.files import atomic_folder, counted, write_text
+from completesplat.files import atomic_folder, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
 from completesplat.photo.saving import save_jpeg, to_uint8
 from completesplat.quantities import Natural, Positive, Range
+from completesplat.wording import counted
 
 logger = logging.getLogger(__name__)
 

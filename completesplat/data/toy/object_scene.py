@@ -38,6 +38,27 @@ from completesplat.data.toy.surroundings import Dome, Light, Patch
 from completesplat.geometry.cameras import invert_rigid, look_at
 
 DARK = np.full(3, 0.07)
+DOME_RADIUS = 3.5
+UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+PATCH_COLORS = {
+    "red": (0.9, 0.08, 0.1),
+    "green": (0.1, 0.7, 0.2),
+    "blue": (0.1, 0.25, 0.9),
+    "yellow": (0.98, 0.85, 0.1),
+}
+EVEN = np.full(len(PATCH_COLORS), 0.25)
+CHANCES = {"light": np.array([0.4, 0.3, 0.2, 0.1]), "dark": np.array([0.1, 0.2, 0.3, 0.4])}
+"""Probabilities of the colours in `PATCH_COLORS`, by the nose of a marked mini."""
+NOSES = {"light": 0.97, "dark": 0.05}
+"""Grey values of the noses."""
+FROM_THE_FRONT = 0.35
+"""Largest azimuth (radians) between the first camera and the front, so that this camera never sees the patch."""
+SURFACE_DIRECTIONS = 60
+"""Directions from which points on an object's surface are sampled."""
+SURFACE_RAYS = 130
+"""Rays from each of these directions."""
+SURFACE_DISTANCE = 20.0
+"""Where these rays start, in bounds of the object's radius. From so far away they are nearly parallel."""
 
 
 class Blueprint(NamedTuple):
@@ -146,22 +167,6 @@ def hydrant(rng: np.random.Generator) -> Blueprint:
 
 
 FAMILIES = (hydrant, bear)
-DOME_RADIUS = 3.5
-SURFACE_DIRECTIONS = 60
-SURFACE_RAYS = 130
-PATCH_COLORS = {
-    "red": (0.9, 0.08, 0.1),
-    "green": (0.1, 0.7, 0.2),
-    "blue": (0.1, 0.25, 0.9),
-    "yellow": (0.98, 0.85, 0.1),
-}
-EVEN = np.full(len(PATCH_COLORS), 0.25)
-NOSES = {"light": 0.97, "dark": 0.05}
-CHANCES = {"light": np.array([0.4, 0.3, 0.2, 0.1]), "dark": np.array([0.1, 0.2, 0.3, 0.4])}
-"""Probabilities of the colours in `PATCH_COLORS`, by the nose of a marked mini."""
-FROM_THE_FRONT = 0.35
-"""Largest azimuth (radians) between the first camera and the front, so that this camera never sees the patch."""
-UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 
 class ToyScene(NamedTuple):
@@ -214,10 +219,11 @@ def _placed(
     """Return the scene of an object that is turned at random, centred, and scaled to `OBJECT_HALF_SIZE`.
 
     The first of the cameras is in front of it. The patch faces backwards and down by `tilt` radians, and covers normals
-    whose cosine with that direction is above `edge`. `chances` are those of its colour; None: all are equal.
+    whose cosine with that direction is above `edge`. `chances` are those of its colour; None: `EVEN`.
     """
     yaw = rng.uniform(0, 2 * np.pi)
     cameras = draw_orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
+    # `rng.choice` uses other random numbers for p=None than for p=EVEN, so each kind of scene keeps to one of the two.
     name = str(rng.choice(list(PATCH_COLORS), p=chances))
     level = np.cos(tilt)
     down = np.sin(tilt)
@@ -299,6 +305,7 @@ def _grey(rng: np.random.Generator) -> tuple[Dome, Light]:
 
 
 def _sunlight(azimuth: float, height: float, ambient: float) -> Light:
+    """Return light from the direction with this azimuth, `height` being the sine of its elevation."""
     level = np.sqrt(1 - height**2)
     direction = np.array([level * np.sin(azimuth), height, level * np.cos(azimuth)])
     return Light(direction, is_point=False, ambient=ambient, sky=0.25, shadow=0.35)
@@ -317,10 +324,11 @@ def _surface(
         height = rng.uniform(0, 1)
         level = np.sqrt(1 - height**2)
         outwards = torch.tensor([level * np.sin(azimuth), height, level * np.cos(azimuth)], dtype=torch.float64)
-        pose = invert_rigid(look_at(20 * reach * outwards, torch.zeros_like(outwards), UP)).numpy()
+        pose = invert_rigid(look_at(SURFACE_DISTANCE * reach * outwards, torch.zeros_like(outwards), UP)).numpy()
         angle = rng.uniform(0, 2 * np.pi, SURFACE_RAYS)
         radius = np.sqrt(rng.uniform(0, 1, SURFACE_RAYS))
-        rays = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(SURFACE_RAYS, 20.0)], axis=-1)
+        ahead = np.full(SURFACE_RAYS, SURFACE_DISTANCE)
+        rays = np.stack([radius * np.cos(angle), radius * np.sin(angle), ahead], axis=-1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         traced, coverage, distances = trace(shapes, light, (dome, patch), pose, rays[:, None])
         points.append((pose[:3, 3] + distances[:, None] * rays @ pose[:3, :3].T)[coverage > 0])

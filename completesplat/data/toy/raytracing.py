@@ -1,6 +1,12 @@
 """Analytic ray tracer: ellipsoids, cone frusta and boxes on the ground of a coloured dome, or in a room.
 
 All of it is one file, because numba compiles a kernel again only when the kernel's own file changes.
+
+A texture [3] is the number of a pattern, its frequency and its phase (on the ground: its angle). A decal [6] is a face,
+the lowest and highest u, the lowest and highest v, and the width of the rim; its colours [3 3] are the rim's and two of
+the inside. A patch covers the local heights [2] between the lowest and the highest, where the normal has a cosine above
+`edge` with the direction `facing`. A ray is the points (ox, oy, oz) + t (dx, dy, dz): in a shape's local frame in
+`_hit_ball`, `_hit_frustum` and `_hit_cube`, in the scene's frame elsewhere.
 """
 
 import math
@@ -12,7 +18,7 @@ from completesplat.data.toy.shapes import BOX, CHECKS, ELLIPSOID, FRUSTUM, RIPPL
 from completesplat.data.toy.surroundings import DOME, GROUND, Dome, Light, Patch, Room
 from completesplat.rasterizers.kernels.compilation import helper, kernel
 
-SELF_INTERSECTION = 1e-6
+SELF_INTERSECTION = 1e-6  # nearer hits are the surface that the ray starts from
 
 # Without the kernels' "fastmath", so that all machines draw the same images.
 compiled = partial(kernel, fastmath=False)

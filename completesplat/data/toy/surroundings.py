@@ -6,7 +6,7 @@ import numpy as np
 
 from completesplat.data.toy.shapes import Array
 
-# Numbers of faces. A room has two across each of x, y and z, the lower one first; else there are a ground and a dome.
+# Indices of faces. A room has two across each of x, y and z, the lower one first. A dome has a ground.
 FLOOR = 2
 CEILING = 3
 WALLS = (0, 1, 4, 5)
@@ -62,9 +62,9 @@ class Patch(NamedTuple):
 class Room(NamedTuple):
     """Inside of a box of `size`, with `colors` [face 2 3] and `textures` [face 3].
 
-    `decals` [decal 6] are rectangles on faces: face, range of the first coordinate, range of the second, width of the
-    rim. The coordinates are (z, y) on walls across x, (x, y) on walls across z. `decal_colors` [decal 3 3] are the rim
-    and two inner colours.
+    The floor is at y = 0, and its middle at x = z = 0. `decals` [decal 6] are rectangles on faces: face, range of u,
+    range of v, width of the rim. The coordinates (u, v) are (z, y) on walls across x, (x, z) on floor and ceiling, and
+    (x, y) on walls across z. `decal_colors` [decal 3 3] are the rim and two inner colours.
     """
 
     size: Array

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from completesplat.errors import BadAnnotation, BadCamera, MissingFile, OutsidePath, PlyError, UnreadableFile
-from completesplat.files import SHORT, printable
 from completesplat.ply_files import read_vertices
+from completesplat.wording import SHORT, printable
 
 MOST_BYTES = 2**32
 # Content above the first size may be larger than its gzipped file by at most the second factor. Deflate reaches 1032;

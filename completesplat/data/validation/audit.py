@@ -13,7 +13,7 @@ from completesplat.data.sequences import SequenceSource
 from completesplat.data.splits import overlaps, shared_names
 from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError, TooFewFrames, refused_to
-from completesplat.files import printable
+from completesplat.wording import printable
 
 FEWEST_FRAMES = 2
 LARGEST_BATCH = 16

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from completesplat.data.sequences import PosedSequence
 from completesplat.evaluation.studies.figures import written_figure
-from completesplat.evaluation.tables import Heading, records_table, show
+from completesplat.evaluation.table_writers import show
+from completesplat.evaluation.tables import Heading, records_table
 
 # Key in the results, label, format.
 MEASURES = [

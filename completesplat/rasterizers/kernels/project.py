@@ -22,13 +22,13 @@ PASSES = 4
 SMALLEST_DEPTH_BITS = np.float64(2.0**-126).view(np.int64)
 DROPPED_BITS = 8 + 52 - PASSES * RADIX_BITS
 # Columns of the sums over views, after which the chain rule continues for each Gaussian separately.
-COLOR = 0
-LOG_OPACITY = 3
-MEAN = 4
-ROOT = 7
-REACHED = 16
-TOTALS = 17
-no_totals = simd.zeros(TOTALS)
+TOTAL_COLOR = 0
+TOTAL_LOG_OPACITY = 3
+TOTAL_MEAN = 4
+TOTAL_ROOT = 7
+TOTAL_REACHED = 16
+TOTALS_WIDTH = 17
+no_totals = simd.zeros(TOTALS_WIDTH)
 gather_one = simd.gather(1)
 gather_three = simd.gather(3)
 gather_four = simd.gather(4)
@@ -65,10 +65,10 @@ def prepare(
 
 
 @helper
-def lane_shapes(quaternions, scales, start, last):
-    """Return quaternions and scales of the Gaussians start..start + 15. The last one repeats beyond the end."""
-    quaternion = gather_four(quaternions.reshape(-1), 4, 0, start, last)
-    return quaternion, gather_three(scales.reshape(-1), 3, 0, start, last)
+def lane_shapes(quaternions, scales, start, end):
+    """Return quaternions and scales of the Gaussians start, ..., start + 15, with end - 1 for any beyond that."""
+    quaternion = gather_four(quaternions.reshape(-1), 4, 0, start, end)
+    return quaternion, gather_three(scales.reshape(-1), 3, 0, start, end)
 
 
 @helper
@@ -89,8 +89,8 @@ def project(
     """Project, cull and sort the Gaussians of one scene for one camera.
 
     Args:
-        unsorted: scratch [gaussian + 1 16] float32.
-        keys, order: scratch [2 gaussian + 1], int64 and int32.
+        unsorted: scratch [gaussian + 1, 16] float32.
+        keys, order: scratch [2, gaussian + 1], int64 and int32.
         records: receives the visible Gaussians, front to back.
 
     Returns:
@@ -144,6 +144,7 @@ def project(
 
 @helper
 def depth_key(z):
+    """Return a depth's sort key, which has PASSES * RADIX_BITS bits."""
     bits = np.float64(z).view(np.int64) - SMALLEST_DEPTH_BITS
     return bits >> DROPPED_BITS if bits > 0 else 0
 
@@ -209,46 +210,49 @@ def append(builder, mask, vectors, rows, vector, numbers, count):
 @kernel
 def project_backward(
     quaternions: Array, scales: Array, opacities: Array, prepared: Array, cameras: Array, blur: float,
-    gradients: Array, places: Array, first: int, last: int,
+    gradients: Array, places: Array, first: int, end: int,
     grad_means: Array, grad_quaternions: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
 ) -> None:  # fmt: skip
-    """Apply the chain rule through the projection to the Gaussians [first, last) of one scene, summed over views.
+    """Apply the chain rule through the projection to the Gaussians [first, end) of one scene, summed over views.
 
     Args:
         cameras: [view 20] float64.
         gradients, places: [view band row 16] and [view band lane], written by `composite`.
         first: a multiple of 16.
     """
-    for start in range(first, last, simd.LANES):
-        sums = sum_views(prepared, cameras, blur, gradients, places, start)
-        reached = sums[REACHED] > ZERO
-        quaternion, scale = lane_shapes(quaternions, scales, start, last)
-        opacity = gather_one(opacities, 1, 0, start, last)
-        grad_root = simd.widen(sums[ROOT:REACHED])
+    for start in range(first, end, simd.LANES):
+        totals = sum_views(prepared, cameras, blur, gradients, places, start)
+        reached = totals[TOTAL_REACHED] > ZERO
+        quaternion, scale = lane_shapes(quaternions, scales, start, end)
+        opacity = gather_one(opacities, 1, 0, start, end)
+        grad_root = simd.widen(totals[TOTAL_ROOT:TOTAL_REACHED])
         grad_quaternion, grad_scale = root_backward(simd.widen(quaternion), simd.widen(scale), grad_root)
-        (grad_log_opacity,) = simd.widen(sums[LOG_OPACITY:MEAN])
+        (grad_log_opacity,) = simd.widen(totals[TOTAL_LOG_OPACITY:TOTAL_MEAN])
         grad_opacity = simd.narrow((grad_log_opacity / simd.widen(opacity)[0],))
-        simd.scatter(grad_colors.reshape(-1), start, last, sums[COLOR:LOG_OPACITY])
-        simd.scatter(grad_means.reshape(-1), start, last, sums[MEAN:ROOT])
-        simd.scatter(grad_opacities, start, last, simd.keep_each(reached, grad_opacity))
-        simd.scatter(grad_quaternions.reshape(-1), start, last, simd.keep_each(reached, simd.narrow(grad_quaternion)))
-        simd.scatter(grad_scales.reshape(-1), start, last, simd.keep_each(reached, simd.narrow(grad_scale)))
+        simd.scatter(grad_colors.reshape(-1), start, end, totals[TOTAL_COLOR:TOTAL_LOG_OPACITY])
+        simd.scatter(grad_means.reshape(-1), start, end, totals[TOTAL_MEAN:TOTAL_ROOT])
+        simd.scatter(grad_opacities, start, end, simd.keep_each(reached, grad_opacity))
+        simd.scatter(grad_quaternions.reshape(-1), start, end, simd.keep_each(reached, simd.narrow(grad_quaternion)))
+        simd.scatter(grad_scales.reshape(-1), start, end, simd.keep_each(reached, simd.narrow(grad_scale)))
 
 
 @helper
 def sum_views(prepared, cameras, blur, gradients, places, start):
+    """Return the totals of the Gaussians start, ..., start + 15, in the order of the columns `TOTAL_...`."""
     mean, root = projection.lane_gaussians(prepared, start)
-    results = no_totals()
+    totals = no_totals()
     for view in range(cameras.shape[0]):
         sums = projection.lane_sums_of_view(gradients[view], places[view], start)
         mask = sums[layout.REACHED] > ZERO
         if not simd.any_lane(mask):
             continue
         grad_mean, grad_root = projection.view_gradients(mean, root, cameras[view], blur, sums)
-        parts = (sums[0], sums[1], sums[2], sums[layout.SUM_S]) + grad_mean + grad_root + (sums[layout.REACHED],)  # noqa: RUF005
+        color = (sums[layout.SUM_COLOR], sums[layout.SUM_COLOR + 1], sums[layout.SUM_COLOR + 2])
+        log_opacity = (sums[layout.SUM_S],)
+        parts = color + log_opacity + grad_mean + grad_root + (sums[layout.REACHED],)
         # Lanes that are not reached may hold any value, even NaN.
-        results = simd.add_each(results, simd.keep_each(mask, parts))
-    return results
+        totals = simd.add_each(totals, simd.keep_each(mask, parts))
+    return totals
 
 
 @helper

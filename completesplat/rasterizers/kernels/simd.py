@@ -19,7 +19,8 @@ I32 = ir.IntType(32)
 I64 = ir.IntType(64)
 VECTOR_IR = ir.VectorType(F32, LANES)
 INTEGERS_IR = ir.VectorType(I32, LANES)
-# x + 1.5 * 2^23 has its last bit at 1, so it is rounded to an integer, which sits in the low bits of the sum.
+# The sum x + 1.5 * 2^23 is rounded to an integer, because the last bit of its fraction has the value 1. Minus the bits
+# of 1.5 * 2^23, the bits of the sum are the rounded x as int32.
 _ROUNDING_SHIFT = 1.5 * 2**23
 _ROUNDING_BITS = int(np.float32(_ROUNDING_SHIFT).view(np.int32))
 _EXP2 = np.polynomial.Chebyshev.interpolate(np.exp2, 5, domain=[-0.5, 0.5])
@@ -98,6 +99,7 @@ def _operand(context, builder, value, type_, element):
 
 
 def in_every_lane(builder, scalar):
+    """Return a vector with the scalar in every lane, for code in LLVM's terms."""
     undefined = ir.Constant(ir.VectorType(scalar.type, LANES), ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(I32, 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(INTEGERS_IR, [0] * LANES))
@@ -268,6 +270,7 @@ def _each(builder, name, vector):
 
 
 def unpack(builder, values):
+    """Return the elements of a tuple as a list."""
     return list(cgutils.unpack_tuple(builder, values))
 
 
@@ -287,34 +290,35 @@ def store(builder, array, offset, vector):
 
 
 def address(builder, array, offset, kind):
+    """Return the address of element `offset`, as a pointer to this kind."""
     return builder.bitcast(builder.gep(array, [offset], inbounds=True), kind.as_pointer())
 
 
 def gather(count):
-    """Return a function (array, stride, column, start, last) that returns `count` neighbouring columns of an array.
+    """Return a function (array, stride, column, start, end) that returns `count` neighbouring columns of an array.
 
-    The first is array[i * stride + column] for i = start, ..., start + 15, with last - 1 for any i beyond that.
+    The first is array[i * stride + column] for i = start, ..., start + 15, with end - 1 for any i beyond that.
     """
 
     @vector_function(_vectors(count))
-    def gather(builder, array, stride, column, start, last):
+    def gather_columns(builder, array, stride, column, start, end):
         vectors = [ir.Constant(VECTOR_IR, ir.Undefined)] * count
-        firsts = _rows(builder, stride, start, last)
+        firsts = _rows(builder, stride, start, end)
         for k, (lane, first) in product(range(count), enumerate(firsts)):
             place = builder.add(builder.add(first, column), ir.Constant(first.type, k))
             value = builder.load(builder.gep(array, [place], inbounds=True))
             vectors[k] = builder.insert_element(vectors[k], value, ir.Constant(I32, lane))
         return vectors
 
-    return gather
+    return gather_columns
 
 
 @vector_function(types.void)
-def scatter(builder, array, start, last, vectors):
-    """Write vectors as `gather` reads them, one for each column. No row beyond last - 1 is written."""
+def scatter(builder, array, start, end, vectors):
+    """Write vectors as `gather` reads them, one for each column. No row beyond end - 1 is written."""
     rows = unpack(builder, vectors)
-    firsts = _rows(builder, ir.Constant(I64, len(rows)), start, last)
-    # Backwards, so that the last write to row last - 1 is the right one.
+    firsts = _rows(builder, ir.Constant(I64, len(rows)), start, end)
+    # Backwards, so that the final write to row end - 1 is the right one.
     for lane, (k, vector) in product(reversed(range(LANES)), enumerate(rows)):
         value = builder.extract_element(vector, ir.Constant(I32, lane))
         place = builder.add(firsts[lane], ir.Constant(I64, k))
@@ -325,11 +329,11 @@ def columns(count):
     """Return a function (array, stride, start) that returns 16 neighbours of each of `count` rows of a flat array."""
 
     @vector_function(_vectors(count))
-    def columns(builder, array, stride, start):
+    def load_columns(builder, array, stride, start):
         firsts = [builder.add(start, builder.mul(stride, ir.Constant(I64, k))) for k in range(count)]
         return [builder.load(address(builder, array, first, VECTOR_IR), align=4) for first in firsts]
 
-    return columns
+    return load_columns
 
 
 @vector_function(types.void)
@@ -351,7 +355,9 @@ def gathered_rows(builder, array, places, start):
     return transposed(builder, rows)
 
 
-def transposed(builder, matrix):
+def transposed(builder, rows):
+    """Return the 16 columns of a matrix of 16 rows, as vectors."""
+    matrix = list(rows)
     for step in (1, 2, 4, 8):  # each round swaps the off-diagonal squares of this size
         for i in (i for i in range(LANES) if not i & step):
             a = matrix[i]
@@ -363,8 +369,8 @@ def transposed(builder, matrix):
     return matrix
 
 
-def _rows(builder, stride, start, last):
-    """Return the offsets of the rows start, ..., start + 15 of a flat array. Row last - 1 replaces those beyond it."""
-    final = builder.sub(last, ir.Constant(last.type, 1))
+def _rows(builder, stride, start, end):
+    """Return the offsets of the rows start, ..., start + 15 of a flat array. Row end - 1 replaces those beyond it."""
+    final = builder.sub(end, ir.Constant(end.type, 1))
     numbers = [builder.add(start, ir.Constant(start.type, lane)) for lane in range(LANES)]
     return [builder.mul(builder.select(builder.icmp_signed("<", i, final), i, final), stride) for i in numbers]
