@@ -21,6 +21,7 @@ EXTRAS = {
     "background": "to cut objects out of photos",
     "grabcut": "to cut them out roughly, by colour, without a download",
     "mesh": "to write meshes",
+    "render": "to render meshes without Blender",
     "heic": "to read the photos of iPhones",
     "colmap": "to find cameras of photos, to read captures whose lens distorts",
     "slurm": "to spread sweeps over a cluster",

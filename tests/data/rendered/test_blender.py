@@ -17,7 +17,7 @@ from completesplat.data.rendered.blender import VARIABLE, find_blender
 from completesplat.data.rendered.rendering import render
 from completesplat.errors import DataError, DiskError
 
-QUICK = ["views=2", "size=8", "workers=1"]
+QUICK = ["views=2", "size=8", "workers=1", "renderer=blender"]
 
 
 @pytest.fixture(autouse=True)

@@ -13,7 +13,7 @@ from packed_sequences import contents
 from PIL import Image
 from support import strict_json, waited_for, write_program
 
-QUICK = ["views=2", "size=8", "samples=1", "workers=1"]
+QUICK = ["views=2", "size=8", "samples=1", "workers=1", "renderer=blender"]
 # Stands for Blender: copies files of two views; refuses `c_broken`; lists the meshes that it got.
 STAND_IN = """
 if [ "$1" = --version ]; then echo Blender 4.2.0; exit; fi
