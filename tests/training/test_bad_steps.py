@@ -12,6 +12,7 @@ from small_runs import Batches
 from support import LIMIT, SMALL, strict_json
 
 from completesplat.errors import DivergenceError
+from completesplat.losses import WeightedSum
 from completesplat.training.callbacks import BadSteps, ExponentialMovingAverage
 from completesplat.training.checkpoints import CheckpointFiles, Checkpoints
 from completesplat.training.reconstruction import ReconstructionModule
@@ -265,12 +266,13 @@ def test_a_run_that_diverges_ends_with_one_line_and_keeps_its_checkpoint(command
 
 def test_a_run_with_one_bad_step_says_so_in_json_that_is_valid(command, toy_root, tmp_path, monkeypatch):
     """The last step is bad, so that its loss is among the results."""
-    render = ReconstructionModule.render
+    weighted = WeightedSum.__call__
 
-    def failing(self, gaussians, scenes):
-        return render(self, gaussians, scenes) * (NAN if self.training and self.global_step == 1 else 1.0)
+    def failing(self, prediction, truth, step):
+        total, terms = weighted(self, prediction, truth, step)
+        return total * (NAN if step == 1 else 1.0), terms
 
-    monkeypatch.setattr(ReconstructionModule, "render", failing)
+    monkeypatch.setattr(WeightedSum, "__call__", failing)
     assert fit(command, toy_root, tmp_path / "run").status == 0
     result = strict_json(tmp_path / "run/metrics.json")
     assert result["train/bad_steps"] == 1
