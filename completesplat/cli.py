@@ -10,7 +10,7 @@ VERBS = ("data", "plan", "fit", "test", "predict", "view", "report", "new", "ben
 def main() -> None:
     """Run the command.
 
-    The exit status is 0 only if everything worked, 2 for a refused input, 1 for other failures.
+    The exit status is 0 only if everything worked, 2 for a refused input, 130 after Ctrl-C, 1 for other failures.
     """
     try:
         try:
@@ -26,7 +26,7 @@ def main() -> None:
 def _check_output() -> None:
     """Exit with status 1 if standard output cannot be written, in silence if its reader (`head`, say) has closed it."""
     try:
-        os.write(sys.stdout.fileno(), b"\n")
+        os.write(sys.stdout.fileno(), b"\n")  # fails if standard output was the reason
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more is written when Python ends
         if not isinstance(error, BrokenPipeError):

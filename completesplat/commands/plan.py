@@ -98,13 +98,14 @@ def training_data(config: DictConfig) -> SceneDataModule | None:
 
 
 def batch_of_device(config: DictConfig) -> int:
-    """Return the scenes that a device takes at once.
+    """Return the scenes that a device takes at once. Devices that are no positive number count as one.
 
     Raises:
         CompleteSplatError: devices cannot share the batch.
     """
     devices = config.trainer.devices
-    count = devices if isinstance(devices, int) else 1
+    count = devices if isinstance(devices, int) and devices > 0 else 1
+    count *= config.trainer.get("num_nodes", 1)
     return batch_per_process(config.data.batch_size, count, config.trainer.accumulate_grad_batches)
 
 

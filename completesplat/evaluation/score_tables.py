@@ -269,7 +269,7 @@ def time_cell(seconds: float | None) -> Cell:
 
 
 def score_tables(entries: Sequence[Entry]) -> list[Table]:
-    """Return a table for each protocol, in the order of data sets and protocols."""
+    """Return a table for each protocol, in the order of the protocols' names and of their data sets."""
     groups = group_by_protocol((entry, entry.protocol) for entry in entries)
     return [_score_table(f"own_{index}", group) for index, group in enumerate(groups, 1)]
 

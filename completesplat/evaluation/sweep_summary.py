@@ -131,7 +131,7 @@ def summarize(*folders: Path) -> tuple[list[Entry], tables.Table]:
         headings.append(tables.score_heading(name, formats[tables.metric_of(name)]))
     remarks = [CAPTION if rows else "No job of this sweep has finished.", *_progress_remarks(jobs)]
     if not alike:
-        remarks.append("Not all jobs were tested alike (data, resolution, scenes), and do not compare.")
+        remarks.append("Jobs were tested differently (data, resolution, scenes), so their scores cannot be compared.")
     for row in rows:
         if row.upper_bound:
             remarks.append(f"{row.label} has seen the views that it is scored on.")

@@ -58,12 +58,12 @@ class Framing:
     Attributes:
         size: side of the square images, in pixels.
         fov_degrees: their field of view; 50 is close to that of a phone's camera.
-        reads_exif: whether a photo has the field of view of its EXIF record, if it has one, in place of that.
+        reads_exif: whether the field of view of a photo's EXIF record replaces `fov_degrees`, if it has one.
         background: grey value from 0 to 1 behind transparent and removed pixels, white by default.
         object_share: share of the square's side that the longer side of an object fills. The square is then cropped
             around a cut-out or transparent object. None: the central square is cropped.
-        whole_object: whether the central square, and its field of view, is enlarged such that it holds the whole
-            cut-out or transparent object.
+        whole_object: whether the central square is enlarged such that it holds the whole cut-out or transparent object.
+            A field of view that is given or EXIF's grows with it; `fov_degrees` is of any square.
         training: what the weights know about their training images (`TrainingImages`); None: nothing is to be compared.
     """
 

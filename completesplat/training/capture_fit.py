@@ -32,7 +32,7 @@ from completesplat.tensors import stack
 from completesplat.training.optimization import Schedule, constant
 from completesplat.training.stage import Stage
 
-REFINED_SHARE = 0.8  # of the run, in which Gaussians move and are added (25,000 of 30,000 steps in 3DGS-MCMC)
+REFINED_SHARE = 0.8  # of the run, in which Gaussians move and are added (close to 25,000 of 30,000 steps in 3DGS-MCMC)
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class CaptureFit(Stage):
         formats, videos, frames: as in `OutputFiles`, without `ply`. A format whose writing fails is left out.
     """
 
-    first_novel = 0  # all held-out photos count as one
+    first_novel = 0  # every held-out photo, the reference too, is scored as a novel view
     unused_settings = ("optimizer", "schedule")
 
     def __init__(

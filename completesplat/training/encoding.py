@@ -1,4 +1,4 @@
-"""Latent cache: a training set encoded once by the frozen autoreconstructor, and latents drawn from it."""
+"""Latent cache: a training set encoded once by the frozen autoreconstructor."""
 
 import hashlib
 import logging

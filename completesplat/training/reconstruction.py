@@ -221,6 +221,10 @@ class ReconstructorOnly(ReconstructionModule):
         self.code_steps = code_steps
         self.code_rate = code_rate
 
+    def latent_figures(self, scenes: SceneBatch) -> dict[str, float]:
+        """Return no figures, because a code has no posterior, and a scene's takes a fit."""
+        return {}
+
     def setup(self, stage: str) -> None:
         """Allocate a code for each training image, unless a checkpoint has codes."""
         if stage == "fit" and not len(self.model.codes):

@@ -97,7 +97,9 @@ def test_jobs_that_were_not_tested_alike_are_not_ranked_and_share_no_naive_rows(
         sweep.scored("ablation=full", f"seed={seed}", psnr=25.0)
     rows, table = summarize(sweep.folder)
     assert [row.label for row in rows] == ["m1", "full"]
-    assert "Not all jobs were tested alike (data, resolution, scenes), and do not compare." in table.remarks
+    assert (
+        "Jobs were tested differently (data, resolution, scenes), so their scores cannot be compared." in table.remarks
+    )
     assert not any(cell.mark for row in table.rows for cell in row.cells)
 
 

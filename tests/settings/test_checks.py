@@ -144,7 +144,7 @@ def test_a_wrong_value_is_reported_under_the_setting_that_the_user_gave():
         ("fit ablation=no_skip", r"no ablation 'no_skip': there are full, .*; did you mean no_skips"),
         (
             "fit -m loss=stge1,stage2",
-            r"no loss 'stge1': .* perceptual, splats, stage1, stage2, things; did you mean stage1",
+            r"no loss 'stge1': .* perceptual, .*, things; did you mean stage1",
         ),
         ("fit data=null", "Config group override must be a string or a list"),
         ("fit ablaton=no_ssim", r"Could not override 'ablaton'.*; did you mean ablation"),

@@ -105,7 +105,7 @@ def draw_cameras(
         fov: smallest and largest field of view in degrees, drawn once for an object.
 
     Raises:
-        CompleteSplatError: the kind is unknown, or the file's cameras cannot be read.
+        CompleteSplatError: the kind is unknown, the file's cameras cannot be read, or `front` is given with a file.
     """
     if kind not in ("turn", "hemisphere"):
         if Path(kind).suffix != ".json":

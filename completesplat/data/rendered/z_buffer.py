@@ -1,4 +1,12 @@
-"""Visibility of triangles by a z-buffer, and bilinear lookups in halved textures: compiled kernels."""
+"""Compiled kernels: nearest triangles and rectangles, lookups in textures, soft shadows.
+
+Arguments that several kernels share:
+    texels: linear RGBA of all textures, 16 bits each, one copy of a texture after the other (`mesh_reading.Textures`).
+    levels: [texture level 3] first value, width and height of each copy of a texture, whose sides are half those of the
+        copy before.
+    texture: number of a triangle's or sample's texture.
+    uv: texture coordinates; v goes up, and both repeat after 1.
+"""
 
 from functools import partial
 from math import ceil, floor, log2
@@ -8,7 +16,7 @@ from completesplat.rasterizers.kernels.compilation import helper, kernel
 NEAR = 1e-4  # depth up to which a triangle is left out
 NOTHING = -1  # number of the triangle where no triangle is
 OPAQUE = 0.5  # least alpha of what is drawn
-BYTES = 65535.0
+LARGEST = 65535.0  # value of a texel
 
 # Without the kernels' "fastmath", so that all machines draw the same images.
 compiled = partial(kernel, fastmath=False)
@@ -39,7 +47,7 @@ def bilinear(texels, start, width, height, u, v, channel):
     upper += across * texel(texels, start, width, right, top, channel)
     lower = (1 - across) * texel(texels, start, width, left, below, channel)
     lower += across * texel(texels, start, width, right, below, channel)
-    return ((1 - down) * upper + down * lower) / BYTES
+    return ((1 - down) * upper + down * lower) / LARGEST
 
 
 @compiled
@@ -49,9 +57,9 @@ def draw_triangles(points, uv, texture, texels, levels, cut, triangles, weights,
     Args:
         points: [triangle 3 3] x and y in pixels, and depth, of the corners.
         cut: whether a texture's transparent parts are left out.
-        triangles: [height width], written: number of the triangle, or `NOTHING`.
-        weights: [height width 2], written: perspectively correct weights of the second and third corner.
-        depth: [height width], written; infinite where nothing is.
+        triangles: [height width], full of `NOTHING`; overwritten by the number of the nearest triangle.
+        weights: [height width 2]; overwritten by perspectively correct weights of the second and third corner.
+        depth: [height width], infinite; overwritten where a triangle is nearer.
     """
     height, width = depth.shape
     for t in range(len(points)):
@@ -171,8 +179,8 @@ def draw_rectangles(eye, rotation, focal, center, rectangles, numbers, depth):
     Args:
         eye, rotation, focal, center: a pinhole camera; `rotation` is from the world to the camera.
         rectangles: [rectangle 4 3] a corner, the vectors of the two sides, which are perpendicular, and the normal.
-        numbers: [height width], written: number of the rectangle, or `NOTHING`.
-        depth: [height width], written; infinite where nothing is.
+        numbers: [height width], full of `NOTHING`; overwritten by the number of the nearest rectangle.
+        depth: [height width], infinite; overwritten where a rectangle is nearer.
     """
     height, width = depth.shape
     for k in range(len(rectangles)):

@@ -28,8 +28,9 @@ def calibration_rows(renderer: SampleRenderer, scenes: Scenes, tick: OnProgress,
     """Return a row for each region of novel views (`novel_values`), with means over the scenes.
 
     `energy_N` is the energy score of N samples, `below_all` and `above_all` are the ends of the rank histogram `ranks`.
-    `spread` and `error` are the roots of the means of `squares`. `bins` has them for `BINS` equally large groups of
-    values, ordered by the samples' variance. The settings are skip and guidance weight (`Sampling`).
+    `spread` and `error` are the roots of the means of `squares`. `bins` has those of the second half of the samples,
+    for `BINS` equally large groups of values that are ordered by the variance of the first half. The settings are skip
+    and guidance weight (`Sampling`).
     """
     measured = defaultdict[str, list[SceneCalibration]](list)
     for index, scene in enumerate(scenes):
