@@ -113,7 +113,7 @@ def test_masked_diffusion_starts_from_all_weights_of_the_main_stage(pipeline):
         ([*FROM_STAGE_1, "conditioning.channels=[8,8,16]"], "latents are 4x4 and the conditioning's features 8x8"),
     ],
 )
-def test_starts_that_cannot_work_are_refused(pipeline, settings, message):
+def test_starts_that_cannot_work_are_refused(pipeline, settings, message, tmp_path):
     files = {stage: getattr(pipeline, stage) / "checkpoints/last.ckpt" for stage in ("var", "diffusion")}
     given = [setting.format(**files) for setting in settings]
-    assert message in refused("fit", f"data.root={pipeline.toy}", *QUICK, *given, "out=run")
+    assert message in refused("fit", f"data.root={pipeline.toy}", *QUICK, *given, f"out={tmp_path / 'run'}")
