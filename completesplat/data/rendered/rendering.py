@@ -97,10 +97,7 @@ def render(
     """
     of_scenes = {name: value for name, value in job.items() if name in RenderSettings.__annotations__}
     settings = cast(RenderSettings, of_scenes)
-    if (meshes is None) == (factory is None):
-        raise CompleteSplatError("give either meshes=FOLDER or factory=NAME (of Infinigen, such as SofaFactory)")
-    if meshes is not None and out.resolve().is_relative_to(Path(meshes).resolve()):
-        raise DataError(f"lies in meshes={meshes}, and its points would be taken for meshes", f"out={out}")
+    _check_places(meshes, factory, out)
     check_surroundings(settings)
     draw_rendered_scene("", settings)  # refuses cameras that cannot be read
     objects = find_meshes(Path(meshes)) if meshes is not None else []
@@ -113,15 +110,10 @@ def render(
     if factory is not None and program is not None:
         objects = procedural_objects(program, factory, count)
     mine = share_of(objects, job["shard"], job["shards"])
-    parameters: dict[str, object] = {"format": FORMAT_VERSION, **settings}
-    if not by_blender:
-        parameters["renderer"] = renderer
     lock = FileLock(out / LOCK)
     out.mkdir(parents=True, exist_ok=True)
     with lock:
-        if not category_writers.is_written(category / DESCRIPTION, parameters):
-            with atomic_folder(category) as unfinished:
-                (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
+        _begin(category, settings, by_blender)
     waiting = [asset for asset in mine if not (category / asset.name).exists()]
     most = (MEGABYTE * job["max_megabytes"], job["max_minutes"])
     write_one = partial(_write_object, category, program, by_blender, settings, most)
@@ -132,6 +124,24 @@ def render(
     with lock:
         _write_lists(category, objects, broken, len(waiting) - len(broken))
     return category
+
+
+def _check_places(meshes: str | None, factory: str | None, out: Path) -> None:
+    """Refuse neither or both of meshes and factory, and results among the meshes."""
+    if (meshes is None) == (factory is None):
+        raise CompleteSplatError("give either meshes=FOLDER or factory=NAME (of Infinigen, such as SofaFactory)")
+    if meshes is not None and out.resolve().is_relative_to(Path(meshes).resolve()):
+        raise DataError(f"lies in meshes={meshes}, and its points would be taken for meshes", f"out={out}")
+
+
+def _begin(category: Path, settings: RenderSettings, by_blender: bool) -> None:
+    """Write the settings into a new folder of renders; refuse a folder that other settings began."""
+    parameters: dict[str, object] = {"format": FORMAT_VERSION, **settings}
+    if not by_blender:
+        parameters["renderer"] = "mesh"
+    if not category_writers.is_written(category / DESCRIPTION, parameters):
+        with atomic_folder(category) as unfinished:
+            (unfinished / DESCRIPTION).write_text(json.dumps(parameters, indent=1, sort_keys=True) + "\n")
 
 
 def _write_lists(category: Path, objects: Sequence[Asset], broken: dict[str, str], new: int) -> None:
