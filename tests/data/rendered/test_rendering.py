@@ -183,7 +183,7 @@ def test_renders_that_were_killed_continue_without_half_written_scenes(cubes, tm
     command = ["data", "render", f"meshes={cubes / 'meshes'}", f"out={tmp_path}", *given]
     process = subprocess.Popen([sys.executable, "-P", "-m", "completesplat", *command], start_new_session=True)
     category = tmp_path / "rendered"
-    done, begun = "[!.]*/object.json", ".*/blender/job.json"
+    done, begun = "[!.]*/object.json", ".*/renderer/job.json"
     assert waited_for(lambda: process.poll() is not None or (any(category.glob(done)) and any(category.glob(begun))))
     assert process.returncode is None  # it has not ended by itself
     os.kill(process.pid, number)
