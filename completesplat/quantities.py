@@ -38,6 +38,6 @@ Widths = Annotated[Sequence[Width], Entries(1), Entries(most=8)]
 Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], Entries(most=8)]
 Few = Annotated[int, Range(1, 16)]
 
-Format = Literal["ply", "splat", "glb", "mesh", "spz", "sog", "html"]  # of a scene's files
+Format = Literal["ply", "compressed.ply", "splat", "spz", "glb", "usdz", "mesh", "sog", "html"]  # of a scene's files
 SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")  # files of Gaussians that are read
 CameraPath = Literal["orbit", "swipe", "wobble"]  # of a video

@@ -31,6 +31,7 @@ NEVER_IMPORTED = {
     "pytest-xdist": "an option of pytest",
     "ruff": "a program",
     "sphinx": "`make site`",
+    "zstandard": "gsply's, for spz of version 4",
 }
 
 # Scripts that Blender's Python runs, which has its own packages.
@@ -103,6 +104,7 @@ ALLOWED = {
     "CC0-1.0",
     "CNRI-Python",
     "ISC",
+    "LicenseRef-TOST-1.0",  # usd-core's: Apache 2.0 with another section on trademarks
     "MIT",
     "MIT-CMU",
     "MPL-2.0",

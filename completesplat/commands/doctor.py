@@ -21,8 +21,8 @@ EXTRAS = {
     "background": "to cut objects out of photos",
     "grabcut": "to cut them out roughly, by colour, without a download",
     "mesh": "to write meshes",
+    "usd": "to write usdz",
     "render": "to render meshes without Blender",
-    "heic": "to read the photos of iPhones",
     "colmap": "to find cameras of photos, to read captures whose lens distorts",
     "slurm": "to spread sweeps over a cluster",
     "perceptual": "to train on perceptual features without a download",
@@ -109,7 +109,7 @@ def programs() -> Iterator[tuple[str, str]]:
 
     yield "ffmpeg", imageio_ffmpeg.get_ffmpeg_exe()
     node = shutil.which("splat-transform") or shutil.which("npx")
-    yield "node", node or "missing, for the formats spz, sog and html: Node.js 20 or newer with npm, https://nodejs.org"
+    yield "node", node or "missing, for the formats sog and html: Node.js 20 or newer with npm, https://nodejs.org"
     try:
         blender = find_blender()
         yield "blender", f"{blender.version}, {blender.command[0]}"

@@ -295,6 +295,7 @@ def output_files(config: DictConfig) -> OutputFiles:
         frames=config.frames,
         maps=config.maps,
         screen_space_dilation=config.screen_space_dilation,
+        spz_version=config.spz_version,
     )
     if set(formats) & set(CONVERTED):
         find_splat_transform()  # before the model runs

@@ -68,10 +68,13 @@ def write_glb(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
 
 
 def write_mesh(path: Path, mesh: Mesh, comments: Sequence[str] = ()) -> None:
-    """Write a mesh with colours at its vertices, turned as by `write_glb`, and log its resolution."""
+    """Write a mesh with colours at its vertices, turned as by `write_glb`, and log its resolution.
+
+    Colours are float32, because trimesh keeps the lower half of the 16 bits of integers.
+    """
     arrays = {
         "POSITION": transform_points(TO_GLTF, mesh.vertices.cpu()).numpy().astype("<f4"),
-        "COLOR_0": _linear(mesh.colors.cpu(), torch.ones(len(mesh.colors), 1)),
+        "COLOR_0": _linear(mesh.colors.cpu(), torch.ones(len(mesh.colors), 1)).numpy().astype("<f4"),
         "indices": mesh.faces.astype("<u4").reshape(-1, 1),
     }
     used = {"extensionsUsed": [UNLIT], "materials": [MATERIAL]}
@@ -92,14 +95,14 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": (gaussians.colors - 0.5) / SH_C0,
     }
     arrays = {name: values.numpy().astype("<f4") for name, values in tensors.items()}
-    arrays["COLOR_0"] = _linear(colors, opacities)
+    arrays["COLOR_0"] = _linear(colors, opacities).mul(65535).round().numpy().astype("<u2")
     return arrays
 
 
-def _linear(colors: Float[Tensor, "n 3"], opacities: Float[Tensor, "n 1"]) -> np.ndarray:
+def _linear(colors: Float[Tensor, "n 3"], opacities: Float[Tensor, "n 1"]) -> Float[Tensor, "n 4"]:
     """Convert sRGB to linear light (IEC 61966-2-1), in which glTF stores colours of points and vertices."""
     linear = torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
-    return torch.cat([linear, opacities], dim=-1).mul(65535).round().numpy().astype("<u2")
+    return torch.cat([linear, opacities], dim=-1)
 
 
 def _write_gltf(path: str | Path, arrays: dict[str, np.ndarray], primitive: Any, others: Any, comments: Any) -> None:
@@ -119,7 +122,7 @@ def _write_gltf(path: str | Path, arrays: dict[str, np.ndarray], primitive: Any,
         if name == "POSITION":
             accessor["min"] = array.min(0).tolist()
             accessor["max"] = array.max(0).tolist()
-        elif name == "COLOR_0":
+        elif array.dtype == np.uint16:
             accessor["normalized"] = True
         accessors.append(accessor)
         target = ELEMENT_ARRAY_BUFFER if name == "indices" else ARRAY_BUFFER

@@ -8,10 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from completesplat.export import mesh, usdz
 from completesplat.export.cleaning import with_screen_space_dilation
+from completesplat.export.compressed import SpzVersion
 from completesplat.export.formats import suffix as format_suffix
 from completesplat.export.formats import write_format
-from completesplat.export.mesh import check_available
 from completesplat.export.placed_scene import PlacedScene, on_optical_axis
 from completesplat.export.splat_transform import PageView
 from completesplat.export.video import render_views, write_video
@@ -35,6 +36,7 @@ class OutputFiles:
         background: grey value behind the scene.
         maps: whether a prediction gets the depth, normals and opacity of the photo's view.
         screen_space_dilation: whether to store Gaussians `with_screen_space_dilation`.
+        spz_version: version of `.spz` files.
     """
 
     formats: Sequence[Format] = ("ply",)
@@ -43,10 +45,13 @@ class OutputFiles:
     background: float = 0.5
     maps: bool = False
     screen_space_dilation: bool = True
+    spz_version: SpzVersion = 3
 
     def __post_init__(self) -> None:
         if "mesh" in self.formats:
-            check_available()
+            mesh.check_available()
+        if "usdz" in self.formats:
+            usdz.check_available()
 
 
 def write_scene(
@@ -77,7 +82,7 @@ def write_scene(
     files: dict[str, str] = {}
     for kind in outputs.formats:
         on_file(name + format_suffix(kind))
-        files.update(write_format(folder, name, kind, stored, view, comments, rasterizer))
+        files.update(write_format(folder, name, kind, stored, view, comments, rasterizer, outputs.spz_version))
     for path in outputs.videos:
         video = f"{path}{suffix}.mp4"
         on_file(video)

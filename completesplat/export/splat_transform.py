@@ -56,8 +56,8 @@ def _find(program: str | None, npx: str | None) -> str:
     if program is None:
         if npx is None:
             raise CompleteSplatError(
-                "formats spz, sog and html need Node.js 20 or newer with npm (https://nodejs.org);"
-                " ply, splat and glb need nothing"
+                "formats sog and html need Node.js 20 or newer with npm (https://nodejs.org);"
+                " ply, compressed.ply, splat, spz and glb need nothing"
             )
         program = _run([npx, "--yes", f"--package={PACKAGE}", "-c", f"command -v {PROGRAM}"]).strip()
     _run([program, "--version"])

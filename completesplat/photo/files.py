@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pi_heif
 from PIL import Image, ImageFile, UnidentifiedImageError
 
 from completesplat.errors import BadImage, ImageError, MissingFile
@@ -16,8 +17,6 @@ from completesplat.photo.exif import ORIENTATION, TRANSPOSITIONS, Tags, read_exi
 from completesplat.wording import by_numbers
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
-HEIC = (".heic", ".heif")
-NEEDS_HEIC = '; HEIC needs: pip install "completesplat[heic]"'
 MOST_PIXELS = 64_000_000  # cameras of 61 million pixels are common
 MOST_BYTES = 2**28
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
@@ -98,12 +97,8 @@ def stored_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORM
 
 
 def photo_formats(formats: tuple[str, ...] = FORMATS) -> tuple[str, ...]:
-    """Return the formats of photos, with that of HEIC where pillow-heif is installed."""
-    try:
-        import pillow_heif
-    except ImportError:
-        return formats
-    pillow_heif.register_heif_opener()
+    """Return the formats of photos, with that of HEIC, whose reader is registered with Pillow."""
+    pi_heif.register_heif_opener()
     return *formats, "HEIF"
 
 
@@ -144,8 +139,7 @@ def open_image(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator
         except ImageError:
             raise
         except UnidentifiedImageError:
-            advice = "" if "HEIF" in formats or not str(source).lower().endswith(HEIC) else NEEDS_HEIC
-            raise ImageError(f"not an image in one of the formats {', '.join(formats)}{advice}") from None
+            raise ImageError(f"not an image in one of the formats {', '.join(formats)}") from None
         except Image.DecompressionBombError:
             raise ImageError(f"more than {MOST_PIXELS:,} pixels; make it smaller first") from None
         # On damaged files, Pillow's decoders raise almost any exception: OSError, SyntaxError, struct.error, ...

@@ -81,6 +81,7 @@ class PredictSettings(SceneSettings):
     cameras: str | None
     screen_space_dilation: bool
     maps: bool
+    spz_version: Literal[3, 4]
     formats: Format | Sequence[Format] | Literal[False] | None
     video: CameraPath | Sequence[CameraPath] | Literal[False] | None
 

@@ -111,7 +111,11 @@ def add_view_controls(gui: viser.GuiApi) -> SimpleNamespace:
 def add_save_controls(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
     """Add the folder `Save`, and return handles of the file's `kind` (a format or a video) and of the button `save`."""
     with gui.add_folder("Save", order=4):
-        kind = gui.add_dropdown("Format", (*formats, VIDEO), hint="spz and sog need Node.js, mesh completesplat[mesh]")
+        kind = gui.add_dropdown(
+            "Format",
+            (*formats, VIDEO),
+            hint="sog and html need Node.js, usdz completesplat[usd], mesh completesplat[mesh]",
+        )
         return SimpleNamespace(kind=kind, save=gui.add_button("Save", hint="what is shown, with all layers"))
 
 

@@ -19,6 +19,7 @@ from completesplat.commands import trained
 from completesplat.commands.inputs import find_images
 from completesplat.commands.predict import output_files, run
 from completesplat.errors import CompleteSplatError
+from completesplat.export.formats import FORMATS
 from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.generator import CompleteSplat
@@ -322,9 +323,12 @@ def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_pat
     monkeypatch.setitem(sys.modules, "skimage", None)
     monkeypatch.setenv("PATH", str(tmp_path))
     for setting, message in (
-        ("formats=html", "formats spz, sog and html need Node.js"),
+        ("formats=html", "formats sog and html need Node.js"),
         ("formats=mesh", 'formats=[mesh] needs scikit-image: pip install "completesplat[mesh]"'),
-        ("formats=[]", "formats=[] video=[]: choose a format (ply, splat, glb, mesh, spz, sog, html) or a video"),
+        (
+            "formats=[]",
+            f"formats=[] video=[]: choose a format ({', '.join(FORMATS)}) or a video",
+        ),
         ("mask=x.png", "mask=FILE belongs to one image"),
         ("image=nofile.jpg", "nofile.jpg: no such file"),
     ):

@@ -101,17 +101,6 @@ def test_photos_of_one_camera_keep_their_scale_and_the_elevation_is_that_given(t
         assert frame.world_to_camera[2, :3] @ eye == pytest.approx(-np.linalg.norm(eye))  # it looks at the origin
 
 
-def test_photos_of_phones_are_read_where_their_reader_is_installed(turns, tmp_path):
-    """Checked with pillow-heif 1.8.1, whose wheels hold x265 (GPL): it is no requirement of the tests."""
-    heif = pytest.importorskip("pillow_heif")
-    heif.register_heif_opener()
-    for path in sorted((turns / "a/left").iterdir()):
-        Image.open(path).convert("RGB").save(path.with_suffix(".HEIC"), quality=95)
-        path.unlink()
-    out = import_turns(turns / "a", tmp_path / "out")
-    assert angles_to(out / "left", AZIMUTHS).max() < 0.2
-
-
 def test_numbers_in_file_names_are_positions_in_the_turn(turns, tmp_path):
     kept = [0, 1, 2, 3, 5, 6, 7, 8, 9, 11]
     for index in kept:  # the third in the next turn

@@ -25,6 +25,7 @@ VIEW = PageView(CAMERA, torch.tensor([0.0, 0, 3]), torch.tensor([0.0, -1, 0]), 0
 # Largest errors: positions (units), logarithms of scales, opacities and colours, and of the rotation's entries.
 PRECISION = {
     "splat": (1e-6, 1e-5, 0.5 / 255, 0.02),
+    "compressed.ply": (4e-3, 0.02, 1 / 255, 0.01),
     "spz": (1 / 4096, 1 / 32 + 1e-4, 1 / 255, 0.005),
     "sog": (1e-3, 0.02, 1 / 255, 0.03),
 }
@@ -42,21 +43,21 @@ def some(count: int = 400) -> Gaussians:
 def written(converter, tmp_path_factory):
     """A folder with the scene in all formats, and each of them converted back."""
     folder = tmp_path_factory.mktemp("formats")
-    for kind in ("ply", "splat", "spz", "sog"):
+    for kind in ("ply", *PRECISION):
         write_format(folder, "a", kind, some(), VIEW)
     for kind in PRECISION:
-        convert(converter, folder / f"a.{kind}", folder / f"{kind}.ply")
+        convert(converter, folder / f"a.{kind}", folder / f"{kind.partition('.')[0]}_back.ply")
     return folder
 
 
 @pytest.mark.parametrize("kind", PRECISION)
 def test_every_format_reads_back_as_the_same_gaussians_on_the_same_axes(written, kind):
     own = read_ply(written / "a.ply")
-    back = read_ply(written / f"{kind}.ply")
+    back = read_ply(written / f"{kind.partition('.')[0]}_back.ply")
     distances = torch.cdist(own.means.double(), back.means.double())
     nearest = distances.argmin(1)
     assert sorted(nearest.tolist()) == list(range(own.count))  # each Gaussian is there once
-    if kind != "sog":  # which sorts by place
+    if kind not in ("sog", "compressed.ply"):  # which sort by place
         assert nearest.tolist() == list(range(own.count))
     back = back[nearest]
     place, scale, byte, rotation = PRECISION[kind]
@@ -69,19 +70,26 @@ def test_every_format_reads_back_as_the_same_gaussians_on_the_same_axes(written,
     assert (turns[0] - turns[1]).abs().max() <= rotation * 9
 
 
-def test_spz_has_y_up_and_z_to_the_viewer_as_its_format_says(written, converter):
-    """Read without the converter: version 3 is gzip, and positions are 24 bits with 12 behind the point.
-
-    Files are version 4, by nianticlabs/spz, README: magic number NGSP, then the version.
-    """
-    assert (written / "a.spz").read_bytes()[:8] == b"NGSP\x04\0\0\0"
-    convert(converter, written / "a.ply", written / "three.spz", ["--spz-version", "3"])
-    data = gzip.decompress((written / "three.spz").read_bytes())
+def test_spz_has_y_up_and_z_to_the_viewer_as_its_format_says(written):
+    """Read without a library: version 3 is gzip, and positions are 24 bits with 12 behind the point."""
+    data = gzip.decompress((written / "a.spz").read_bytes())
+    assert data[:8] == b"NGSP\x03\0\0\0"
     raw = np.frombuffer(data[16 : 16 + 400 * 9], np.uint8).reshape(400, 3, 3).astype(np.int32)
     fixed = raw[..., 0] | raw[..., 1] << 8 | raw[..., 2] << 16
     means = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed) / 4096
     expected = read_ply(written / "a.ply").means.numpy() * [1, -1, -1]
     assert np.abs(means - expected).max() <= 1 / 4096
+
+
+def test_both_versions_of_spz_hold_the_same(written, converter):
+    """By nianticlabs/spz, README: magic number NGSP, then the version."""
+    write_format(written, "four", "spz", some(), VIEW, spz_version=4)
+    assert (written / "four.spz").read_bytes()[:8] == b"NGSP\x04\0\0\0"
+    convert(converter, written / "four.spz", written / "four_back.ply")
+    three = read_ply(written / "spz_back.ply")
+    four = read_ply(written / "four_back.ply")
+    for name, values in vars(three).items():
+        torch.testing.assert_close(getattr(four, name), values, msg=name)
 
 
 def test_no_opacity_comes_back_from_spz_as_minus_infinity(tmp_path, converter):

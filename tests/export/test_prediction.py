@@ -1,11 +1,10 @@
 """The files of one prediction beside its splats: contact sheet, maps and description."""
 
 import dataclasses
-import os
 
 import numpy as np
 import torch
-from fake_converter import install
+from gsply import read_spz
 from image_sheets import cells
 from PIL import Image
 from support import some_gaussians, strict_json
@@ -13,7 +12,6 @@ from support import some_gaussians, strict_json
 from completesplat.export import prediction
 from completesplat.export.images import color_depth
 from completesplat.export.placed_scene import PlacedScene
-from completesplat.export.ply import read_ply
 from completesplat.export.scene_files import OutputFiles
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -69,9 +67,7 @@ def test_maps_share_one_scale_of_depth_and_agree_on_what_is_there(tmp_path):
         assert np.abs(normals[8, 8].astype(int) - [128, 128, 255]).max() <= 1
 
 
-def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path, monkeypatch):
-    program = install(tmp_path / "bin", "splat-transform")
-    monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
+def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path):
     bright = dataclasses.replace(scene_at(2, 0.9), colors=torch.tensor([[0.2, 0.4, 1.5], [0.0, 0.5, 1.0]]))
     faint = dataclasses.replace(scene_at(2, 0.9), opacities=torch.tensor([0.9, 1e-4]))
     wanted = OutputFiles(formats=("ply", "spz"), videos=())
@@ -81,4 +77,4 @@ def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path, 
     recorded = strict_json(tmp_path / "a/scene.json")["settings"]
     counted = [recorded[name] for name in ("gaussians", "colors_clipped", "left_out_of_spz")]
     assert counted == [[2, 2], [1, 0], [0, 1]]
-    assert [read_ply(tmp_path / f"a/sample_{i:02}.spz").count for i in (0, 1)] == [2, 1]
+    assert [len(read_spz(tmp_path / f"a/sample_{i:02}.spz")) for i in (0, 1)] == [2, 1]

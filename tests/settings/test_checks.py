@@ -22,7 +22,11 @@ ODD = [
     ("predict", "box=[a,b,c,d]", f"box=['a', 'b', 'c', 'd']: {NUMBER}"),
     ("predict", "weights=[a]", "weights=['a']: must be a text"),
     ("predict", "video=1", "video=1: choose one of orbit, swipe, wobble"),
-    ("predict", "formats=[ply,obj]", "formats=['ply', 'obj']: choose one of ply, splat, glb, mesh, spz, sog, html"),
+    (
+        "predict",
+        "formats=[ply,obj]",
+        "formats=['ply', 'obj']: choose one of ply, compressed.ply, splat, spz, glb, usdz, mesh, sog, html",
+    ),
     ("fit", "model=capture model.videos=[zoom]", "model.videos=['zoom']: choose one of orbit, swipe, wobble"),
     ("data", "scenes=many", f"scenes=many: {WHOLE}"),
     ("test", "overrides=5", "overrides=5: must be a list, such as overrides=[5]"),

@@ -55,8 +55,7 @@ def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
     present = {path for searched in folders for path in searched.glob("[!.]*") if path.is_file()}
     unread = sorted({path.name for path in present.difference(photos)})
     if unread:
-        advice = "" if "HEIF" in formats else files.NEEDS_HEIC
-        logger.warning("left out: %s of other formats: %s%s", counted(len(unread), "file"), first_names(unread), advice)
+        logger.warning("left out: %s of other formats: %s", counted(len(unread), "file"), first_names(unread))
     return photos
 
 
