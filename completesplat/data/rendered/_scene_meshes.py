@@ -34,17 +34,30 @@ AS_STORED = {
     "usdz": UNCHECKED,
 }
 
+UP_AXES = {
+    "y": {"up_axis": "Y", "forward_axis": "NEGATIVE_Z"},
+    "z": {"up_axis": "Z", "forward_axis": "Y"},
+}
+WITHOUT_STANDARD = ("obj", "ply", "stl")  # other formats say which axis points up
+
 
 class RefusedMesh(Exception):
     """Mesh that cannot be rendered."""
 
 
-def import_mesh(path: Path, root: Path) -> None:
-    """Import a file into the empty scene, or refuse one that Blender cannot read, or whose textures it cannot use."""
+def import_mesh(path: Path, root: Path, up: str | None) -> None:
+    """Import a file into the empty scene, or refuse one that Blender cannot read, or whose textures it cannot use.
+
+    Args:
+        up: axis that points up in files of `WITHOUT_STANDARD`; None: Blender's default.
+    """
     kind = path.suffix[1:].lower()
     module, name = IMPORTERS[kind].split(".")
+    settings: dict[str, Any] = dict(AS_STORED.get(kind, {}))
+    if up is not None and kind in WITHOUT_STANDARD:
+        settings |= UP_AXES[up]
     try:
-        getattr(getattr(bpy.ops, module), name)(filepath=str(path), **AS_STORED.get(kind, {}))
+        getattr(getattr(bpy.ops, module), name)(filepath=str(path), **settings)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip() and "Location:" not in line]
         reason = lines[-1] if "Traceback" in lines[0] else lines[0]

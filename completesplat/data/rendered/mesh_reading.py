@@ -21,9 +21,11 @@ SMOOTH = np.cos(np.radians(40.0))  # a corner is shaded smoothly if its faces' n
 SAME_PLACE = 1e-6  # of an object's size: corners that are nearer belong to one vertex
 METAL = 0.5
 GREY = 0.8  # linear, of faces without colour: Blender's own default
-Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-TURNS = {".ply": np.eye(3), ".obj": Y_UP, ".glb": Y_UP, ".gltf": Y_UP}
-"""Rotations that make z point up, by the rules of the formats (of PLY, which has none: as stored)."""
+TURNS = {"y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), "z": np.eye(3)}
+"""Rotations that make z point up, by the axis that points up in the file."""
+UP_AXES = {".glb": "y", ".gltf": "y", ".obj": "y", ".ply": "z"}
+"""Axes that point up: glTF's by its standard, the others' as most programs write them."""
+WITHOUT_STANDARD = (".obj", ".ply")
 
 
 @dataclass(frozen=True)
@@ -138,12 +140,13 @@ def import_trimesh() -> ModuleType:
     return trimesh
 
 
-def read_mesh(path: Path, root: Path) -> TexturedMesh:
+def read_mesh(path: Path, root: Path, up: str | None = None) -> TexturedMesh:
     """Read a mesh file with its textures.
 
     Args:
         path: a file with one of the suffixes in `READABLE`.
         root: folder that all its textures must lie in, with links resolved.
+        up: axis that points up in files of `WITHOUT_STANDARD`; None: as in `UP_AXES`.
 
     Raises:
         BrokenMesh: trimesh cannot read it, a texture is missing or cannot be read, or its faces cannot be drawn.
@@ -161,7 +164,8 @@ def read_mesh(path: Path, root: Path) -> TexturedMesh:
             raise BrokenMesh(reason) from error
     if files.refused:
         raise BrokenMesh(files.refused[0])
-    is_gltf = path.suffix.lower() in (".glb", ".gltf")
+    kind = path.suffix.lower()
+    is_gltf = kind in (".glb", ".gltf")
     description = gltf_description(path) if is_gltf else {}
     parts = []
     for geometry, matrix in geometries:
@@ -170,7 +174,8 @@ def read_mesh(path: Path, root: Path) -> TexturedMesh:
             parts.append(_part(geometry, matrix, is_gltf))
     if not parts:
         raise BrokenMesh("it has no faces")
-    return _joined(parts, TURNS[path.suffix.lower()], _beyond(description))
+    axis = up if up is not None and kind in WITHOUT_STANDARD else UP_AXES[kind]
+    return _joined(parts, TURNS[axis], _beyond(description))
 
 
 def _require_texture(geometry: Any, description: dict[str, Any]) -> None:

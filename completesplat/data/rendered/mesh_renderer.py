@@ -66,7 +66,7 @@ def draw_job(job: dict[str, Any], stopped: Event, minutes: float = math.inf) -> 
         BrokenMesh: the mesh cannot be drawn, or not in this time.
     """
     end = time.monotonic() + 60 * minutes
-    mesh = read_mesh(Path(job["mesh"]), Path(job["root"]))
+    mesh = read_mesh(Path(job["mesh"]), Path(job["root"]), job["up"])
     planes = surroundings(job, float(mesh.corners[..., 2].min()))
     lighting = light_of(job["light"], mesh, planes)
     folder = Path(job["folder"])

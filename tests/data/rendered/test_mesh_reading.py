@@ -56,6 +56,28 @@ def test_textures_are_found(cube, tmp_path, place, name):
     assert 0 < there < 1
 
 
+@pytest.mark.parametrize(("up", "tall"), [(None, 1), ("y", 1), ("z", 2)])
+def test_a_scan_stands_if_it_is_said_that_z_points_up(tmp_path, up, tall):
+    """The box is twice as high as wide; it lies on its back where y is taken to point up."""
+    mesh = read_mesh(meshes.write_scan(tmp_path / "scan"), tmp_path.resolve(), up)
+    sides = np.ptp(mesh.corners, axis=(0, 1))
+    assert sides.argmax() == tall
+    assert sides.max() == pytest.approx(2 * sides.min())
+    assert texture_of(tmp_path / "scan/meshes/model.obj", tmp_path) < 0.9
+
+
+def test_what_gltf_says_goes_before_a_given_axis_and_ply_has_none(tmp_path):
+    box = trimesh.creation.box((1, 1, 2))
+    tall = {}
+    for name in ("box.glb", "box.ply"):
+        box.export(tmp_path / name)
+        for up in (None, "y", "z"):
+            corners = read_mesh(tmp_path / name, tmp_path, up).corners
+            tall[name, up] = int(np.ptp(corners, axis=(0, 1)).argmax())
+    assert {tall["box.glb", up] for up in (None, "y", "z")} == {1}
+    assert [tall["box.ply", up] for up in (None, "y", "z")] == [2, 1, 2]
+
+
 def test_a_texture_that_is_missing_outside_or_damaged_is_refused(cube, tmp_path):
     path = moved(cube, "../../../outside.png")
     with pytest.raises(BrokenMesh, match=r"its texture model.png is missing"):

@@ -33,7 +33,7 @@ def camera(eye, size=SIZE, degrees=40.0):
 def drawn(mesh, folder, cameras, **changes):
     """Draw a mesh; return its images (sRGB, 0 to 1), and its depth, mask and coverage."""
     folder.mkdir(exist_ok=True)
-    job = {"mesh": str(mesh), "root": str(mesh.parent.resolve()), "folder": str(folder), "samples": 16}
+    job = {"mesh": str(mesh), "root": str(mesh.parent.resolve()), "folder": str(folder), "samples": 16, "up": None}
     job |= {"views": [view_of(one) for one in cameras], "room": 3.0, "floor": None, "wall": None}
     job |= {"light": UNIFORM, "hidden": None, **changes}
     record = draw_job(job, Event())
