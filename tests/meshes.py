@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,16 +19,8 @@ SQUARES = 4
 """Squares along an edge of the checker cube."""
 
 SETTINGS = {"cameras": "turn", "fov": [36, 55], "light": "random", "floor": "random", "wall": "none", "seed": 0}
-SETTINGS |= {
-    "front": None,
-    "hidden": "none",
-    "up": None,
-    "factory": None,
-    "count": 1,
-    "max_megabytes": 500,
-    "max_minutes": 5,
-}
-SETTINGS |= {"workers": 1, "shard": 0, "shards": 1}
+SETTINGS |= {"front": None, "hidden": "none", "factory": None, "count": 1, "max_megabytes": 500, "max_minutes": 5}
+SETTINGS |= {"up": None, "workers": 1, "shard": 0, "shards": 1}
 SETTINGS |= {"renderer": "blender"}
 """Settings of renders, without views, size and samples."""
 
@@ -56,6 +49,26 @@ def write_scan(folder: Path) -> Path:
     textures.mkdir(parents=True)
     path.with_suffix(".png").rename(textures / "texture.png")
     path.with_suffix(".mtl").write_text("newmtl checker\nmap_Kd texture.png\n")
+    return path
+
+
+def write_ball(path: Path, **material: Any) -> Path:
+    """Write a GLB of a grey ball with changes of its material, which is of no metal, in glTF's words."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(2)
+    ball.export(path)
+    content = path.read_bytes()
+    length = int.from_bytes(content[12:16], "little")
+    description = json.loads(content[20 : 20 + length])
+    metal = {"baseColorFactor": [0.5, 0.5, 0.5, 1], "metallicFactor": 0}
+    description["materials"] = [{"pbrMetallicRoughness": metal | material.pop("pbr", {}), **material}]
+    description["extensionsUsed"] = list(material.get("extensions", ()))
+    description["meshes"][0]["primitives"][0]["material"] = 0
+    text = json.dumps(description).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = len(text).to_bytes(4, "little") + content[16:20] + text + content[20 + length :]
+    path.write_bytes(content[:8] + (12 + len(chunks)).to_bytes(4, "little") + chunks)
     return path
 
 

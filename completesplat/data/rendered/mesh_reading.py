@@ -190,14 +190,27 @@ def _require_texture(geometry: Any, description: dict[str, Any]) -> None:
 def _beyond(description: dict[str, Any]) -> str:
     """Name what of a glTF's materials only Blender draws."""
     materials = description.get("materials", ())
+    extensions = {name for material in materials for name in material.get("extensions", ())}
     words = []
-    if any(x.get("pbrMetallicRoughness", {}).get("metallicFactor", 0) > METAL for x in materials):
+    if any(map(_is_metal, materials)):
         words.append("metal")
-    if "KHR_materials_transmission" in description.get("extensionsUsed", ()):
+    if "KHR_materials_transmission" in extensions:
         words.append("glass")
-    if any(x.get("alphaMode") == "BLEND" for x in materials):
+    if any(material.get("alphaMode") == "BLEND" for material in materials):
         words.append("half-transparent materials")
+    if any(any(material.get("emissiveFactor", ())) for material in materials):
+        words.append("materials that glow")
     return " and ".join(words)
+
+
+def _is_metal(material: dict[str, Any]) -> bool:
+    """Whether a material of glTF is metal everywhere. Where it says nothing, it is: the standard's default is 1."""
+    extensions = material.get("extensions", {})
+    if "KHR_materials_unlit" in extensions or "KHR_materials_pbrSpecularGlossiness" in extensions:
+        return False
+    surface = material.get("pbrMetallicRoughness", {})
+    factor: float = surface.get("metallicFactor", 1.0)
+    return factor > METAL and "metallicRoughnessTexture" not in surface
 
 
 def _part(geometry: Any, matrix: Float[np.ndarray, "4 4"], is_gltf: bool) -> _Part:

@@ -123,10 +123,26 @@ def test_colours_of_vertices_and_materials_are_linear(tmp_path):
     assert read_mesh(tmp_path / "t.obj", tmp_path).colors == pytest.approx(np.full((1, 3, 3), 0.5), abs=5e-3)
 
 
-def test_what_only_blender_draws_is_named(tmp_path):
-    kind = trimesh.visual.material.PBRMaterial(metallicFactor=1.0, baseColorFactor=[255, 255, 255, 255], name="steel")
-    visual = trimesh.visual.TextureVisuals(uv=np.zeros((3, 2)), material=kind)
-    triangle = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False, visual=visual)
-    triangle.export(tmp_path / "t.glb")
-    assert read_mesh(tmp_path / "t.glb", tmp_path).beyond == "metal"
-    assert Image.MAX_IMAGE_PIXELS is not None
+@pytest.mark.parametrize(
+    ("material", "name"),
+    [
+        ({}, ""),
+        ({"pbr": {"metallicFactor": 1.0}}, "metal"),
+        ({"pbr": {"metallicFactor": 1.0}, "extensions": {"KHR_materials_unlit": {}}}, ""),
+        ({"extensions": {"KHR_materials_transmission": {"transmissionFactor": 0.9}}}, "glass"),
+        ({"alphaMode": "BLEND"}, "half-transparent materials"),
+        ({"emissiveFactor": [0.0, 2.0, 0.0]}, "materials that glow"),
+        ({"pbr": {"metallicFactor": 0.9}, "alphaMode": "BLEND"}, "metal and half-transparent materials"),
+    ],
+)
+def test_what_only_blender_draws_is_named(tmp_path, material, name):
+    assert read_mesh(meshes.write_ball(tmp_path / "ball.glb", **material), tmp_path).beyond == name
+
+
+def test_a_material_that_says_nothing_is_of_metal_by_the_standard_unless_a_texture_says_where(tmp_path):
+    triangle = meshes.write_gltf(tmp_path / "t.gltf", "t.png")
+    Image.new("RGB", (8, 8), (200, 40, 40)).save(tmp_path / "t.png")
+    assert read_mesh(triangle, tmp_path).beyond == "metal"
+    surface = '"metallicRoughnessTexture": {"index": 0}, "baseColorTexture"'
+    triangle.write_text(triangle.read_text().replace('"baseColorTexture"', surface))
+    assert read_mesh(triangle, tmp_path).beyond == ""
