@@ -12,7 +12,7 @@ from PIL import Image
 from completesplat.data.rendered.mesh_reading import packed_textures, read_mesh, to_linear, to_srgb
 from completesplat.data.rendered.mesh_renderer import ambient_light, draw_job
 from completesplat.data.rendered.random_scenes import view_of
-from completesplat.data.rendered.z_buffer import look_up
+from completesplat.data.rendered.shading import filtered
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 
 trimesh = pytest.importorskip("trimesh")
@@ -124,13 +124,11 @@ def test_far_textures_show_their_mean_in_linear_light():
     image = np.stack([checker, checker, checker, np.full_like(checker, 255)], axis=-1).astype(np.uint8)
     textures = packed_textures([image])
     assert textures.levels.shape == (1, 4, 3)
-    colors = np.empty((1, 3))
-    look_up(textures.texels, textures.levels, np.zeros(1, np.int64), np.array([[0.3, 0.6]]), np.array([0.1]), colors)
-    assert to_srgb(colors) * 255 == pytest.approx(np.full((1, 3), 188), abs=1)
-    corners = np.array([[0.5 / 64, 1 - 0.5 / 64], [1.5 / 64, 1 - 0.5 / 64], [-0.5 / 64, 1 - 0.5 / 64]])
-    near = np.empty((3, 3))
-    look_up(textures.texels, textures.levels, np.zeros(3, np.int64), corners, np.zeros(3), near)
-    assert near[:, 0] == pytest.approx([0, 1, 1], abs=1e-4)  # the texture repeats
+    color = np.array(filtered(textures.texels, textures.levels, 0, 0.3, 0.6, 0.1))
+    assert to_srgb(color) * 255 == pytest.approx(np.full(3, 188), abs=1)
+    columns = np.array([0.5, 1.5, -0.5]) / 64
+    near = [filtered(textures.texels, textures.levels, 0, u, 1 - 0.5 / 64, 0.0)[0] for u in columns]
+    assert near == pytest.approx([0, 1, 1], abs=1e-4)  # the texture repeats
 
 
 def square(path, pixels, **material):
