@@ -1,7 +1,7 @@
 """Images of textured meshes without Blender: z-buffer, sun with soft shadows, sky, ground and walls.
 
 It draws the jobs of `draw_rendered_scene`, as `_scene_script.py` does in Blender, and writes the same files. It leaves
-out highlights, metal, glass, and light from surface to surface other than from the ground.
+out highlights, metal, glass, and light from surface to surface other than from floor and walls.
 """
 
 import math
@@ -28,6 +28,8 @@ BLOCK = 32  # pixels of a block's side, of which the least depth is known
 SKY_STEPS = 48  # directions of each angle over which the sky's light is added up
 NORMAL_STEPS = 33
 SKY_DEPTH = 1e10  # where no surface is
+BOUNCES = 4  # of light between floor and walls, as in Blender
+WALL_TOP = 0.87  # z of the direction to the upper edge of a room's walls, from its middle
 DISTANT = 1000.0  # of the sun, whose rays are then nearly parallel
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
@@ -89,17 +91,13 @@ def light_of(light: dict[str, Any], mesh: TexturedMesh, planes: Planes) -> Light
     axes = np.stack([across, np.cross(toward, across), -toward])
     sun = np.array(light["color"]) * light["strength"] / math.pi
     sky = np.array(light["sky"])
-    bounce = None
-    if len(planes.corners):
-        above = ambient_light(sky, None)[-1]
-        bounce = mean_color(planes, 0) * (above + sun * math.sin(elevation))
     softness = math.tan(light["angle"] / 2)
     shadow = _depth_from(axes, mesh)
     return Light(
         sun=sun,
         softness=softness,
         sky=sky,
-        ambient=ambient_light(sky, bounce),
+        ambient=_ambient_light(sky, sun, toward, planes),
         axes=axes,
         shadow=shadow,
         nearest=_nearest(shadow, math.ceil((softness * SHADOW_SIDE + 2) / BLOCK) + 1),
@@ -124,12 +122,37 @@ def _offsets() -> Float[np.ndarray, "offset 2"]:
     return radii[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
 
-def ambient_light(sky: Float[np.ndarray, "2 3"], ground: Float[np.ndarray, " 3"] | None) -> Float[np.ndarray, "step 3"]:
-    """Return the radiance of white surfaces under the sky alone, by the z of their normals.
+def _ambient_light(
+    sky: Float[np.ndarray, "2 3"], sun: Float[np.ndarray, " 3"], toward: Float[np.ndarray, " 3"], planes: Planes
+) -> Float[np.ndarray, "step 3"]:
+    """Return the received light from sky, floor and walls, which light each other, by the z of normals."""
+    is_floor = planes.normals[:, 2] > 0.5
+    colors = np.array([mean_color(planes, number) for number in range(len(is_floor))]).reshape(-1, 3)
+    floor_sun = sun * toward[2]
+    # Walls throw no shadow, and the sun lights their inner sides, which their normals point away from.
+    wall_sun = sun * (-planes.normals[~is_floor] @ toward).clip(0, None).mean() if not is_floor.all() else None
+    ground = None
+    walls = None
+    for _ in range(BOUNCES):
+        table = ambient_light(sky, ground, walls)
+        if is_floor.any():
+            ground = colors[is_floor][0] * (table[-1] + floor_sun)
+        if wall_sun is not None:
+            walls = colors[~is_floor][0] * (table[NORMAL_STEPS // 2] + wall_sun)
+    return ambient_light(sky, ground, walls)
+
+
+def ambient_light(
+    sky: Float[np.ndarray, "2 3"],
+    ground: Float[np.ndarray, " 3"] | None,
+    walls: Float[np.ndarray, " 3"] | None = None,
+) -> Float[np.ndarray, "step 3"]:
+    """Return the received light but the sun's, by the z of normals.
 
     Args:
         sky: colours at the horizon, which it has below it, too, and at the zenith; between them, linear in z.
         ground: colour of all directions below the horizon instead.
+        walls: colour of all directions from the horizon to the walls' upper edge instead.
     """
     heights = (np.arange(2 * SKY_STEPS) + 0.5) / SKY_STEPS - 1
     azimuths = 2 * np.pi * (np.arange(SKY_STEPS) + 0.5) / SKY_STEPS
@@ -137,6 +160,8 @@ def ambient_light(sky: Float[np.ndarray, "2 3"], ground: Float[np.ndarray, " 3"]
     radiance = (1 - share) * sky[0] + share * sky[1]
     if ground is not None:
         radiance[heights < 0] = ground
+    if walls is not None:
+        radiance[(heights > 0) & (heights < WALL_TOP)] = walls
     normals = np.linspace(-1, 1, NORMAL_STEPS)
     level = np.sqrt(1 - normals**2)[:, None, None] * np.sqrt(1 - heights**2)[:, None] * np.cos(azimuths)
     cosines = (normals[:, None, None] * heights[:, None] + level).clip(0, None).mean(-1)

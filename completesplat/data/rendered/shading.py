@@ -16,6 +16,7 @@ CHECKER, NOISE, IMAGE = range(3)
 """Patterns of planes."""
 SHADOW_BIAS = 0.01  # distance within which a place does not shadow itself
 STRIDE = 4  # each of so many neighbouring samples looks at other places of the sun
+SHEEN = 0.03  # share of the light that matt surfaces reflect whatever their colour is: 0.02 to 0.06 in Blender
 LEAST_COSINE = 0.05  # of the angle at which a plane is seen; it limits a sample's size on it
 
 
@@ -378,9 +379,9 @@ def shade(  # noqa: PLR0913
                 lit_red += cosine * sun[0]
                 lit_green += cosine * sun[1]
                 lit_blue += cosine * sun[2]
-            red_sum += min(red * lit_red, 1.0)
-            green_sum += min(green * lit_green, 1.0)
-            blue_sum += min(blue * lit_blue, 1.0)
+            red_sum += min((SHEEN + (1 - SHEEN) * red) * lit_red, 1.0)
+            green_sum += min((SHEEN + (1 - SHEEN) * green) * lit_green, 1.0)
+            blue_sum += min((SHEEN + (1 - SHEEN) * blue) * lit_blue, 1.0)
         count = samples * samples
         image[pixel // width, pixel % width, 0] = red_sum / count
         image[pixel // width, pixel % width, 1] = green_sum / count

@@ -19,9 +19,9 @@ def surroundings(job: dict[str, Any], ground: float) -> Planes:
     """Return the floor below the object, if there is one, and then the walls of a room without a ceiling."""
     side = job["room"] if job["wall"] else OPEN_GROUND
     square = np.array([(-side, -side), (side, -side), (side, side), (-side, side)])
-    corners = []
-    sides = []
-    surfaces = []
+    corners: list[tuple[float, ...]] = []
+    sides: list[list[tuple[float, ...]]] = []
+    surfaces: list[dict[str, Any]] = []
     if job["floor"]:
         corners.append((-side, -side, ground))
         sides.append([(2 * side, 0, 0), (0, 2 * side, 0)])
@@ -31,8 +31,8 @@ def surroundings(job: dict[str, Any], ground: float) -> Planes:
             corners.append((*place, ground))
             sides.append([(*(following - place), 0), (0, 0, 2 * side)])
             surfaces.append(job["wall"])
-    files = sorted({surface["file"] for surface in surfaces} - {""})
-    textures = packed_textures([_pixels(file) for file in files] or [WHITE])
+    files = sorted({surface["file"] for surface in surfaces})
+    textures = packed_textures([_pixels(file) if file else WHITE for file in files] or [WHITE])
     vectors = np.array(sides, np.float64).reshape(-1, 2, 3)
     lengths = np.linalg.norm(vectors, axis=-1)
     units = vectors / lengths[..., None]
@@ -45,7 +45,7 @@ def surroundings(job: dict[str, Any], ground: float) -> Planes:
         patterns=np.array([PATTERNS[surface["pattern"]] for surface in surfaces], np.int64),
         colors=np.array([surface["colors"] or np.zeros((2, 3)) for surface in surfaces]).reshape(-1, 2, 3),
         repeats=np.array([surface["repeats"] for surface in surfaces], np.float64),
-        texture=np.array([files.index(surface["file"] or files[0]) if files else 0 for surface in surfaces], np.int64),
+        texture=np.array([files.index(surface["file"]) for surface in surfaces], np.int64),
         texels=textures.texels,
         levels=textures.levels,
         lattice=np.random.default_rng(0).uniform(size=LATTICE),

@@ -12,7 +12,7 @@ from PIL import Image
 from completesplat.data.rendered.mesh_reading import packed_textures, read_mesh, to_linear, to_srgb
 from completesplat.data.rendered.mesh_renderer import ambient_light, draw_job
 from completesplat.data.rendered.random_scenes import view_of
-from completesplat.data.rendered.shading import filtered
+from completesplat.data.rendered.shading import SHEEN, filtered
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 
 trimesh = pytest.importorskip("trimesh")
@@ -82,6 +82,10 @@ def test_a_white_surface_under_a_uniform_sky_has_the_skys_own_radiance():
     assert half[16] == pytest.approx(np.full(3, 0.35), rel=2e-3)
     assert half[-1] == pytest.approx(np.full(3, 0.7), rel=2e-3)
     assert half[0] == pytest.approx(np.zeros(3), abs=1e-6)
+    # A room whose walls and ground are as bright as the sky is no different; black walls hide most of it.
+    assert ambient_light(sky, sky[0], sky[0]) == pytest.approx(np.full((33, 3), 0.7), rel=2e-3)
+    room = ambient_light(sky, np.zeros(3), np.zeros(3))
+    assert room[-1] == pytest.approx(np.full(3, 0.7 * (1 - 0.87**2)), rel=0.05)
 
 
 def test_a_plain_mesh_under_a_uniform_sky_has_one_colour(tmp_path):
@@ -90,7 +94,7 @@ def test_a_plain_mesh_under_a_uniform_sky_has_one_colour(tmp_path):
     ball.export(tmp_path / "ball.ply")
     images, geometry, _ = drawn(tmp_path / "ball.ply", tmp_path / "out", [camera((3.0, 0, 0))])
     inside = geometry[0][..., 2] == 1
-    expected = to_srgb(0.4 * to_linear(np.array([200, 100, 50]) / 255))
+    expected = to_srgb(0.4 * (SHEEN + (1 - SHEEN) * to_linear(np.array([200, 100, 50]) / 255)))
     assert np.abs(images[0][inside] - expected).max() < 0.01
 
 
