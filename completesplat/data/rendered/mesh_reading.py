@@ -17,7 +17,7 @@ READABLE = (".glb", ".gltf", ".obj", ".ply")
 """Suffixes that trimesh reads with their textures; Blender reads the others."""
 MOST_TEXTURE = 2048  # pixels of a texture's side; larger ones are reduced, because images are much smaller
 FEWEST_TEXELS = 8  # side below which a texture is not halved any more
-SMOOTH = np.cos(np.radians(40.0))  # a corner is shaded smoothly if its faces' normals differ less from their mean
+SMOOTH = np.cos(np.radians(25.0))  # a corner is shaded smoothly if its faces' normals differ less from their mean
 SAME_PLACE = 1e-6  # of an object's size: corners that are nearer belong to one vertex
 METAL = 0.5
 GREY = 0.8  # linear, of faces without colour: Blender's own default

@@ -192,12 +192,12 @@ def test_paint_changes_only_what_the_first_camera_does_not_see(cube, tmp_path):
 
 
 def test_a_sharp_edge_is_shaded_flat_and_a_ball_smoothly(tmp_path):
-    box = trimesh.creation.box((1, 1, 1))  # 8 vertices, each of three faces
-    box.export(tmp_path / "box.ply")
-    mesh = read_mesh(tmp_path / "box.ply", tmp_path)
-    crosses = np.cross(mesh.corners[:, 1] - mesh.corners[:, 0], mesh.corners[:, 2] - mesh.corners[:, 0])
-    flat = crosses / np.linalg.norm(crosses, axis=1, keepdims=True)
-    assert mesh.normals == pytest.approx(np.repeat(flat[:, None], 3, axis=1))
+    for name, solid in (("box", trimesh.creation.box()), ("gem", trimesh.creation.icosahedron())):
+        solid.export(tmp_path / f"{name}.ply")  # each vertex belongs to three or five faces
+        mesh = read_mesh(tmp_path / f"{name}.ply", tmp_path)
+        crosses = np.cross(mesh.corners[:, 1] - mesh.corners[:, 0], mesh.corners[:, 2] - mesh.corners[:, 0])
+        flat = crosses / np.linalg.norm(crosses, axis=1, keepdims=True)
+        assert mesh.normals == pytest.approx(np.repeat(flat[:, None], 3, axis=1))
     trimesh.creation.icosphere(4).export(tmp_path / "ball.ply")
     ball = read_mesh(tmp_path / "ball.ply", tmp_path)
     assert ball.normals == pytest.approx(ball.corners, abs=0.01)
