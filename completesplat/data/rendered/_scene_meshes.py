@@ -62,11 +62,22 @@ def import_mesh(path: Path, root: Path, up: str | None) -> None:
         lines = [line.strip() for line in str(error).splitlines() if line.strip() and "Location:" not in line]
         reason = lines[-1] if "Traceback" in lines[0] else lines[0]
         raise RefusedMesh(f"Blender cannot import it: {reason.removeprefix('Error: ')}") from None
+    for image in list(bpy.data.images):
+        find_texture(image, path)
     for image in bpy.data.images:
         check_texture(image, root)
     trees = [material.node_tree for material in bpy.data.materials if material.use_nodes]
     if any(node.type == "TEX_IMAGE" and node.image is None for tree in trees for node in tree.nodes):
         raise RefusedMesh("it has a texture in a format that Blender does not read, such as KTX2")
+
+
+def find_texture(image: Any, mesh: Path) -> None:
+    """Load a missing texture from `materials/textures` beside the mesh's folder (Google Scanned Objects)."""
+    file = Path(bpy.path.abspath(image.filepath))
+    other = mesh.parent.parent / "materials/textures" / file.name
+    if image.filepath and image.packed_file is None and not file.is_file() and other.is_file():
+        image.user_remap(bpy.data.images.load(str(other)))
+        bpy.data.images.remove(image)
 
 
 def check_texture(image: Any, root: Path) -> None:
