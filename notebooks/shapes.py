@@ -22,7 +22,7 @@ with suppress(ImportError):
     import cupy as xp
 
 SIZE = int(sys.argv[4]) if len(sys.argv) > 4 else 64
-SAMPLES, FRAMES, PICTURES, PICTURE = 2, 16, 300, 2 * SIZE
+SAMPLES, FRAMES, PICTURES, PICTURE = 4, 16, 300, 2 * SIZE
 BALL, CYLINDER, CUBE = 0, 1, 2
 
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ SQUARES = 4
 
 SETTINGS = {"cameras": "turn", "fov": [36, 55], "light": "random", "floor": "random", "wall": "none", "seed": 0}
 SETTINGS |= {"front": None, "hidden": "none", "factory": None, "count": 1, "max_megabytes": 500, "max_minutes": 5}
-SETTINGS |= {"workers": 1, "shard": 0, "shards": 1}
+SETTINGS |= {"up": None, "workers": 1, "shard": 0, "shards": 1}
 SETTINGS |= {"renderer": "blender"}
 """Settings of renders, without views, size and samples."""
 
@@ -27,17 +28,47 @@ CORNERS = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 FACES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 
 
-def write_cube(path: Path, half: float = 3.0, center: Sequence[float] = (0, 0, 0)) -> Path:
+def write_cube(path: Path, half: float | Sequence[float] = 3.0, center: Sequence[float] = (0, 0, 0)) -> Path:
     """Write an OBJ of a cube with a checker on each face; the format's y axis points up."""
     path.parent.mkdir(parents=True, exist_ok=True)
     rows, columns = np.mgrid[:64, :64] * SQUARES // 64
     pixels = np.where(((rows + columns) % 2 == 0)[..., None], 230, 20).astype(np.uint8).repeat(3, axis=-1)
     Image.fromarray(pixels).save(path.with_suffix(".png"))
     path.with_suffix(".mtl").write_text(f"newmtl checker\nmap_Kd {path.stem}.png\n")
-    vertices = ["v {:g} {:g} {:g}".format(*(half * np.array(corner) + center)) for corner in CORNERS]
+    vertices = ["v {:g} {:g} {:g}".format(*(np.multiply(half, corner) + center)) for corner in CORNERS]
     faces = ["f " + " ".join(f"{index + 1}/{place}" for place, index in enumerate(face, 1)) for face in FACES]
     textured = ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1", "usemtl checker"]
     path.write_text("\n".join([f"mtllib {path.stem}.mtl", *vertices, *textured, *faces]) + "\n")
+    return path
+
+
+def write_scan(folder: Path) -> Path:
+    """Write an upright box, twice as high as wide, as Google Scanned Objects are stored: z points up in the OBJ."""
+    path = write_cube(folder / "meshes/model.obj", half=(1, 1, 2))
+    textures = folder / "materials/textures"
+    textures.mkdir(parents=True)
+    path.with_suffix(".png").rename(textures / "texture.png")
+    path.with_suffix(".mtl").write_text("newmtl checker\nmap_Kd texture.png\n")
+    return path
+
+
+def write_ball(path: Path, **material: Any) -> Path:
+    """Write a GLB of a grey ball with changes of its material, which is of no metal, in glTF's words."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(2)
+    ball.export(path)
+    content = path.read_bytes()
+    length = int.from_bytes(content[12:16], "little")
+    description = json.loads(content[20 : 20 + length])
+    metal = {"baseColorFactor": [0.5, 0.5, 0.5, 1], "metallicFactor": 0}
+    description["materials"] = [{"pbrMetallicRoughness": metal | material.pop("pbr", {}), **material}]
+    description["extensionsUsed"] = list(material.get("extensions", ()))
+    description["meshes"][0]["primitives"][0]["material"] = 0
+    text = json.dumps(description).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = len(text).to_bytes(4, "little") + content[16:20] + text + content[20 + length :]
+    path.write_bytes(content[:8] + (12 + len(chunks)).to_bytes(4, "little") + chunks)
     return path
 
 

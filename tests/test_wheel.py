@@ -7,7 +7,10 @@ from hashlib import sha256
 from pathlib import Path
 from zipfile import ZipFile
 
+import meshes
+import numpy as np
 import pytest
+from PIL import Image
 from support import strict_json
 from written_commands import ROOT
 
@@ -43,6 +46,31 @@ def test_the_wheel_has_the_package_its_settings_and_weights_and_no_link_that_lea
     assert [line for line in description.splitlines() if line.startswith(("completesplat", "##"))] == commands
     assert "![" not in description
     assert "*A photograph of an apple" not in description
+
+
+def test_the_installed_wheel_draws_a_scan_and_a_glb_in_an_empty_folder_without_blender(
+    installed, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("COMPLETESPLAT_BLENDER", str(tmp_path / "none"))  # refused if it is looked for
+    meshes.write_scan(tmp_path / "MESHES/scan")
+    meshes.write_ball(tmp_path / "MESHES/ball.glb")
+    meshes.write_ball(tmp_path / "MESHES/steel.glb", pbr={"metallicFactor": 1.0})
+    glass = {"KHR_materials_transmission": {"transmissionFactor": 1.0}}
+    meshes.write_ball(tmp_path / "MESHES/glass.glb", extensions=glass)
+    settings = ["up=z", "floor=none", "views=4", "size=32", "samples=4", "workers=1", "out=RENDERS"]
+    printed = installed.run(tmp_path, "completesplat", "data", "render", "meshes=MESHES", *settings)
+    lines = [line for line in printed.splitlines() if "renderer=blender" in line]
+    assert len(lines) == 2
+    for line, name in zip(sorted(lines), ("glass: glass", "steel: metal"), strict=True):
+        assert f"{name}: drawn as plain colours; renderer=blender draws them" in line
+    scenes = {path.parent.name: strict_json(path) for path in (tmp_path / "RENDERS/rendered").glob("*/object.json")}
+    assert sorted(scenes) == ["ball", "glass", "scan_meshes_model", "steel"]
+    tall = []
+    for name in ("scan_meshes_model", "ball"):
+        for mask in (tmp_path / "RENDERS/rendered" / name / "masks").iterdir():
+            rows, columns = np.nonzero(np.asarray(Image.open(mask)) > 127)
+            tall.append(np.ptp(rows) > 1.2 * np.ptp(columns))
+    assert tall == 4 * [True] + 4 * [False]
 
 
 def test_a_commit_gives_the_same_release_in_another_folder_with_other_permissions(tmp_path):

@@ -34,26 +34,50 @@ AS_STORED = {
     "usdz": UNCHECKED,
 }
 
+UP_AXES = {
+    "y": {"up_axis": "Y", "forward_axis": "NEGATIVE_Z"},
+    "z": {"up_axis": "Z", "forward_axis": "Y"},
+}
+WITHOUT_STANDARD = ("obj", "ply", "stl")  # other formats say which axis points up
+
 
 class RefusedMesh(Exception):
     """Mesh that cannot be rendered."""
 
 
-def import_mesh(path: Path, root: Path) -> None:
-    """Import a file into the empty scene, or refuse one that Blender cannot read, or whose textures it cannot use."""
+def import_mesh(path: Path, root: Path, up: str | None) -> None:
+    """Import a file into the empty scene, or refuse one that Blender cannot read, or whose textures it cannot use.
+
+    Args:
+        up: axis that points up in files of `WITHOUT_STANDARD`; None: Blender's default.
+    """
     kind = path.suffix[1:].lower()
     module, name = IMPORTERS[kind].split(".")
+    settings: dict[str, Any] = dict(AS_STORED.get(kind, {}))
+    if up is not None and kind in WITHOUT_STANDARD:
+        settings |= UP_AXES[up]
     try:
-        getattr(getattr(bpy.ops, module), name)(filepath=str(path), **AS_STORED.get(kind, {}))
+        getattr(getattr(bpy.ops, module), name)(filepath=str(path), **settings)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip() and "Location:" not in line]
         reason = lines[-1] if "Traceback" in lines[0] else lines[0]
         raise RefusedMesh(f"Blender cannot import it: {reason.removeprefix('Error: ')}") from None
+    for image in list(bpy.data.images):
+        find_texture(image, path)
     for image in bpy.data.images:
         check_texture(image, root)
     trees = [material.node_tree for material in bpy.data.materials if material.use_nodes]
     if any(node.type == "TEX_IMAGE" and node.image is None for tree in trees for node in tree.nodes):
         raise RefusedMesh("it has a texture in a format that Blender does not read, such as KTX2")
+
+
+def find_texture(image: Any, mesh: Path) -> None:
+    """Load a missing texture from `materials/textures` beside the mesh's folder (Google Scanned Objects)."""
+    file = Path(bpy.path.abspath(image.filepath))
+    other = mesh.parent.parent / "materials/textures" / file.name
+    if image.filepath and image.packed_file is None and not file.is_file() and other.is_file():
+        image.user_remap(bpy.data.images.load(str(other)))
+        bpy.data.images.remove(image)
 
 
 def check_texture(image: Any, root: Path) -> None:

@@ -291,7 +291,7 @@ def run(job: dict[str, Any]) -> dict[str, Any]:
             find_factory(job["factory"])
             return {}
         if "mesh" in job:
-            import_mesh(Path(job["mesh"]), Path(job["root"]))
+            import_mesh(Path(job["mesh"]), Path(job["root"]), job["up"])
         else:
             make_object(job["factory"], job["seed"])
         objects = baked_objects()

@@ -17,13 +17,15 @@ READABLE = (".glb", ".gltf", ".obj", ".ply")
 """Suffixes that trimesh reads with their textures; Blender reads the others."""
 MOST_TEXTURE = 2048  # pixels of a texture's side; larger ones are reduced, because images are much smaller
 FEWEST_TEXELS = 8  # side below which a texture is not halved any more
-SMOOTH = np.cos(np.radians(40.0))  # a corner is shaded smoothly if its faces' normals differ less from their mean
+SMOOTH = np.cos(np.radians(25.0))  # a corner is shaded smoothly if its faces' normals differ less from their mean
 SAME_PLACE = 1e-6  # of an object's size: corners that are nearer belong to one vertex
 METAL = 0.5
 GREY = 0.8  # linear, of faces without colour: Blender's own default
-Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-TURNS = {".ply": np.eye(3), ".obj": Y_UP, ".glb": Y_UP, ".gltf": Y_UP}
-"""Rotations that make z point up, by the rules of the formats (of PLY, which has none: as stored)."""
+TURNS = {"y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), "z": np.eye(3)}
+"""Rotations that make z point up, by the axis that points up in the file."""
+UP_AXES = {".glb": "y", ".gltf": "y", ".obj": "y", ".ply": "z"}
+"""Axes that point up: glTF's by its standard, the others' as most programs write them."""
+WITHOUT_STANDARD = (".obj", ".ply")
 
 
 @dataclass(frozen=True)
@@ -138,12 +140,13 @@ def import_trimesh() -> ModuleType:
     return trimesh
 
 
-def read_mesh(path: Path, root: Path) -> TexturedMesh:
+def read_mesh(path: Path, root: Path, up: str | None = None) -> TexturedMesh:
     """Read a mesh file with its textures.
 
     Args:
         path: a file with one of the suffixes in `READABLE`.
         root: folder that all its textures must lie in, with links resolved.
+        up: axis that points up in files of `WITHOUT_STANDARD`; None: as in `UP_AXES`.
 
     Raises:
         BrokenMesh: trimesh cannot read it, a texture is missing or cannot be read, or its faces cannot be drawn.
@@ -161,7 +164,8 @@ def read_mesh(path: Path, root: Path) -> TexturedMesh:
             raise BrokenMesh(reason) from error
     if files.refused:
         raise BrokenMesh(files.refused[0])
-    is_gltf = path.suffix.lower() in (".glb", ".gltf")
+    kind = path.suffix.lower()
+    is_gltf = kind in (".glb", ".gltf")
     description = gltf_description(path) if is_gltf else {}
     parts = []
     for geometry, matrix in geometries:
@@ -170,7 +174,8 @@ def read_mesh(path: Path, root: Path) -> TexturedMesh:
             parts.append(_part(geometry, matrix, is_gltf))
     if not parts:
         raise BrokenMesh("it has no faces")
-    return _joined(parts, TURNS[path.suffix.lower()], _beyond(description))
+    axis = up if up is not None and kind in WITHOUT_STANDARD else UP_AXES[kind]
+    return _joined(parts, TURNS[axis], _beyond(description))
 
 
 def _require_texture(geometry: Any, description: dict[str, Any]) -> None:
@@ -185,14 +190,27 @@ def _require_texture(geometry: Any, description: dict[str, Any]) -> None:
 def _beyond(description: dict[str, Any]) -> str:
     """Name what of a glTF's materials only Blender draws."""
     materials = description.get("materials", ())
+    extensions = {name for material in materials for name in material.get("extensions", ())}
     words = []
-    if any(x.get("pbrMetallicRoughness", {}).get("metallicFactor", 0) > METAL for x in materials):
+    if any(map(_is_metal, materials)):
         words.append("metal")
-    if "KHR_materials_transmission" in description.get("extensionsUsed", ()):
+    if "KHR_materials_transmission" in extensions:
         words.append("glass")
-    if any(x.get("alphaMode") == "BLEND" for x in materials):
+    if any(material.get("alphaMode") == "BLEND" for material in materials):
         words.append("half-transparent materials")
+    if any(any(material.get("emissiveFactor", ())) for material in materials):
+        words.append("materials that glow")
     return " and ".join(words)
+
+
+def _is_metal(material: dict[str, Any]) -> bool:
+    """Whether a material of glTF is metal everywhere. Where it says nothing, it is: the standard's default is 1."""
+    extensions = material.get("extensions", {})
+    if "KHR_materials_unlit" in extensions or "KHR_materials_pbrSpecularGlossiness" in extensions:
+        return False
+    surface = material.get("pbrMetallicRoughness", {})
+    factor: float = surface.get("metallicFactor", 1.0)
+    return factor > METAL and "metallicRoughnessTexture" not in surface
 
 
 def _part(geometry: Any, matrix: Float[np.ndarray, "4 4"], is_gltf: bool) -> _Part:

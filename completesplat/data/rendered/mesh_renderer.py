@@ -1,54 +1,37 @@
 """Images of textured meshes without Blender: z-buffer, sun with soft shadows, sky, ground and walls.
 
 It draws the jobs of `draw_rendered_scene`, as `_scene_script.py` does in Blender, and writes the same files. It leaves
-out highlights, metal, glass, and light from surface to surface other than from the ground.
+out highlights, metal, glass, and light from surface to surface other than from floor and walls.
 """
 
 import math
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from threading import Event
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
+from numpy.lib.stride_tricks import sliding_window_view
 from PIL import Image
 
 from completesplat.data.rendered.assets import BrokenMesh
 from completesplat.data.rendered.mesh_reading import TexturedMesh, read_mesh, to_srgb
-from completesplat.data.rendered.surroundings import Plane, surface_colors, surface_mean, surroundings
-from completesplat.data.rendered.z_buffer import NOTHING, draw_rectangles, draw_triangles, light_share, look_up
+from completesplat.data.rendered.shading import Light, Planes, Surfaces, View, draw_planes, shade
+from completesplat.data.rendered.surroundings import mean_color, surroundings
+from completesplat.data.rendered.z_buffer import NOTHING, draw_triangles
 
 SHADOW_SIDE = 1024  # pixels of the object's depth from the sun
 SHADOW_SAMPLES = 16
-SHADOW_BIAS = 0.01
+BLOCK = 32  # pixels of a block's side, of which the least depth is known
 SKY_STEPS = 48  # directions of each angle over which the sky's light is added up
 NORMAL_STEPS = 33
 SKY_DEPTH = 1e10  # where no surface is
+BOUNCES = 4  # of light between floor and walls, as in Blender
+WALL_TOP = 0.87  # z of the direction to the upper edge of a room's walls, from its middle
 DISTANT = 1000.0  # of the sun, whose rays are then nearly parallel
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-
-
-@dataclass(frozen=True)
-class Lighting:
-    """Sun and sky, in linear light.
-
-    Attributes:
-        toward_sun: unit vector.
-        sun: radiance of a white surface that faces the sun.
-        sky: colours of the sky at the horizon and at the zenith.
-        ambient: radiance of a white surface by the z of its normal, from -1 to 1.
-        shadow: depth of the object from the sun.
-    """
-
-    toward_sun: Float[np.ndarray, " 3"]
-    sun: Float[np.ndarray, " 3"]
-    softness: float
-    sky: Float[np.ndarray, "2 3"]
-    ambient: Float[np.ndarray, "step 3"]
-    shadow: Float[np.ndarray, "side side"]
-    axes: Float[np.ndarray, "3 3"]
 
 
 def draw_job(job: dict[str, Any], stopped: Event, minutes: float = math.inf) -> dict[str, Any]:
@@ -66,21 +49,20 @@ def draw_job(job: dict[str, Any], stopped: Event, minutes: float = math.inf) -> 
         BrokenMesh: the mesh cannot be drawn, or not in this time.
     """
     end = time.monotonic() + 60 * minutes
-    mesh = read_mesh(Path(job["mesh"]), Path(job["root"]))
+    mesh = read_mesh(Path(job["mesh"]), Path(job["root"]), job["up"])
     planes = surroundings(job, float(mesh.corners[..., 2].min()))
-    lighting = light_of(job["light"], mesh, planes)
+    light = light_of(job["light"], mesh, planes)
     folder = Path(job["folder"])
     hidden = job["hidden"]
     paints = hidden["colors"] if hidden else [None]
     samples = max(1, round(math.sqrt(job["samples"])))
     back = painted_triangles(mesh, hidden) if hidden else np.zeros(len(mesh.corners), bool)
+    scene = _Scene(mesh, light, planes, back)
     for number, view in enumerate(job["views"]):
         if stopped.is_set() or time.monotonic() > end:
             raise BrokenMesh(f"took longer than max_minutes={minutes:g}")
-        scene = _Scene(mesh, lighting, planes, back)
         depth, seen = scene.geometry(view)
-        for index, paint in enumerate(paints):
-            image, coverage = scene.image(view, samples, paint)
+        for index, (image, coverage) in enumerate(scene.images(view, samples, paints)):  # noqa: B007
             prefix = f"{index}_" if index else ""
             encoded = np.round(255 * to_srgb(image)).astype(np.uint8)
             Image.fromarray(encoded).save(folder / f"{prefix}{number:04d}.png")
@@ -96,7 +78,7 @@ def painted_triangles(mesh: TexturedMesh, hidden: dict[str, Any]) -> Bool[np.nda
     return away
 
 
-def light_of(light: dict[str, Any], mesh: TexturedMesh, planes: list[Plane]) -> Lighting:
+def light_of(light: dict[str, Any], mesh: TexturedMesh, planes: Planes) -> Light:
     """Return the light of a job with what each surface receives of it."""
     elevation = light["elevation"]
     azimuth = light["azimuth"]
@@ -109,20 +91,68 @@ def light_of(light: dict[str, Any], mesh: TexturedMesh, planes: list[Plane]) -> 
     axes = np.stack([across, np.cross(toward, across), -toward])
     sun = np.array(light["color"]) * light["strength"] / math.pi
     sky = np.array(light["sky"])
-    bounce = None
-    if planes:
-        above = ambient_light(sky, None)[-1]
-        bounce = surface_mean(planes[0]) * (above + sun * math.sin(elevation))
+    softness = math.tan(light["angle"] / 2)
     shadow = _depth_from(axes, mesh)
-    return Lighting(toward, sun, math.tan(light["angle"] / 2), sky, ambient_light(sky, bounce), shadow, axes)
+    return Light(
+        sun=sun,
+        softness=softness,
+        sky=sky,
+        ambient=_ambient_light(sky, sun, toward, planes),
+        axes=axes,
+        shadow=shadow,
+        nearest=_nearest(shadow, math.ceil((softness * SHADOW_SIDE + 2) / BLOCK) + 1),
+        offsets=_offsets(),
+    )
 
 
-def ambient_light(sky: Float[np.ndarray, "2 3"], ground: Float[np.ndarray, " 3"] | None) -> Float[np.ndarray, "step 3"]:
-    """Return the radiance of white surfaces under the sky alone, by the z of their normals.
+def _nearest(shadow: Float[np.ndarray, "side side"], reach: int) -> Float[np.ndarray, "block block"]:
+    """Return the least depth of each block of pixels and those that are up to `reach` blocks away."""
+    blocks = len(shadow) // BLOCK
+    least = shadow.reshape(blocks, BLOCK, blocks, BLOCK).min((1, 3))
+    for _ in range(2):
+        padded = np.pad(least, ((reach, reach), (0, 0)), constant_values=np.inf)
+        least = sliding_window_view(padded, 2 * reach + 1, axis=0).min(-1).T
+    return np.ascontiguousarray(least)
+
+
+def _offsets() -> Float[np.ndarray, "offset 2"]:
+    """Return places that fill the unit disc evenly (Vogel's spiral)."""
+    angles = GOLDEN_ANGLE * np.arange(SHADOW_SAMPLES)
+    radii = np.sqrt((np.arange(SHADOW_SAMPLES) + 0.5) / SHADOW_SAMPLES)
+    return radii[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+
+
+def _ambient_light(
+    sky: Float[np.ndarray, "2 3"], sun: Float[np.ndarray, " 3"], toward: Float[np.ndarray, " 3"], planes: Planes
+) -> Float[np.ndarray, "step 3"]:
+    """Return the received light from sky, floor and walls, which light each other, by the z of normals."""
+    is_floor = planes.normals[:, 2] > 0.5
+    colors = np.array([mean_color(planes, number) for number in range(len(is_floor))]).reshape(-1, 3)
+    floor_sun = sun * toward[2]
+    # Walls throw no shadow, and the sun lights their inner sides, which their normals point away from.
+    wall_sun = sun * (-planes.normals[~is_floor] @ toward).clip(0, None).mean() if not is_floor.all() else None
+    ground = None
+    walls = None
+    for _ in range(BOUNCES):
+        table = ambient_light(sky, ground, walls)
+        if is_floor.any():
+            ground = colors[is_floor][0] * (table[-1] + floor_sun)
+        if wall_sun is not None:
+            walls = colors[~is_floor][0] * (table[NORMAL_STEPS // 2] + wall_sun)
+    return ambient_light(sky, ground, walls)
+
+
+def ambient_light(
+    sky: Float[np.ndarray, "2 3"],
+    ground: Float[np.ndarray, " 3"] | None,
+    walls: Float[np.ndarray, " 3"] | None = None,
+) -> Float[np.ndarray, "step 3"]:
+    """Return the received light but the sun's, by the z of normals.
 
     Args:
         sky: colours at the horizon, which it has below it, too, and at the zenith; between them, linear in z.
         ground: colour of all directions below the horizon instead.
+        walls: colour of all directions from the horizon to the walls' upper edge instead.
     """
     heights = (np.arange(2 * SKY_STEPS) + 0.5) / SKY_STEPS - 1
     azimuths = 2 * np.pi * (np.arange(SKY_STEPS) + 0.5) / SKY_STEPS
@@ -130,6 +160,8 @@ def ambient_light(sky: Float[np.ndarray, "2 3"], ground: Float[np.ndarray, " 3"]
     radiance = (1 - share) * sky[0] + share * sky[1]
     if ground is not None:
         radiance[heights < 0] = ground
+    if walls is not None:
+        radiance[(heights > 0) & (heights < WALL_TOP)] = walls
     normals = np.linspace(-1, 1, NORMAL_STEPS)
     level = np.sqrt(1 - normals**2)[:, None, None] * np.sqrt(1 - heights**2)[:, None] * np.cos(azimuths)
     cosines = (normals[:, None, None] * heights[:, None] + level).clip(0, None).mean(-1)
@@ -154,158 +186,69 @@ def _depth_from(axes: Float[np.ndarray, "3 3"], mesh: TexturedMesh) -> Float[np.
 class _Scene:
     """One object in its surroundings, drawn from one camera at a time."""
 
-    def __init__(
-        self, mesh: TexturedMesh, lighting: Lighting, planes: list[Plane], back: Bool[np.ndarray, " triangle"]
-    ) -> None:
+    def __init__(self, mesh: TexturedMesh, light: Light, planes: Planes, back: Bool[np.ndarray, " triangle"]) -> None:
+        textures = mesh.textures
         self.mesh = mesh
-        self.lighting = lighting
+        self.light = light
         self.planes = planes
-        self.back = back
+        self.surfaces = Surfaces(
+            mesh.uv, mesh.normals, mesh.colors, mesh.texture, textures.texels, textures.levels, back
+        )
+        self.unpainted = self.surfaces._replace(back=np.zeros_like(back))
 
     def geometry(self, view: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Return depth and whether the object is seen, at the pixels' centres."""
-        camera = _Camera(view, 1)
-        triangles, _, depth = self._visible(camera)
-        _, distance = camera.nearest(self.planes)
-        depth = np.minimum(depth, distance)
-        return np.where(np.isfinite(depth), depth, SKY_DEPTH), triangles != NOTHING
+        triangles, _, depth, _, distance, _ = self._visible(view, 1)
+        nearest = np.minimum(depth, distance)
+        return np.where(np.isfinite(nearest), nearest, SKY_DEPTH), triangles != NOTHING
 
-    def image(
-        self, view: dict[str, Any], samples: int, paint: list[float] | None
-    ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]:
-        """Return linear colours and the object's coverage, each the mean of samples x samples a pixel."""
-        camera = _Camera(view, samples)
-        triangles, weights, depth = self._visible(camera)
-        numbers, distance = camera.nearest(self.planes)
-        seen = depth <= distance
-        seen &= triangles != NOTHING
-        numbers[seen] = NOTHING
-        colors = np.empty((*camera.shape, 3))
-        empty = (numbers == NOTHING) & ~seen
-        colors[empty] = self._sky(camera.rays[empty])
-        for index, plane in enumerate(self.planes):
-            shown = numbers == index
-            colors[shown] = self._lit_plane(camera, plane, camera.rays[shown], distance[shown])
-        rays = camera.rays[seen]
-        colors[seen] = self._lit_object(camera, triangles[seen], weights[seen], depth[seen], rays, paint)
-        height, width = view["size"][::-1]
-        blocks = colors.clip(0, 1).reshape(height, samples, width, samples, 3)
-        return blocks.mean((1, 3)), seen.reshape(height, samples, width, samples).mean((1, 3))
+    def images(
+        self, view: dict[str, Any], samples: int, paints: Sequence[Sequence[float] | None]
+    ) -> Iterator[tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]]:
+        """Yield linear colours and the object's coverage with each paint, means of samples x samples a pixel."""
+        width, height = view["size"]
+        triangles, weights, depth, numbers, distance, points = self._visible(view, samples)
+        for paint in paints:
+            image = np.empty((height, width, 3))
+            coverage = np.empty((height, width))
+            surfaces = self.unpainted if paint is None else self.surfaces
+            color = np.array(paint or (0.0, 0.0, 0.0))
+            scene = (view_in_samples(view, samples), samples, surfaces, self.planes, self.light, color)
+            shade(*scene, points, triangles, weights, depth, numbers, distance, image, coverage)
+            yield image, coverage
 
-    def _visible(self, camera: "_Camera") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _visible(self, view: dict[str, Any], samples: int) -> tuple[np.ndarray, ...]:
+        """Return the buffers of `draw_triangles`, those of `draw_planes`, and the projected corners."""
+        camera = view_in_samples(view, samples)
+        width, height = view["size"]
+        shape = (height * samples, width * samples)
+        triangles = np.full(shape, NOTHING, np.int64)
+        weights = np.empty((*shape, 2))
+        depth = np.full(shape, np.inf)
         mesh = self.mesh
-        triangles = np.full(camera.shape, NOTHING, np.int64)
-        weights = np.empty((*camera.shape, 2))
-        depth = np.full(camera.shape, np.inf)
-        buffers = (triangles, weights, depth)
         textures = mesh.textures
-        points = camera.projected(mesh.corners)
+        points = projected(camera, np.array(view["world_to_camera"]), mesh.corners)
+        buffers = (triangles, weights, depth)
         draw_triangles(points, mesh.uv, mesh.texture, textures.texels, textures.levels, mesh.cut, *buffers)
-        return buffers
-
-    def _sky(self, rays: Float[np.ndarray, "ray 3"]) -> Float[np.ndarray, "ray 3"]:
-        heights = rays[:, 2] / np.linalg.norm(rays, axis=-1)
-        share = heights.clip(0, 1)[..., None]
-        horizon, zenith = self.lighting.sky
-        return (1 - share) * horizon + share * zenith
-
-    def _lit_plane(
-        self, camera: "_Camera", plane: Plane, rays: Float[np.ndarray, "sample 3"], distance: np.ndarray
-    ) -> Float[np.ndarray, "sample 3"]:
-        places = camera.eye + distance[:, None] * rays
-        lengths = np.linalg.norm(plane.sides, axis=1)
-        uv = (places - plane.corner) @ (plane.sides / lengths[:, None]).T
-        normal = plane.normal
-        cosine = np.abs(rays @ normal) / np.linalg.norm(rays, axis=1)
-        colors = surface_colors(plane, uv, distance / camera.focal / np.maximum(cosine, 0.05))
-        toward = np.where((rays @ normal)[:, None] > 0, -normal, normal)
-        return colors * self._received(places, toward)
-
-    def _lit_object(
-        self,
-        camera: "_Camera",
-        triangles: np.ndarray,
-        weights: np.ndarray,
-        depth: np.ndarray,
-        rays: Float[np.ndarray, "sample 3"],
-        paint: list[float] | None,
-    ) -> Float[np.ndarray, "sample 3"]:
-        mesh = self.mesh
-        rest = 1 - weights.sum(-1, keepdims=True)
-        shares = np.concatenate([rest, weights], axis=-1)[:, None]
-        uv = (shares @ mesh.uv[triangles])[:, 0]
-        colors = np.empty((len(triangles), 3))
-        area = camera.texture_area(mesh.corners, mesh.uv, triangles)
-        look_up(mesh.textures.texels, mesh.textures.levels, mesh.texture[triangles], uv, area, colors)
-        colors *= (shares @ mesh.colors[triangles])[:, 0]
-        if paint is not None:
-            colors[self.back[triangles]] = paint
-        normals = (shares @ mesh.normals[triangles])[:, 0]
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        normals = np.where((normals * rays).sum(1, keepdims=True) > 0, -normals, normals)
-        return colors * self._received(camera.eye + depth[:, None] * rays, normals)
-
-    def _received(
-        self, places: Float[np.ndarray, "place 3"], normals: Float[np.ndarray, "place 3"]
-    ) -> Float[np.ndarray, "place 3"]:
-        """Return the radiance of white surfaces at places."""
-        light = self.lighting
-        steps = np.linspace(-1, 1, NORMAL_STEPS)
-        ambient = np.stack([np.interp(normals[:, 2], steps, light.ambient[:, k]) for k in range(3)], axis=-1)
-        cosines = (normals @ light.toward_sun).clip(0, None)
-        shares = np.empty(len(places))
-        angles = GOLDEN_ANGLE * np.arange(SHADOW_SAMPLES)
-        radii = np.sqrt((np.arange(SHADOW_SAMPLES) + 0.5) / SHADOW_SAMPLES)
-        offsets = radii[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-        in_sun = places @ light.axes.T
-        light_share(in_sun, light.shadow, 1.0, light.softness, offsets, SHADOW_BIAS, shares)
-        return ambient + (cosines * shares)[:, None] * light.sun
+        numbers = np.full(shape, NOTHING, np.int64)
+        distance = np.full(shape, np.inf)
+        draw_planes(camera, self.planes, numbers, distance)
+        return triangles, weights, depth, numbers, distance, points
 
 
-class _Camera:
-    """Pinhole of a job's view, with samples x samples rays a pixel."""
-
-    def __init__(self, view: dict[str, Any], samples: int) -> None:
-        matrix = np.array(view["world_to_camera"])
-        self.rotation = matrix[:3, :3]
-        self.shift = matrix[:3, 3]
-        self.eye = -self.rotation.T @ self.shift
-        self.focal = view["focal"] * samples
-        self.center = np.array(view["center"]) * samples
-        width, height = (side * samples for side in view["size"])
-        self.shape = height, width
-        x = (np.arange(width) + 0.5 - self.center[0]) / self.focal
-        y = (np.arange(height) + 0.5 - self.center[1]) / self.focal
-        directions = np.stack(np.broadcast_arrays(x[None], y[:, None], 1.0), axis=-1)
-        self.rays = directions @ self.rotation
-        """World directions [height width 3] whose length along the optical axis is 1."""
-
-    def projected(self, corners: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Return x and y in samples, and depth."""
-        points = corners @ self.rotation.T + self.shift
-        depth = points[..., 2:]
-        safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
-        return np.concatenate([points[..., :2] / safe * self.focal + self.center, depth], axis=-1)
-
-    def nearest(self, planes: list[Plane]) -> tuple[Int[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-        """Return the number of the nearest plane at each sample, or `NOTHING`, and its depth, or infinity."""
-        numbers = np.full(self.shape, NOTHING, np.int64)
-        depth = np.full(self.shape, np.inf)
-        rectangles = np.array([plane.described() for plane in planes]).reshape(-1, 4, 3)
-        draw_rectangles(self.eye, self.rotation, self.focal, self.center, rectangles, numbers, depth)
-        return numbers, depth
-
-    def texture_area(self, corners: np.ndarray, uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-        """Return for each sample the area in texture coordinates that it covers on its triangle."""
-        used, inverse = np.unique(triangles, return_inverse=True)
-        points = self.projected(corners[used])[..., :2]
-        on_image = np.abs(_crosses(points))
-        on_texture = np.abs(_crosses(uv[used]))
-        return (on_texture / np.maximum(on_image, 1e-12))[inverse.reshape(-1)]
+def view_in_samples(view: dict[str, Any], samples: int) -> View:
+    """Return a job's view with samples x samples a pixel."""
+    matrix = np.array(view["world_to_camera"])
+    rotation = np.ascontiguousarray(matrix[:3, :3])
+    eye = -rotation.T @ matrix[:3, 3]
+    return View(eye, rotation, float(view["focal"] * samples), np.array(view["center"], np.float64) * samples)
 
 
-def _crosses(points: Float[np.ndarray, "triangle 3 2"]) -> Float[np.ndarray, " triangle"]:
-    first = points[:, 1] - points[:, 0]
-    second = points[:, 2] - points[:, 0]
-    product: Float[np.ndarray, " triangle"] = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    return product
+def projected(
+    camera: View, matrix: Float[np.ndarray, "4 4"], corners: Float[np.ndarray, "*n 3"]
+) -> Float[np.ndarray, "*n 3"]:
+    """Return x and y in samples, and depth."""
+    points = corners @ camera.rotation.T + matrix[:3, 3]
+    depth = points[..., 2:]
+    safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
+    return np.concatenate([points[..., :2] / safe * camera.focal + camera.center, depth], axis=-1)

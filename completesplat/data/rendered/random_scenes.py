@@ -48,8 +48,9 @@ Angles = Float[np.ndarray, " view"]
 
 
 class RenderSettings(TypedDict):
-    """Settings of all scenes, for `draw_cameras`, `draw_light` and `draw_surface`."""
+    """Settings of all scenes, for `read_mesh`, `draw_cameras`, `draw_light` and `draw_surface`."""
 
+    up: Literal["y", "z"] | None
     views: Annotated[int, Range(2, 1000)]
     size: Side
     samples: Positive
@@ -73,6 +74,7 @@ def draw_rendered_scene(name: str, settings: RenderSettings) -> tuple[dict[str, 
     cameras = draw_cameras(rng, settings["cameras"], views, settings["fov"], size, front)
     job = {
         "seed": int(rng.integers(2**31)),
+        "up": settings["up"],
         "samples": settings["samples"],
         "views": [view_of(camera) for camera in cameras],
         "room": room_size(cameras),

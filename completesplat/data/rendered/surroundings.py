@@ -1,108 +1,67 @@
-"""Floor and walls around an object: where they are, and the colours of their matt surfaces."""
+"""Floor and walls around an object: where they are, and what they show."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image
 
-from completesplat.data.rendered.mesh_reading import Textures, packed_textures
-from completesplat.data.rendered.z_buffer import look_up
+from completesplat.data.rendered.mesh_reading import packed_textures
+from completesplat.data.rendered.shading import CHECKER, IMAGE, NOISE, Planes
 
 OPEN_GROUND = 30.0  # half size of a floor without walls, as in Blender
 LATTICE = 4096  # values of a noise's lattice
+PATTERNS = {"checker": CHECKER, "noise": NOISE, "image": IMAGE}
+WHITE = np.full((1, 1, 4), 255, np.uint8)
 
 
-@dataclass(frozen=True)
-class Plane:
-    """Rectangle with a matt surface: the floor, or a wall.
-
-    Attributes:
-        corner: place where both texture coordinates are 0; they are lengths along the sides.
-        sides: vectors of the two sides.
-    """
-
-    corner: Float[np.ndarray, " 3"]
-    sides: Float[np.ndarray, "2 3"]
-    surface: dict[str, Any]
-    picture: Textures | None
-
-    @property
-    def normal(self) -> Float[np.ndarray, " 3"]:
-        """Unit vector across the plane."""
-        normal: Float[np.ndarray, " 3"] = np.cross(self.sides[0], self.sides[1])
-        return normal / np.linalg.norm(normal)
-
-    def described(self) -> Float[np.ndarray, "4 3"]:
-        """Return corner, sides and normal, as `draw_rectangles` takes them."""
-        return np.stack([self.corner, *self.sides, self.normal])
-
-
-def surroundings(job: dict[str, Any], ground: float) -> list[Plane]:
-    """Return the floor below the object, and the walls of a room without a ceiling."""
+def surroundings(job: dict[str, Any], ground: float) -> Planes:
+    """Return the floor below the object, if there is one, and then the walls of a room without a ceiling."""
     side = job["room"] if job["wall"] else OPEN_GROUND
     square = np.array([(-side, -side), (side, -side), (side, side), (-side, side)])
-    planes = []
+    corners: list[tuple[float, ...]] = []
+    sides: list[list[tuple[float, ...]]] = []
+    surfaces: list[dict[str, Any]] = []
     if job["floor"]:
-        sides = np.array([(2 * side, 0, 0), (0, 2 * side, 0)])
-        planes.append(_plane(np.array([-side, -side, ground]), sides, job["floor"]))
+        corners.append((-side, -side, ground))
+        sides.append([(2 * side, 0, 0), (0, 2 * side, 0)])
+        surfaces.append(job["floor"])
     if job["wall"]:
         for place, following in zip(square, np.roll(square, -1, axis=0), strict=True):
-            sides = np.array([(*(following - place), 0), (0, 0, 2 * side)])
-            planes.append(_plane(np.array([*place, ground]), sides, job["wall"]))
-    return planes
+            corners.append((*place, ground))
+            sides.append([(*(following - place), 0), (0, 0, 2 * side)])
+            surfaces.append(job["wall"])
+    files = sorted({surface["file"] for surface in surfaces})
+    textures = packed_textures([_pixels(file) if file else WHITE for file in files] or [WHITE])
+    vectors = np.array(sides, np.float64).reshape(-1, 2, 3)
+    lengths = np.linalg.norm(vectors, axis=-1)
+    units = vectors / lengths[..., None]
+    return Planes(
+        corners=np.array(corners, np.float64).reshape(-1, 3),
+        first=np.ascontiguousarray(units[:, 0]),
+        second=np.ascontiguousarray(units[:, 1]),
+        normals=np.cross(units[:, 0], units[:, 1]),
+        lengths=lengths,
+        patterns=np.array([PATTERNS[surface["pattern"]] for surface in surfaces], np.int64),
+        colors=np.array([surface["colors"] or np.zeros((2, 3)) for surface in surfaces]).reshape(-1, 2, 3),
+        repeats=np.array([surface["repeats"] for surface in surfaces], np.float64),
+        texture=np.array([files.index(surface["file"]) for surface in surfaces], np.int64),
+        texels=textures.texels,
+        levels=textures.levels,
+        lattice=np.random.default_rng(0).uniform(size=LATTICE),
+    )
 
 
-def _plane(corner: np.ndarray, sides: np.ndarray, surface: dict[str, Any]) -> Plane:
-    picture = None
-    if surface["pattern"] == "image":
-        with Image.open(surface["file"]) as file:
-            picture = packed_textures([np.asarray(file.convert("RGBA"))])
-    return Plane(corner, sides, surface, picture)
+def _pixels(file: str) -> UInt8[np.ndarray, "height width 4"]:
+    with Image.open(file) as image:
+        return np.asarray(image.convert("RGBA"))
 
 
-def surface_mean(plane: Plane) -> Float[np.ndarray, " 3"]:
-    """Return the mean linear colour of a surface."""
-    if plane.picture is None:
-        return np.array(plane.surface["colors"]).mean(0)
-    start, width, height = plane.picture.levels[0, -1]
-    values = plane.picture.texels[start : start + 4 * width * height].reshape(-1, 4)
+def mean_color(planes: Planes, number: int) -> Float[np.ndarray, " 3"]:
+    """Return the mean linear colour of a plane."""
+    if planes.patterns[number] != IMAGE:
+        return planes.colors[number].mean(0)
+    start, width, height = planes.levels[planes.texture[number], -1]
+    values = planes.texels[start : start + 4 * width * height].reshape(-1, 4)
     mean: Float[np.ndarray, " 3"] = values[:, :3].mean(0) / 65535
     return mean
-
-
-def surface_colors(
-    plane: Plane, uv: Float[np.ndarray, "sample 2"], size: Float[np.ndarray, " sample"]
-) -> Float[np.ndarray, "sample 3"]:
-    """Return the linear colours of a surface at lengths along its sides; `size` is that of a sample on it."""
-    surface = plane.surface
-    scaled = uv * surface["repeats"]
-    extent = size * surface["repeats"]
-    if plane.picture is not None:
-        colors = np.empty((len(uv), 3))
-        picture = plane.picture
-        look_up(picture.texels, picture.levels, np.zeros(len(uv), np.int64), scaled, extent**2, colors)
-        return colors
-    share = (np.floor(scaled).sum(-1) % 2)[:, None] if surface["pattern"] == "checker" else _noise(scaled)[:, None]
-    # Samples that are wider than the pattern show its mean.
-    share = share + (0.5 - share) * (extent - 1).clip(0, 1)[:, None]
-    first, second = np.array(surface["colors"])
-    return (1 - share) * first + share * second
-
-
-def _noise(places: Float[np.ndarray, "place 2"]) -> Float[np.ndarray, " place"]:
-    """Return smooth noise from 0 to 1 whose features have size 1 (value noise of two octaves)."""
-    lattice = np.random.default_rng(0).uniform(size=LATTICE)
-    total = np.zeros(len(places))
-    for octave, weight in ((1, 2 / 3), (2, 1 / 3)):
-        scaled = places * octave
-        cell = np.floor(scaled).astype(np.int64)
-        inside = scaled - cell
-        blend = inside * inside * (3 - 2 * inside)
-        for across in (0, 1):
-            for up in (0, 1):
-                values = lattice[((cell[:, 0] + across) * 73 + (cell[:, 1] + up) * 179) % LATTICE]
-                share = np.abs(1 - across - blend[:, 0]) * np.abs(1 - up - blend[:, 1])
-                total += weight * values * share
-    return total

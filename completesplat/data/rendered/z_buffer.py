@@ -1,15 +1,15 @@
-"""Compiled kernels: nearest triangles and rectangles, lookups in textures, soft shadows.
+"""Compiled kernels: nearest triangles, and values of textures.
 
 Arguments that several kernels share:
     texels: linear RGBA of all textures, 16 bits each, one copy of a texture after the other (`mesh_reading.Textures`).
     levels: [texture level 3] first value, width and height of each copy of a texture, whose sides are half those of the
         copy before.
-    texture: number of a triangle's or sample's texture.
+    texture: number of a triangle's texture.
     uv: texture coordinates; v goes up, and both repeat after 1.
 """
 
 from functools import partial
-from math import ceil, floor, log2
+from math import ceil, floor
 
 from completesplat.rasterizers.kernels.compilation import helper, kernel
 
@@ -39,10 +39,10 @@ def bilinear(texels, start, width, height, u, v, channel):
     down = y - top
     left = int(left)
     top = int(top)
-    right = (left + 1) % width
-    below = (top + 1) % height
-    left = left % width
-    top = top % height
+    right = left + 1 if left + 1 < width else 0
+    below = top + 1 if top + 1 < height else 0
+    left = left if left >= 0 else width - 1
+    top = top if top >= 0 else height - 1
     upper = (1 - across) * texel(texels, start, width, left, top, channel)
     upper += across * texel(texels, start, width, right, top, channel)
     lower = (1 - across) * texel(texels, start, width, left, below, channel)
@@ -98,117 +98,12 @@ def draw_triangles(points, uv, texture, texels, levels, cut, triangles, weights,
                     first = 1.0 - second - third
                     u = first * uv[t, 0, 0] + second * uv[t, 1, 0] + third * uv[t, 2, 0]
                     v = first * uv[t, 0, 1] + second * uv[t, 1, 1] + third * uv[t, 2, 1]
-                    start, across, down = levels[texture[t], 0]
+                    start = levels[texture[t], 0, 0]
+                    across = levels[texture[t], 0, 1]
+                    down = levels[texture[t], 0, 2]
                     if bilinear(texels, start, across, down, u, v, 3) < OPAQUE:
                         continue
                 depth[row, column] = here
                 triangles[row, column] = t
                 weights[row, column, 0] = second
                 weights[row, column, 1] = third
-
-
-@compiled
-def look_up(texels, levels, texture, uv, area, colors):
-    """Look linear colours up in textures.
-
-    Args:
-        texture: [sample] number of the texture.
-        uv: [sample 2].
-        area: [sample] of a sample in texture coordinates, which chooses the halved copy.
-        colors: [sample 3], written.
-    """
-    for k in range(len(texture)):
-        start, width, height = levels[texture[k], 0]
-        covered = area[k] * width * height
-        if covered > 1.0:
-            level = min(int(0.5 * log2(covered) + 0.5), levels.shape[1] - 1)
-            start, width, height = levels[texture[k], level]
-        for channel in range(3):
-            colors[k, channel] = bilinear(texels, start, width, height, uv[k, 0], uv[k, 1], channel)
-
-
-@compiled
-def light_share(places, depth, half, softness, offsets, bias, shares):
-    """Find which share of the sun reaches places (percentage-closer soft shadows, Fernando 2005).
-
-    Args:
-        places: [place 3] in the sun's frame: x and y across, and depth along its rays.
-        depth: [side side] of the object from the sun, over the square from -`half` to `half`.
-        softness: tangent of half the sun's angle.
-        offsets: [sample 2] in the unit disc.
-        bias: distance within which a place does not shadow itself.
-        shares: [place], written, 0 to 1.
-    """
-    side = len(depth)
-    scale = side / (2 * half)
-    for k in range(len(places)):
-        x = (places[k, 0] + half) * scale
-        y = (places[k, 1] + half) * scale
-        here = places[k, 2] - bias
-        blockers = 0
-        gap = 0.0
-        reach = softness * 2 * half * scale + 1.5
-        for offset in offsets:
-            row = floor(y + reach * offset[1])
-            column = floor(x + reach * offset[0])
-            if 0 <= row < side and 0 <= column < side and depth[row, column] < here:
-                blockers += 1
-                gap += here - depth[row, column]
-        if blockers == 0:
-            shares[k] = 1.0
-            continue
-        reach = softness * gap / blockers * scale + 1.5
-        dark = 0
-        for offset in offsets:
-            row = floor(y + reach * offset[1])
-            column = floor(x + reach * offset[0])
-            if 0 <= row < side and 0 <= column < side and depth[row, column] < here:
-                dark += 1
-        shares[k] = 1.0 - dark / len(offsets)
-
-
-@inlined
-def along(vector, x, y, z):
-    return vector[0] * x + vector[1] * y + vector[2] * z
-
-
-@compiled
-def draw_rectangles(eye, rotation, focal, center, rectangles, numbers, depth):
-    """Find the nearest rectangle at each pixel's centre.
-
-    Args:
-        eye, rotation, focal, center: a pinhole camera; `rotation` is from the world to the camera.
-        rectangles: [rectangle 4 3] a corner, the vectors of the two sides, which are perpendicular, and the normal.
-        numbers: [height width], full of `NOTHING`; overwritten by the number of the nearest rectangle.
-        depth: [height width], infinite; overwritten where a rectangle is nearer.
-    """
-    height, width = depth.shape
-    for k in range(len(rectangles)):
-        corner, first, second, normal = rectangles[k]
-        from_x = eye[0] - corner[0]
-        from_y = eye[1] - corner[1]
-        from_z = eye[2] - corner[2]
-        offset = -along(normal, from_x, from_y, from_z)
-        first_square = along(first, first[0], first[1], first[2])
-        second_square = along(second, second[0], second[1], second[2])
-        for row in range(height):
-            y = (row + 0.5 - center[1]) / focal
-            for column in range(width):
-                x = (column + 0.5 - center[0]) / focal
-                ray_x = x * rotation[0, 0] + y * rotation[1, 0] + rotation[2, 0]
-                ray_y = x * rotation[0, 1] + y * rotation[1, 1] + rotation[2, 1]
-                ray_z = x * rotation[0, 2] + y * rotation[1, 2] + rotation[2, 2]
-                facing = along(normal, ray_x, ray_y, ray_z)
-                if facing == 0.0:
-                    continue
-                distance = offset / facing
-                if distance <= 0.0 or distance >= depth[row, column]:
-                    continue
-                place_x = from_x + distance * ray_x
-                place_y = from_y + distance * ray_y
-                place_z = from_z + distance * ray_z
-                across = along(first, place_x, place_y, place_z) / first_square
-                up = along(second, place_x, place_y, place_z) / second_square
-                if 0.0 <= across <= 1.0 and 0.0 <= up <= 1.0:
-                    depth[row, column] = distance
-                    numbers[row, column] = k

@@ -56,6 +56,28 @@ def test_textures_are_found(cube, tmp_path, place, name):
     assert 0 < there < 1
 
 
+@pytest.mark.parametrize(("up", "tall"), [(None, 1), ("y", 1), ("z", 2)])
+def test_a_scan_stands_if_it_is_said_that_z_points_up(tmp_path, up, tall):
+    """The box is twice as high as wide; it lies on its back where y is taken to point up."""
+    mesh = read_mesh(meshes.write_scan(tmp_path / "scan"), tmp_path.resolve(), up)
+    sides = np.ptp(mesh.corners, axis=(0, 1))
+    assert sides.argmax() == tall
+    assert sides.max() == pytest.approx(2 * sides.min())
+    assert texture_of(tmp_path / "scan/meshes/model.obj", tmp_path) < 0.9
+
+
+def test_what_gltf_says_goes_before_a_given_axis_and_ply_has_none(tmp_path):
+    box = trimesh.creation.box((1, 1, 2))
+    tall = {}
+    for name in ("box.glb", "box.ply"):
+        box.export(tmp_path / name)
+        for up in (None, "y", "z"):
+            corners = read_mesh(tmp_path / name, tmp_path, up).corners
+            tall[name, up] = int(np.ptp(corners, axis=(0, 1)).argmax())
+    assert {tall["box.glb", up] for up in (None, "y", "z")} == {1}
+    assert [tall["box.ply", up] for up in (None, "y", "z")] == [2, 1, 2]
+
+
 def test_a_texture_that_is_missing_outside_or_damaged_is_refused(cube, tmp_path):
     path = moved(cube, "../../../outside.png")
     with pytest.raises(BrokenMesh, match=r"its texture model.png is missing"):
@@ -101,10 +123,26 @@ def test_colours_of_vertices_and_materials_are_linear(tmp_path):
     assert read_mesh(tmp_path / "t.obj", tmp_path).colors == pytest.approx(np.full((1, 3, 3), 0.5), abs=5e-3)
 
 
-def test_what_only_blender_draws_is_named(tmp_path):
-    kind = trimesh.visual.material.PBRMaterial(metallicFactor=1.0, baseColorFactor=[255, 255, 255, 255], name="steel")
-    visual = trimesh.visual.TextureVisuals(uv=np.zeros((3, 2)), material=kind)
-    triangle = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False, visual=visual)
-    triangle.export(tmp_path / "t.glb")
-    assert read_mesh(tmp_path / "t.glb", tmp_path).beyond == "metal"
-    assert Image.MAX_IMAGE_PIXELS is not None
+@pytest.mark.parametrize(
+    ("material", "name"),
+    [
+        ({}, ""),
+        ({"pbr": {"metallicFactor": 1.0}}, "metal"),
+        ({"pbr": {"metallicFactor": 1.0}, "extensions": {"KHR_materials_unlit": {}}}, ""),
+        ({"extensions": {"KHR_materials_transmission": {"transmissionFactor": 0.9}}}, "glass"),
+        ({"alphaMode": "BLEND"}, "half-transparent materials"),
+        ({"emissiveFactor": [0.0, 2.0, 0.0]}, "materials that glow"),
+        ({"pbr": {"metallicFactor": 0.9}, "alphaMode": "BLEND"}, "metal and half-transparent materials"),
+    ],
+)
+def test_what_only_blender_draws_is_named(tmp_path, material, name):
+    assert read_mesh(meshes.write_ball(tmp_path / "ball.glb", **material), tmp_path).beyond == name
+
+
+def test_a_material_that_says_nothing_is_of_metal_by_the_standard_unless_a_texture_says_where(tmp_path):
+    triangle = meshes.write_gltf(tmp_path / "t.gltf", "t.png")
+    Image.new("RGB", (8, 8), (200, 40, 40)).save(tmp_path / "t.png")
+    assert read_mesh(triangle, tmp_path).beyond == "metal"
+    surface = '"metallicRoughnessTexture": {"index": 0}, "baseColorTexture"'
+    triangle.write_text(triangle.read_text().replace('"baseColorTexture"', surface))
+    assert read_mesh(triangle, tmp_path).beyond == ""

@@ -12,7 +12,7 @@ from PIL import Image
 from completesplat.data.rendered.mesh_reading import packed_textures, read_mesh, to_linear, to_srgb
 from completesplat.data.rendered.mesh_renderer import ambient_light, draw_job
 from completesplat.data.rendered.random_scenes import view_of
-from completesplat.data.rendered.z_buffer import look_up
+from completesplat.data.rendered.shading import SHEEN, filtered
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 
 trimesh = pytest.importorskip("trimesh")
@@ -33,7 +33,7 @@ def camera(eye, size=SIZE, degrees=40.0):
 def drawn(mesh, folder, cameras, **changes):
     """Draw a mesh; return its images (sRGB, 0 to 1), and its depth, mask and coverage."""
     folder.mkdir(exist_ok=True)
-    job = {"mesh": str(mesh), "root": str(mesh.parent.resolve()), "folder": str(folder), "samples": 16}
+    job = {"mesh": str(mesh), "root": str(mesh.parent.resolve()), "folder": str(folder), "samples": 16, "up": None}
     job |= {"views": [view_of(one) for one in cameras], "room": 3.0, "floor": None, "wall": None}
     job |= {"light": UNIFORM, "hidden": None, **changes}
     record = draw_job(job, Event())
@@ -82,6 +82,10 @@ def test_a_white_surface_under_a_uniform_sky_has_the_skys_own_radiance():
     assert half[16] == pytest.approx(np.full(3, 0.35), rel=2e-3)
     assert half[-1] == pytest.approx(np.full(3, 0.7), rel=2e-3)
     assert half[0] == pytest.approx(np.zeros(3), abs=1e-6)
+    # A room whose walls and ground are as bright as the sky is no different; black walls hide most of it.
+    assert ambient_light(sky, sky[0], sky[0]) == pytest.approx(np.full((33, 3), 0.7), rel=2e-3)
+    room = ambient_light(sky, np.zeros(3), np.zeros(3))
+    assert room[-1] == pytest.approx(np.full(3, 0.7 * (1 - 0.87**2)), rel=0.05)
 
 
 def test_a_plain_mesh_under_a_uniform_sky_has_one_colour(tmp_path):
@@ -90,7 +94,7 @@ def test_a_plain_mesh_under_a_uniform_sky_has_one_colour(tmp_path):
     ball.export(tmp_path / "ball.ply")
     images, geometry, _ = drawn(tmp_path / "ball.ply", tmp_path / "out", [camera((3.0, 0, 0))])
     inside = geometry[0][..., 2] == 1
-    expected = to_srgb(0.4 * to_linear(np.array([200, 100, 50]) / 255))
+    expected = to_srgb(0.4 * (SHEEN + (1 - SHEEN) * to_linear(np.array([200, 100, 50]) / 255)))
     assert np.abs(images[0][inside] - expected).max() < 0.01
 
 
@@ -124,13 +128,11 @@ def test_far_textures_show_their_mean_in_linear_light():
     image = np.stack([checker, checker, checker, np.full_like(checker, 255)], axis=-1).astype(np.uint8)
     textures = packed_textures([image])
     assert textures.levels.shape == (1, 4, 3)
-    colors = np.empty((1, 3))
-    look_up(textures.texels, textures.levels, np.zeros(1, np.int64), np.array([[0.3, 0.6]]), np.array([0.1]), colors)
-    assert to_srgb(colors) * 255 == pytest.approx(np.full((1, 3), 188), abs=1)
-    corners = np.array([[0.5 / 64, 1 - 0.5 / 64], [1.5 / 64, 1 - 0.5 / 64], [-0.5 / 64, 1 - 0.5 / 64]])
-    near = np.empty((3, 3))
-    look_up(textures.texels, textures.levels, np.zeros(3, np.int64), corners, np.zeros(3), near)
-    assert near[:, 0] == pytest.approx([0, 1, 1], abs=1e-4)  # the texture repeats
+    color = np.array(filtered(textures.texels, textures.levels, 0, 0.3, 0.6, 0.1))
+    assert to_srgb(color) * 255 == pytest.approx(np.full(3, 188), abs=1)
+    columns = np.array([0.5, 1.5, -0.5]) / 64
+    near = [filtered(textures.texels, textures.levels, 0, u, 1 - 0.5 / 64, 0.0)[0] for u in columns]
+    assert near == pytest.approx([0, 1, 1], abs=1e-4)  # the texture repeats
 
 
 def square(path, pixels, **material):
@@ -190,12 +192,12 @@ def test_paint_changes_only_what_the_first_camera_does_not_see(cube, tmp_path):
 
 
 def test_a_sharp_edge_is_shaded_flat_and_a_ball_smoothly(tmp_path):
-    box = trimesh.creation.box((1, 1, 1))  # 8 vertices, each of three faces
-    box.export(tmp_path / "box.ply")
-    mesh = read_mesh(tmp_path / "box.ply", tmp_path)
-    crosses = np.cross(mesh.corners[:, 1] - mesh.corners[:, 0], mesh.corners[:, 2] - mesh.corners[:, 0])
-    flat = crosses / np.linalg.norm(crosses, axis=1, keepdims=True)
-    assert mesh.normals == pytest.approx(np.repeat(flat[:, None], 3, axis=1))
+    for name, solid in (("box", trimesh.creation.box()), ("gem", trimesh.creation.icosahedron())):
+        solid.export(tmp_path / f"{name}.ply")  # each vertex belongs to three or five faces
+        mesh = read_mesh(tmp_path / f"{name}.ply", tmp_path)
+        crosses = np.cross(mesh.corners[:, 1] - mesh.corners[:, 0], mesh.corners[:, 2] - mesh.corners[:, 0])
+        flat = crosses / np.linalg.norm(crosses, axis=1, keepdims=True)
+        assert mesh.normals == pytest.approx(np.repeat(flat[:, None], 3, axis=1))
     trimesh.creation.icosphere(4).export(tmp_path / "ball.ply")
     ball = read_mesh(tmp_path / "ball.ply", tmp_path)
     assert ball.normals == pytest.approx(ball.corners, abs=0.01)

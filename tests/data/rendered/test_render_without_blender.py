@@ -71,11 +71,8 @@ def test_a_format_that_needs_blender_and_a_light_file_are_refused_in_one_line_wi
 
 
 def test_a_material_that_only_blender_draws_is_named(tmp_path, caplog):
-    kind = trimesh.visual.material.PBRMaterial(metallicFactor=1.0, name="steel")
-    ball = trimesh.creation.icosphere(2)
-    ball.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(ball.vertices), 2)), material=kind)
     (tmp_path / "meshes").mkdir()
-    ball.export(tmp_path / "meshes/ball.glb")
+    meshes.write_ball(tmp_path / "meshes/ball.glb", pbr={"metallicFactor": 1.0})
     with caplog.at_level(logging.WARNING):
         render(str(tmp_path / "meshes"), out=tmp_path / "data", **QUICK)
     assert "ball: metal: drawn as plain colours; renderer=blender draws them" in caplog.text
