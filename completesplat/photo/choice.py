@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -18,6 +18,7 @@ from completesplat.photo.reading import Framing, ImageLike, read_square
 from completesplat.weights import CONFIG_FILE, read_small, shipped
 from completesplat.wording import printable
 
+Item = TypeVar("Item")
 LOOKED_AT = 8  # at most this many of the images are examined
 SAME_GREY = 0.1  # largest difference of a border's pixel from the background
 BACKGROUND_SHARE = 0.5  # of the border's pixels, at least, if an object lies on the background
@@ -31,9 +32,26 @@ class Match(NamedTuple):
 
 
 def likeliest_weights(images: Sequence[Path], remove_background: bool) -> tuple[str, str]:
-    """Return the name of the likeliest shipped weights for `LOOKED_AT` of the images, and the reason as a clause.
+    """Return `likeliest_for` of some of the images (`looked_at`)."""
+    named = [(image.name, image) for image in looked_at(images)]
+    return likeliest_for(named, len(images), remove_background)
+
+
+def looked_at(items: Sequence[Item]) -> Sequence[Item]:
+    """Return at most `LOOKED_AT` of the items, from all over."""
+    step = math.ceil(len(items) / LOOKED_AT) or 1
+    return items[::step]
+
+
+def likeliest_for(
+    images: Sequence[tuple[str, ImageLike]], number: int, remove_background: bool = False
+) -> tuple[str, str]:
+    """Return the name of the likeliest shipped weights for some of `number` images, and the reason as a clause.
 
     Without an image, they are those for photos of anything.
+
+    Args:
+        images: name and content of each image.
 
     Raises:
         WeightsError: the package has no weights.
@@ -42,16 +60,16 @@ def likeliest_weights(images: Sequence[Path], remove_background: bool) -> tuple[
         raise WeightsError("weights=auto: this package has no weights; give weights=DIR")
     sums = Counter[str]()
     names = list[str]()
-    step = math.ceil(len(images) / LOOKED_AT) or 1
-    for image in images[::step]:
+    for name, image in images:
         with suppress(ImageError, OSError):  # which ends the prediction of this image alone, when its turn comes
-            sums.update({name: match.probability for name, match in match_shipped(image, remove_background).items()})
-            names.append(printable(image.name))
+            matches = match_shipped(image, remove_background)
+            sums.update({weights: match.probability for weights, match in matches.items()})
+            names.append(printable(name))
     if not names:
         return _without_images(bool(images))
-    shares = [f"{name} {total / len(names):.0%}" for name, total in sums.most_common()]
-    shares += [f"{name} needs a plain background" for name in shipped() if name not in sums]
-    whose = names[0] if len(images) == 1 else f"{len(names)} of {len(images)} images"
+    shares = [f"{weights} {total / len(names):.0%}" for weights, total in sums.most_common()]
+    shares += [f"{weights} needs a plain background" for weights in shipped() if weights not in sums]
+    whose = names[0] if number == 1 else f"{len(names)} of {number} images"
     return sums.most_common(1)[0][0], f"; likeliest for {whose} ({', '.join(shares)})"
 
 

@@ -57,7 +57,7 @@ class TrainingImages(TypedDict, total=False):
             which are rare, and high for fruit on white.
         box_masks: how often parts of an image were hidden.
         background: grey value behind the objects, if images show nothing else.
-        depth_before: depth range before the centre of an object of the common size.
+        depth_before, depth_after: depth range before and behind the centre of an object of the common size.
         picture_mean, picture_std: mean and standard deviation of the training images' features, see
             `completesplat.photo.features.image_features`.
     """
@@ -67,6 +67,7 @@ class TrainingImages(TypedDict, total=False):
     box_masks: Share
     background: Share
     depth_before: Annotated[float, Range(0, 1e6)]
+    depth_after: Annotated[float, Range(0, 1e6)]
     picture_mean: Annotated[Sequence[Share], Entries(8, 8)]
     picture_std: Annotated[Sequence[Annotated[float, Range(1e-6, 1)]], Entries(8, 8)]
 
