@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.errors import ImageError, WeightsError
-from completesplat.photo.features import distance_to_training
+from completesplat.photo.features import distance_to_training, image_features
 from completesplat.photo.reading import Framing, ImageLike, read_square
 from completesplat.weights import CONFIG_FILE, read_small, shipped
 from completesplat.wording import printable
@@ -82,9 +82,10 @@ def _without_images(unreadable: bool) -> tuple[str, str]:
 def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str, Match]:
     """Return how an image fits the weights in the package, the likeliest first.
 
-    Training images are taken as normally distributed, with `log_odds` before the image is seen. Distances depend on the
-    resolution, so the image, which is read once, is resized for each model. Weights of objects on one background are
-    left out if the image's border does not show it.
+    Training images are taken as normally distributed, with `log_odds` before the image is seen. Weights with
+    `feature_odds` state their odds against those for photos of anything themselves. Distances depend on the resolution,
+    so the image, which is read once, is resized for each model. Weights of objects on one background are left out if
+    the image's border does not show it.
 
     Raises:
         CompleteSplatError: as `read_square`.
@@ -99,12 +100,16 @@ def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str
         background = training.get("background")
         if background is not None and not _lies_on(background, square):
             continue
-        distance = distance_to_training(read_square(square, Framing(config["image_size"])).image, training)
+        resized = read_square(square, Framing(config["image_size"])).image
+        distance = distance_to_training(resized, training)
         if distance is not None:
             standard_deviations = torch.tensor(training["picture_std"])
             # Log density of independent normal features, without its constant. `distance` squared is the mean over the
             # features of their squared distances from the mean, in standard deviations.
             density = -standard_deviations.log().sum().item() - len(standard_deviations) * distance**2 / 2
+            if "feature_odds" in training:
+                of_anything = logarithms[0] if logarithms else 0.0
+                density = of_anything + (image_features(resized) @ torch.tensor(training["feature_odds"])).item()
             distances[name] = distance
             logarithms.append(density + training.get("log_odds", 0.0))
     probabilities = torch.tensor(logarithms, dtype=torch.float64).softmax(0).tolist()

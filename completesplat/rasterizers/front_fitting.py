@@ -36,8 +36,8 @@ def fit_front(
     """Fit colours, opacities and scales of Gaussians [batch], so that each set looks like its image from its camera.
 
     Each round is a step of Adam on the squared error, until it is `ENOUGH`. The best of all rounds is returned.
-    Gaussians that the image hides stay as they are. None changes its place, becomes more opaque or grows. Of `DirectionalGaussians`, the means of
-    the colours change.
+    Gaussians that the image hides stay as they are. None changes its place, becomes more opaque or grows. Of
+    `DirectionalGaussians`, the means of the colours change.
 
     This also works where autograd is off, as in `torch.inference_mode()`.
 

@@ -54,7 +54,9 @@ class TrainingImages(TypedDict, total=False):
     Attributes:
         content: what they show, in words, for weights in the package.
         log_odds: logarithm of the odds that a photo shows this, before it is seen (0: even). It is low for renders,
-            which are rare, and high for fruit on white.
+            which are rare.
+        feature_odds: what each of the image's features adds to `log_odds` (`notebooks/odds.py`); the sum compares the
+            photo with other things on the same background. Without it, the odds are of normal distributions.
         box_masks: how often parts of an image were hidden.
         background: grey value behind the objects, if images show nothing else.
         depth_before, depth_after: depth range before and behind the centre of an object of the common size.
@@ -63,7 +65,8 @@ class TrainingImages(TypedDict, total=False):
     """
 
     content: str
-    log_odds: Annotated[float, Range(-100, 100)]
+    log_odds: Annotated[float, Range(-1000, 1000)]
+    feature_odds: Annotated[Sequence[float], Entries(8, 8)]
     box_masks: Share
     background: Share
     depth_before: Annotated[float, Range(0, 1e6)]
