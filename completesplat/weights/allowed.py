@@ -66,7 +66,7 @@ class TrainingImages(TypedDict, total=False):
 
     content: str
     log_odds: Annotated[float, Range(-1000, 1000)]
-    feature_odds: Annotated[Sequence[float], Entries(8, 8)]
+    feature_odds: Annotated[Sequence[Annotated[float, Range(-1000, 1000)]], Entries(8, 8)]
     box_masks: Share
     background: Share
     depth_before: Annotated[float, Range(0, 1e6)]
