@@ -165,6 +165,11 @@ class SceneModel(nn.Module):
         """Return the settings that a data set with the config `data` must have for this model."""
         return {"image_size": self.image_size} | ({} if self.background is None else {"background": self.background})
 
+    def depths_of_training(self) -> dict[str, float]:
+        """Return the depth range around an object in training, by the names of the settings of data."""
+        training = self.architecture.get("training") or {}
+        return {name: training[name] for name in ("depth_before", "depth_after") if name in training}
+
     @in_float32()
     def forward(
         self,

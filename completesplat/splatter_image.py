@@ -63,6 +63,14 @@ def incremental_depths(raw: LayerMaps, near: Tensor, far: Tensor) -> LayerMaps:
     return torch.cat([first, steps], dim=-3).cumsum(dim=-3)
 
 
+def bent_below(values: Tensor, largest: float) -> Tensor:
+    """Return values that approach a bound from below: the `largest` less softplus(largest - value).
+
+    Far below the bound they hardly change. The gradient is nowhere 0: half at the bound, and falling beyond.
+    """
+    return largest - torch.nn.functional.softplus(largest - values)
+
+
 LAYER_DEPTHS = {"independent": independent_depths, "incremental": incremental_depths}
 
 Length = Annotated[float, Range(1e-9, 1e9)]
@@ -83,6 +91,8 @@ class Parameterization:
         layer_step: initial distance of a layer behind the last with incremental depths, in scene units.
         smallest_scale, largest_scale: the exponential of the raw scale is clamped to this range, in scene units
             (the paper states none). The clamp has no gradient outside and the full gradient inside.
+        smooth_scales: near `largest_scale`, bend towards it in place of the clamp, so that Gaussians that reach it keep
+            a gradient and can shrink again. Small scales stay almost as they are.
         harmonics: largest degree of the spherical harmonics of colours. 0 is the paper's: one colour for all
             directions. Light that stands still while an object turns needs 1 to 3.
         within_range: give opacity 0 to Gaussians that their offset moves nearer than the depth range, because they
@@ -98,6 +108,7 @@ class Parameterization:
     largest_scale: Length = 2.0
     harmonics: Degree = 0
     within_range: bool = False
+    smooth_scales: bool = False
 
     @property
     def groups(self) -> dict[str, Group]:
@@ -144,7 +155,10 @@ class SplatterImage(TensorDataclass):
         opacity = parts["opacity"].sigmoid()
         if settings.within_range:
             opacity = opacity * (depth + parts["offset"].select(-3, 2) >= near).unsqueeze(-3)
-        log_scale = parts["scale"].clamp(math.log(settings.smallest_scale), math.log(settings.largest_scale))
+        log_scale = parts["scale"]
+        if settings.smooth_scales:
+            log_scale = bent_below(log_scale, math.log(settings.largest_scale))
+        log_scale = log_scale.clamp(math.log(settings.smallest_scale), math.log(settings.largest_scale))
 
         def flat(values: Tensor) -> Tensor:
             return rearrange(values, "... layer channel height width -> ... (layer height width) channel")

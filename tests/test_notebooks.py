@@ -98,6 +98,29 @@ def test_an_autoreconstructor_of_twice_the_channels_computes_the_same(tmp_path):
     torch.testing.assert_close(after.splatter_image.raw, before.splatter_image.raw, rtol=1e-4, atol=1e-4)
 
 
+def test_odds_are_fitted_to_two_kinds_of_images_and_written_beside_the_weights(tmp_path, monkeypatch, capsys):
+    """Red squares on white against blue ones: the odds of a red one are high, those of a blue one low."""
+    rng = np.random.default_rng(0)
+    for kind, channel in (("reds", 0), ("blues", 2)):
+        for number in range(10):
+            (tmp_path / kind / str(number)).mkdir(parents=True)
+            pixels = np.full((20, 20, 3), 255, np.uint8)
+            pixels[4:16, 4:16] = rng.integers(0, 100, (12, 12, 3))
+            pixels[4:16, 4:16, channel] = 250
+            Image.fromarray(pixels).save(tmp_path / kind / str(number) / "0.png")
+    weights = tmp_path / "weights"
+    weights.mkdir()
+    (weights / "config.json").write_text(json.dumps({"image_size": 16, "training": {}}))
+    (weights / "model.safetensors").write_bytes(b"")
+    folders = [str(tmp_path / name) for name in ("weights", "reds", "blues")]
+    monkeypatch.setattr("sys.argv", ["odds.py", *folders])
+    runpy.run_path(str(ROOT / "notebooks/odds.py"))["main"]()
+    assert capsys.readouterr().out == "held out: 100.0% of 2 of the kind, 100.0% of 2 others\n"
+    training = json.loads((weights / "config.json").read_text())["training"]
+    assert len(training["feature_odds"]) == 8
+    assert training["feature_odds"][0] > 0 > training["feature_odds"][2]
+
+
 def test_a_data_set_written_as_captures_has_the_same_views(tmp_path):
     """Six of eight frames: images up to JPEG, cameras, and the place of the object in the depth range."""
     write_objects(tmp_path / "toys", scenes=6, frames=8, size=32, seed=0, workers=1, progress=False)

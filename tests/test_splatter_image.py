@@ -75,6 +75,20 @@ def test_scale_is_exponential_within_its_range_and_keeps_its_gradient_there():
     torch.testing.assert_close(raw.grad[:, :, 5:8], torch.ones(1, 2, 3, SIZE, SIZE))
 
 
+def test_smooth_scales_keep_a_gradient_at_the_largest_and_beyond():
+    settings = {"largest_scale": 2.0, "smooth_scales": True}
+    raw = image_of(scale=math.log(2.0)).raw
+    for beyond, least in ((0.0, 0.4), (1.0, 0.2)):
+        moved = (raw + beyond).requires_grad_()
+        scales = SplatterImage(moved, Parameterization(**settings)).gaussians(CAMERA, RANGE).scales
+        assert (scales < 2.0).all()
+        (gradient,) = torch.autograd.grad(scales.log().sum(), moved)
+        assert gradient.max() > least
+    small = image_of(scale=math.log(0.02))
+    bent = SplatterImage(small.raw, Parameterization(**settings)).gaussians(CAMERA, RANGE)
+    torch.testing.assert_close(bent.scales, small.gaussians(CAMERA, RANGE).scales, rtol=0.02, atol=0)
+
+
 def test_incremental_layers_lie_behind_each_other_and_independent_ones_anywhere():
     raw = torch.linspace(-3, 2, 3).view(1, 3, 1, 1, 1)
     depth = image_of(3, "incremental", depth=raw).gaussians(CAMERA, RANGE).means[..., 2].reshape(3, -1)

@@ -23,7 +23,7 @@ from completesplat.commands.locks import is_first_process
 from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.records import SCORES, job_entries, read_mapping
 from completesplat.settings.checks import check_parts_of_verb, check_values
-from completesplat.settings.composition import shard_folder, use_working_folder
+from completesplat.settings.composition import shard_folder, typed_keys, use_working_folder
 from completesplat.settings.options import did_you_mean
 from completesplat.signals import Interrupted, ended_by_signals
 from completesplat.weights import RUN_CHECKPOINT
@@ -58,6 +58,8 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     folder, out = job_folders(config)
     OmegaConf.set_struct(config, False)
     config.out = str(out)
+    if "typed" in config:
+        config.typed = typed_keys(hydra_config.overrides.task)
     resolved = cast(dict[str, object], OmegaConf.to_container(config, resolve=True))
     if is_finished(out, resolved, hydra_config.overrides.task):
         print(f"{out}: finished before, not repeated")

@@ -3,6 +3,7 @@
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,10 +13,10 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from completesplat.commands.inputs import check_one_model
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.evaluation.provenance import checkpoint_facts
 from completesplat.generator import CompleteSplat
-from completesplat.photo.choice import likeliest_weights
+from completesplat.photo.choice import likeliest_for, likeliest_weights, looked_at
 from completesplat.scene_model import SceneModel
 from completesplat.settings.checks import REMOVE
 from completesplat.settings.schema import TestSettings
@@ -114,11 +115,13 @@ class GivenWeights(TrainedModel):
     Args:
         weights, trust: see `CompleteSplat.from_pretrained`.
         data, rasterizer, sampler: configs of these parts.
+        typed: names of the settings that the user gave.
     """
 
     weights: str
     trust: bool
     data: Mapping[str, object]
+    typed: Sequence[str]
     rasterizer: Mapping[str, object]
     sampler: Mapping[str, object] | None
     seed: int
@@ -128,9 +131,22 @@ class GivenWeights(TrainedModel):
         return CompleteSplat.from_pretrained(self.weights, self.trust)
 
     def configuration(self) -> Any:
-        """Return the config of the data, with image size and background as the weights need them."""
+        """Return the config of the data as the weights need them, with a warning where the user gave another value.
+
+        The weights cannot do without their image size and background. A depth range that the user gave stays.
+        """
         config = _given_data(self.data, self.seed)
-        config.data.update(self.model.needed_of_data(config.data))
+        for name, depth in self.model.depths_of_training().items():
+            if name not in config.data:
+                continue
+            if f"data.{name}" not in self.typed:
+                config.data[name] = depth
+            elif config.data[name] != depth:
+                logger.warning("data.%s=%s: these weights were trained at %s", name, config.data[name], depth)
+        for name, value in self.model.needed_of_data(config.data).items():
+            if f"data.{name}" in self.typed and config.data[name] != value:
+                logger.warning("data.%s=%s: these weights need %s, which is taken", name, config.data[name], value)
+            config.data[name] = value
         return config
 
     def scorer(self, configuration: Any) -> "Scorer":
@@ -219,8 +235,32 @@ def trained_model(**settings: Unpack[TestSettings]) -> TrainedModel:
         raise CompleteSplatError("weights=DIR and scenes=DIR need data: give data=NAME data.root=DIR")
     rasterizer = settings["rasterizer"]
     if weights is not None:
-        return GivenWeights(weights, settings["trust"], data, rasterizer, sampler, seed)
+        if weights == AUTO:
+            weights, reason = likeliest_for_test(data, seed)
+            print(f"weights: {weights}, which come with the package{reason}")
+        return GivenWeights(weights, settings["trust"], data, settings.get("typed", ()), rasterizer, sampler, seed)
     return GivenScenes(str(scenes), frame, align, method, data, rasterizer, sampler, seed)
+
+
+def likeliest_for_test(data: Mapping[str, object], seed: int) -> tuple[str, str]:
+    """Return the name of the likeliest shipped weights for the reference views of test scenes, and the reason.
+
+    As in a prediction from several photos, one set of weights serves all of them.
+
+    Raises:
+        DataError: there are no test scenes.
+        WeightsError: the package has no weights.
+    """
+    module: SceneDataModule = instantiate(_given_data(data, seed).data, _convert_="all")
+    module.prepare_data()
+    store = module.store("test")
+    views = []
+    for name in looked_at(store.names):
+        with suppress(DataError):  # which the test reports
+            sequence = store.source.read(name)
+            reference, _ = module.evaluation_views(sequence, "test")
+            views.append((name, store.image(sequence, reference)))
+    return likeliest_for(views, len(store.names))
 
 
 def _given_data(data: Mapping[str, object], seed: int) -> Any:

@@ -20,6 +20,8 @@ WARM_UP = 8  # rounds in which the rates rise, so that a scene that is nearly ri
 ENOUGH = 1e-3
 """Mean squared error (30 dB) at which fitting ends, because more of it makes the sides of a scene worse."""
 SMALLEST = 1e-4  # opacity's distance from 0 and 1
+ONLY_FALLING = ("opacities", "scales")
+"""What fitting does not raise: a Gaussian that grows hides, from other sides, what lies behind it."""
 
 
 def fit_front(
@@ -34,8 +36,8 @@ def fit_front(
     """Fit colours, opacities and scales of Gaussians [batch], so that each set looks like its image from its camera.
 
     Each round is a step of Adam on the squared error, until it is `ENOUGH`. The best of all rounds is returned.
-    Gaussians that the image hides stay as they are, and none changes its place. Of `DirectionalGaussians`, the means of
-    the colours change.
+    Gaussians that the image hides stay as they are. None changes its place, becomes more opaque or grows. Of
+    `DirectionalGaussians`, the means of the colours change.
 
     This also works where autograd is off, as in `torch.inference_mode()`.
 
@@ -65,11 +67,13 @@ def fit_front(
             grads = torch.autograd.grad(error, moves)
             # torch.optim's Adam is the same, but its first step imports torch's compiler, which takes a second.
             factor = min(1, number / WARM_UP) * (1 + math.cos(math.pi * (number - 1) / rounds)) / 2
-            for move, mean, square, grad, rate in zip(moves, means, squares, grads, RATES.values(), strict=True):
+            for name, move, mean, square, grad in zip(RATES, moves, means, squares, grads, strict=True):
                 mean.lerp_(grad, 1 - BETAS[0])
                 square.lerp_(grad.square(), 1 - BETAS[1])
                 deviation = (square / (1 - BETAS[1] ** number)).sqrt() + DAMPING
-                move.data -= rate * factor * mean / (1 - BETAS[0] ** number) / deviation
+                move.data -= RATES[name] * factor * mean / (1 - BETAS[0] ** number) / deviation
+                if name in ONLY_FALLING:
+                    move.data.clamp_(max=0)
     return best
 
 

@@ -131,6 +131,11 @@ def swept_keys(arguments: Sequence[str]) -> list[str]:
     return [override.key_or_group for override in parsed if override.is_sweep_override()]
 
 
+def typed_keys(overrides: Sequence[str]) -> list[str]:
+    """Return the keys of a job's overrides."""
+    return [override.key_or_group for override in OverridesParser.create().parse_overrides(list(overrides))]
+
+
 def job_name(*keys: str, _root_: DictConfig) -> str:
     """Return the directory name for the job that Hydra is about to start: `ablation-no_skips+seed-0`.
 

@@ -6,7 +6,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, TypedDict
+from typing import Annotated, Any, Literal, NamedTuple, NotRequired, TypedDict
 
 from completesplat.errors import CompleteSplatError
 from completesplat.quantities import CameraPath, Entries, Format, NonNegative, Positive, Range, Seed, Share
@@ -101,6 +101,7 @@ class ModelSettings(TypedDict):
     ckpt: str | None
     weights: str | None
     overrides: Sequence[str]
+    typed: NotRequired[Sequence[str]]
     seed: Annotated[int, Range(0, 2**32 - 1)]
     trust: bool
 

@@ -54,19 +54,23 @@ class TrainingImages(TypedDict, total=False):
     Attributes:
         content: what they show, in words, for weights in the package.
         log_odds: logarithm of the odds that a photo shows this, before it is seen (0: even). It is low for renders,
-            which are rare, and high for fruit on white.
+            which are rare.
+        feature_odds: what each of the image's features adds to `log_odds` (`notebooks/odds.py`); the sum compares the
+            photo with other things on the same background. Without it, the odds are of normal distributions.
         box_masks: how often parts of an image were hidden.
         background: grey value behind the objects, if images show nothing else.
-        depth_before: depth range before the centre of an object of the common size.
+        depth_before, depth_after: depth range before and behind the centre of an object of the common size.
         picture_mean, picture_std: mean and standard deviation of the training images' features, see
             `completesplat.photo.features.image_features`.
     """
 
     content: str
-    log_odds: Annotated[float, Range(-100, 100)]
+    log_odds: Annotated[float, Range(-1000, 1000)]
+    feature_odds: Annotated[Sequence[Annotated[float, Range(-1000, 1000)]], Entries(8, 8)]
     box_masks: Share
     background: Share
     depth_before: Annotated[float, Range(0, 1e6)]
+    depth_after: Annotated[float, Range(0, 1e6)]
     picture_mean: Annotated[Sequence[Share], Entries(8, 8)]
     picture_std: Annotated[Sequence[Annotated[float, Range(1e-6, 1)]], Entries(8, 8)]
 

@@ -60,6 +60,8 @@ def test_the_ladder_of_reconstructions_has_every_rung_and_fitting_helps(runs, co
     assert rows[fitted[0]]["psnr"] > rows[fitted[2]]["psnr"]
     assert rows[posterior]["psnr"] != rows[alone]["psnr"]
     assert all(row["sharpness_behind"] > 0 and 0 < row["behind"] < 60 for row in rows.values())
+    assert all(row["sharpness_object"] > 0 for row in rows.values())
+    assert any(row["sharpness_object"] != row["sharpness_behind"] for row in rows.values())
     assert "Where quality is lost" in finished.out
     assert finished.err.count(", done") == len(rows)  # a line each where there is no terminal
 

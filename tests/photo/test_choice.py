@@ -76,6 +76,17 @@ def test_probabilities_are_those_of_normal_distributions_and_log_odds(package, t
         assert match.probability == pytest.approx(densities[name] / sum(densities.values()), rel=1e-3, abs=1e-12)
 
 
+def test_odds_by_features_are_against_the_weights_for_photos_of_anything(package, tmp_path):
+    """Red weighs 4, so a photo of red 0.5 has odds of exp(2 - 1), although it is far from the training images."""
+    odds = {"log_odds": -1.0, "feature_odds": [4.0] + [0.0] * 7}
+    change_json(package["reds"] / "config.json", lambda config: config["training"].update(odds))
+    change_json(package["greens"] / "config.json", lambda config: config["training"].update(log_odds=-100.0))
+    found = match_shipped(photo(tmp_path / "photo.png", "#800000"))
+    assert found["reds"].distance > 1
+    assert found["reds"].probability == pytest.approx(1 / (1 + np.exp(1 - 4 * 128 / 255)), rel=1e-3)
+    assert found["blues"].probability == pytest.approx(1 - found["reds"].probability, rel=1e-3)
+
+
 @pytest.mark.parametrize(("border", "chosen"), [("white", "reds"), ("red", "blues")])
 def test_weights_of_objects_on_white_are_for_images_whose_border_is_white(package, tmp_path, border, chosen):
     change_json(package["reds"] / "config.json", lambda config: config["training"].update(background=1.0))

@@ -22,7 +22,7 @@ def test_features_are_colours_their_spread_and_how_fine_they_are():
 def test_data_say_what_weights_are_to_know_of_them(toy_root):
     toys = ToyObjectsDataModule(str(toy_root), scenes=4, frames=4, image_size=32, box_masks={"probability": 0.25})
     facts = toys.training_facts()
-    assert (facts["box_masks"], facts["depth_before"]) == (0.25, 1.0)
+    assert (facts["box_masks"], facts["depth_before"], facts["depth_after"]) == (0.25, 1.0, 4.0)
     store = toys.store("train")
     sequences = [toys.source("train").read(name) for name in store.names]
     photos = torch.stack([store.image(s, frame) for s in sequences for frame in range(4)]).double() / 255

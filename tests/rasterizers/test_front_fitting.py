@@ -87,10 +87,11 @@ def test_hidden_pixels_have_no_influence(image):
     assert changed[:, -2:].mean() > 10 * changed[:, :2].mean()
 
 
-@pytest.mark.parametrize("name", ["colors", "opacities", "scales"])
-def test_a_value_that_is_wrong_is_found(name):
-    right = replace(wall(2, 0.9), opacities=torch.full((1, SIDE**2), 0.7))
-    wrong = replace(right, **{name: getattr(right, name) * 0.25})
+@pytest.mark.parametrize(("name", "factor"), [("colors", 0.25), ("opacities", 3), ("scales", 3)])
+def test_a_value_that_is_wrong_is_found(name, factor):
+    """Opacities and scales that are too large; they are not raised."""
+    right = replace(wall(2, 0.9), opacities=torch.full((1, SIDE**2), 0.3))
+    wrong = replace(right, **{name: getattr(right, name) * factor})
     before, after = ((render(x) - render(right)).square().mean() for x in (wrong, fitted(wrong, render(right), 100)))
     assert after <= ENOUGH < before / 1.5
 
@@ -120,3 +121,15 @@ def test_no_colour_becomes_brighter_than_white():
     result = fitted(dim, torch.ones(1, 3, SIDE, SIDE), 20)
     assert result.colors.max() == 1
     assert result.colors.min() >= 0
+
+
+def test_nothing_becomes_more_opaque_or_grows_because_it_would_hide_what_lies_behind(image):
+    """A thin pale wall in front of a dark one: only its colour and its falling opacity may show the image."""
+    thin = replace(wall(2, 0.9), opacities=torch.full((1, SIDE**2), 0.3))
+    scene = joined(thin, wall(3, 0.2))
+    result = fitted(scene, image, 20)
+    assert (result.opacities <= scene.opacities).all()
+    assert (result.scales <= scene.scales).all()
+    assert (result.colors - scene.colors).abs().amax() > 0.1
+    faded = fitted(scene, render(wall(3, 0.2)), 40)
+    assert faded.opacities[:, : SIDE**2].mean() < 0.2

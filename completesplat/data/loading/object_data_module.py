@@ -41,8 +41,11 @@ class ObjectDataModule(SceneDataModule):
         self.views = ObjectViews(self.targets, spread_targets, evaluation_targets, validation_targets)
 
     def training_facts(self) -> dict[str, float | list[float]]:
-        """Return the facts about training images that weights store, with the depth range before the object."""
-        return super().training_facts() | {"depth_before": self.framing.depth_before}
+        """Return the facts about training images that weights store, with the depth range around the object."""
+        facts = super().training_facts()
+        facts["depth_before"] = self.framing.depth_before
+        facts["depth_after"] = self.framing.depth_after
+        return facts
 
     def described_views(self, reference: str) -> dict[str, str | None]:
         """Return those facts of `describe` that all data of objects share, given what the reference of a test is."""

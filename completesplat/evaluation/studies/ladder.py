@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from completesplat.evaluation.regions import counted_pixels
 from completesplat.evaluation.studies.controls import OnProgress, Scenes
 from completesplat.evaluation.studies.samples import SampleRenderer, mean_over_scenes, near_reference
 from completesplat.gaussians import Gaussians
@@ -31,7 +32,8 @@ def ladder_rows(renderer: SampleRenderer, scenes: Scenes, fits: int, tick: OnPro
     The rungs: raw values of the Splatter Image, then the decoder's weights, then the latent, each fitted to all views
     of the scene in `fits` steps while the rest is kept; the mean of the posterior that sees all views (if it sees
     views); samples; the mean of the posterior that sees the reference image alone. `psnr` is of all views, `behind` of
-    those more than `BEHIND` degrees from the reference, and `sharpness_behind` their gradient energy over the truth's.
+    those more than `BEHIND` degrees from the reference. `sharpness_behind` is the gradient energy of these over the
+    truth's, `sharpness_object` that of the object's pixels alone, where data have masks.
     """
     measured = defaultdict[str, list[dict[str, float | None]]](list)
     for scene in scenes:
@@ -99,14 +101,19 @@ def _scores(renderer: SampleRenderer, scene: SceneBatch, gaussians: Gaussians) -
     rendering = renderer.rasterizer(gaussians, views.cameras.repeated(len(gaussians.means)))
     images = renderer.over_background(rendering)
     quality = torch.stack([psnr(sample, views.images) for sample in images])
-    scores: dict[str, float | None] = {"psnr": quality.mean().item(), "behind": None, "sharpness_behind": None}
+    scores: dict[str, float | None] = {"psnr": quality.mean().item()}
+    scores |= dict.fromkeys(("behind", "sharpness_behind", "sharpness_object"))
     behind = ~near_reference(scene.reference.cameras[0], views.cameras, BEHIND)
     if not behind.any():
         return scores
     scores["behind"] = quality[:, behind].mean().item()
-    counted = torch.ones_like(views.images[behind][:, :1], dtype=torch.bool)
-    by_sample = [sharpness(sample[behind], views.images[behind], counted) for sample in images]
-    known = [sharp for sharp in by_sample if sharp is not None]
-    if known:  # else the truth has no gradient
-        scores["sharpness_behind"] = sum(known) / len(known)
+    shown = views[behind]
+    regions = {"sharpness_behind": counted_pixels(shown, "full")}
+    if not (shown.masks > 0.5).all():  # without masks, all pixels are the object's
+        regions["sharpness_object"] = counted_pixels(shown, "object")
+    for name, counted in regions.items():
+        by_sample = [sharpness(sample[behind], shown.images, counted) for sample in images]
+        known = [sharp for sharp in by_sample if sharp is not None]
+        if known:  # else the truth has no gradient
+            scores[name] = sum(known) / len(known)
     return scores
