@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from completesplat.installation import install_command
+
 
 class CompleteSplatError(Exception):
     """An error that the caller can put right: a bad input, a missing file, a wrong setting."""
@@ -125,7 +127,7 @@ def needing(extra: str, what: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise CompleteSplatError(f'{what}: pip install "completesplat[{extra}]"') from error
+        raise CompleteSplatError(f"{what}: {install_command(extra)}") from error
 
 
 @contextmanager

@@ -21,7 +21,7 @@ TREES = {path: ast.parse(text, path) for path, text in FILES.items()}
 # A module imports from its own floor and from those before it; nothing from the benchmarks, which are no part of the
 # method.
 LAYERS = """
-    version errors quantities signals wording files settings ply_files weights tensors
+    version installation errors quantities signals wording files settings ply_files weights tensors
     geometry gaussians splatter_image scene rasterizers
     photo data autoreconstructor diffusion losses metrics scene_model baselines generator export
     evaluation training viewer commands cli

@@ -13,6 +13,7 @@ from packaging.requirements import Requirement
 from completesplat.data.rendered.blender import find_blender
 from completesplat.errors import CompleteSplatError
 from completesplat.files import write_json
+from completesplat.installation import install_command
 from completesplat.version import __version__
 
 EXTRAS = {
@@ -98,7 +99,7 @@ def extras() -> Iterator[tuple[str, str]]:
         names = [x.name for x in requirements if x.marker is not None and x.marker.evaluate({"extra": extra})]
         missing = [name for name in names if _version(name) is None]
         if missing:
-            yield f"extra {extra}", f'missing, {purpose}: pip install "completesplat[{extra}]"'
+            yield f"extra {extra}", f"missing, {purpose}: {install_command(extra)}"
         else:
             yield f"extra {extra}", ", ".join(f"{name} {_version(name)}" for name in names)
 

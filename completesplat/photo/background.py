@@ -10,6 +10,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from completesplat.errors import CompleteSplatError, ImageError
+from completesplat.installation import install_command
 
 # Networks of rembg under Apache 2.0, the best first (DIS, U2-Net, its small form); its default forbids commercial use.
 NETWORKS = ("isnet-general-use", "u2net", "u2netp")
@@ -60,7 +61,7 @@ def by_grabcut(image: Image.Image) -> Image.Image:
     try:
         import cv2
     except ImportError as error:
-        extras = 'pip install "completesplat[background]", or "completesplat[grabcut]" (no download, coarser)'
+        extras = f"{install_command('background')}, or {install_command('grabcut')} (no download, coarser)"
         raise CompleteSplatError(f"background=remove needs rembg or OpenCV: {extras}") from error
     scale = GRABCUT_SIDE / max(image.size)
     width = max(SMALLEST_SIDE, round(image.width * scale))
@@ -71,9 +72,8 @@ def by_grabcut(image: Image.Image) -> Image.Image:
     cv2.setRNGSeed(0)
     cv2.grabCut(pixels, labels, (0, 0, 0, 0), models[0], models[1], GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
     mask = Image.fromarray(_largest_piece(labels)).convert("L")
-    log.info(
-        'background: removed roughly, from colours (GrabCut); rembg is better: pip install "completesplat[background]"'
-    )
+    advice = f"rembg is better: {install_command('background')}"
+    log.info("background: removed roughly, from colours (GrabCut); %s", advice)
     cut = image.convert("RGBA")
     cut.putalpha(mask.resize(image.size, Image.Resampling.BICUBIC))
     return cut

@@ -12,6 +12,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.installation import install_command
 from completesplat.rasterizers import Rendering, RenderingConstants, require_float32, with_view_colors
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
 
@@ -50,7 +51,7 @@ class CudaRasterizer:
         try:
             import gsplat
         except ImportError as error:
-            message = f'the cuda rasterizer needs gsplat ({error}): pip install "completesplat[cuda]"'
+            message = f"the cuda rasterizer needs gsplat ({error}): {install_command('cuda')}"
             raise CompleteSplatError(message) from error
         for name in COMPILED:
             value = getattr(RenderingConstants, name)

@@ -8,6 +8,7 @@ from support import strict_json, write_program
 
 from completesplat.commands import doctor
 from completesplat.commands.doctor import findings
+from completesplat.installation import install_command
 
 
 def test_each_thing_has_a_line_and_stands_in_the_file(command, tmp_path):
@@ -35,7 +36,7 @@ def test_missing_packages_come_with_what_installs_them(monkeypatch):
     monkeypatch.setattr(doctor, "LIBRARIES", ("no-such-library",))
     extras = findings(doctor.extras)
     assert extras["extra view"].startswith("numpy ")
-    assert extras["extra colmap"].endswith('pip install "completesplat[colmap]"')
+    assert extras["extra colmap"].endswith(install_command("colmap"))
     assert findings(doctor.versions)["no-such-library"] == "missing: pip install no-such-library"
 
 

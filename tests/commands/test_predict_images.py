@@ -23,6 +23,7 @@ from completesplat.export.formats import FORMATS
 from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.generator import CompleteSplat
+from completesplat.installation import install_command
 from completesplat.photo.reading import Photograph
 
 QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
@@ -324,7 +325,7 @@ def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_pat
     monkeypatch.setenv("PATH", str(tmp_path))
     for setting, message in (
         ("formats=html", "formats sog and html need Node.js"),
-        ("formats=mesh", 'formats=[mesh] needs scikit-image: pip install "completesplat[mesh]"'),
+        ("formats=mesh", f"formats=[mesh] needs scikit-image: {install_command('mesh')}"),
         (
             "formats=[]",
             f"formats=[] video=[]: choose a format ({', '.join(FORMATS)}) or a video",

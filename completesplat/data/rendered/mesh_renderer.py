@@ -18,7 +18,7 @@ from PIL import Image
 
 from completesplat.data.rendered.assets import BrokenMesh
 from completesplat.data.rendered.mesh_reading import TexturedMesh, read_mesh, to_srgb
-from completesplat.data.rendered.shading import Light, Planes, Surfaces, View, draw_planes, shade
+from completesplat.data.rendered.shading import LightArrays, Planes, Surfaces, View, draw_planes, shade
 from completesplat.data.rendered.surroundings import mean_color, surroundings
 from completesplat.data.rendered.z_buffer import NOTHING, draw_triangles
 
@@ -78,7 +78,7 @@ def painted_triangles(mesh: TexturedMesh, hidden: dict[str, Any]) -> Bool[np.nda
     return away
 
 
-def light_of(light: dict[str, Any], mesh: TexturedMesh, planes: Planes) -> Light:
+def light_of(light: dict[str, Any], mesh: TexturedMesh, planes: Planes) -> LightArrays:
     """Return the light of a job with what each surface receives of it."""
     elevation = light["elevation"]
     azimuth = light["azimuth"]
@@ -93,7 +93,7 @@ def light_of(light: dict[str, Any], mesh: TexturedMesh, planes: Planes) -> Light
     sky = np.array(light["sky"])
     softness = math.tan(light["angle"] / 2)
     shadow = _depth_from(axes, mesh)
-    return Light(
+    return LightArrays(
         sun=sun,
         softness=softness,
         sky=sky,
@@ -186,7 +186,7 @@ def _depth_from(axes: Float[np.ndarray, "3 3"], mesh: TexturedMesh) -> Float[np.
 class _Scene:
     """One object in its surroundings, drawn from one camera at a time."""
 
-    def __init__(self, mesh: TexturedMesh, light: Light, planes: Planes, back: Bool[np.ndarray, " triangle"]) -> None:
+    def __init__(self, mesh: TexturedMesh, light: LightArrays, planes: Planes, back: Bool[np.ndarray, " triangle"]) -> None:
         textures = mesh.textures
         self.mesh = mesh
         self.light = light

@@ -66,7 +66,7 @@ class Planes(NamedTuple):
     lattice: Float[np.ndarray, " value"]
 
 
-class Light(NamedTuple):
+class LightArrays(NamedTuple):
     """Sun and sky, in linear light.
 
     Attributes:
