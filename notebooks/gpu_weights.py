@@ -151,7 +151,7 @@ class Lease:
         """
         if self.is_done("store"):
             return
-        kernels = subprocess.Popen([sys.executable, "-c", KERNELS])
+        kernels = subprocess.Popen([sys.executable, "-c", KERNELS if GPU else ""])
         mix = self.out / "mix"
         if not mix.is_dir():
             unfinished = self.out / "mix.unfinished"
