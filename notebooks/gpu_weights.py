@@ -50,6 +50,7 @@ CAMERA = ("depth_range", "fov_degrees", "up")
 
 KERNELS = "from completesplat.rasterizers.selection import auto; auto()"
 DEPTHS = ["data.depth_before=1", "data.depth_after=3"]
+SPLITS = ["data.val_fraction=0.01", "data.test_fraction=0"]  # as the experiments have them; a splits.json decides
 WITHIN_RANGE = "autoreconstructor.reconstructor.parameterization.within_range=true"
 TRAINING = [WITHIN_RANGE, "callbacks.checkpoint.every_minutes=1", "trainer.val_check_interval=100000", "test=false"]
 STAGE1 = ["experiment=anything_var", "loss=things", "data.random_background=0.5", "callbacks.images=null"]
@@ -156,7 +157,7 @@ class Lease:
         if not mix.is_dir():
             unfinished = self.out / "mix.unfinished"
             shutil.rmtree(unfinished, ignore_errors=True)
-            with tarfile.open(self.inputs / "captures.tar") as packed:
+            with tarfile.open(self.inputs / "captures.tar.gz") as packed:
                 packed.extractall(unfinished, filter="data")
             unfinished.rename(mix)
         names = json.loads((self.inputs / "captures.json").read_text())
@@ -165,7 +166,7 @@ class Lease:
         solids = [f"{index:05d}" for index in range(self.sizes.solids)]
         train = names["scans"] + names["more"] + colored + solids
         write_json(mix / "splits.json", {"train": train, "val": names["val"], "test": []})
-        packing = ["data=captures", f"data.root={mix}", self.size, *DEPTHS, "splits=[train,val]"]
+        packing = ["data=captures", f"data.root={mix}", self.size, *DEPTHS, *SPLITS, "splits=[train,val]"]
         self.verb("store", "data", "prepare", *packing, *([] if GPU else ["workers=1"]))
         while kernels.poll() is None:
             self.clock.seconds()

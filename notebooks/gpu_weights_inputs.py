@@ -56,7 +56,7 @@ def pack(inputs: Path, start: Path, scans: Path, more: list[Path]) -> None:
         shutil.copy(start / file, inputs)
     splits = json.loads((scans / "splits.json").read_text())
     names = {"scans": splits["train"], "val": splits["val"], "more": []}
-    with tarfile.open(inputs / "captures.tar", "w") as packed:
+    with tarfile.open(inputs / "captures.tar.gz", "w:gz") as packed:
         for name in names["scans"] + names["val"]:
             add_capture(packed, name, scans / name)
         for folder in more:
