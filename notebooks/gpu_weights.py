@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tarfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,9 +38,9 @@ from completesplat.weights.checkpoint_reading import load_part
 HERE = Path(__file__).parent
 GPU = torch.cuda.is_available()
 
-# Ends of the parts, as shares of all minutes. Before `early` are 150 s of 14 minutes for kernels and data, after
-# `stage1` 50 s for latents, after `stage2` 70 s for scores.
-ENDS = {"early": 0.31, "stage1": 0.64, "stage2": 0.91}
+# Ends of the trainings, as shares of the time after kernels and data, which take two to three minutes. Stage 2's has
+# latents in it (50 s); scores follow.
+ENDS = {"early": 0.18, "stage1": 0.57, "stage2": 0.91}
 START_SECONDS = 20  # in which a training's process begins, and ends
 STEPS_A_SECOND = {"early": 7.0, "stage2": 8.8}  # assumed on an H200, until they are measured
 PERCEPTUAL = 0.2
@@ -78,10 +79,11 @@ SMALL = Sizes(image=32, batch1=2, batch2=2, solids=2, frames=2, last_steps=LAST_
 class Clock:
     """Seconds that a folder's parts have had, also in runs that were cut, and all that they may have."""
 
-    def __init__(self, file: Path, minutes: float) -> None:
-        self.file = file
+    def __init__(self, out: Path, minutes: float) -> None:
+        self.file = out / "seconds.txt"
+        self.data_file = out / "data_seconds.txt"
         self.whole = 60 * minutes
-        before = float(file.read_text()) if file.is_file() else 0.0
+        before = float(self.file.read_text()) if self.file.is_file() else 0.0
         self.begun = time.monotonic() - before
 
     def seconds(self) -> float:
@@ -92,9 +94,14 @@ class Clock:
         unfinished.replace(self.file)
         return so_far
 
+    def end_data(self) -> None:
+        """Store that the data have taken the time so far."""
+        self.data_file.write_text(f"{self.seconds():.1f}")
+
     def left_until(self, share: float) -> float:
-        """Return the seconds until a share of the whole time is over."""
-        return share * self.whole - self.seconds()
+        """Return the seconds until a share of the time after the data is over."""
+        data = float(self.data_file.read_text())
+        return data + share * (self.whole - data) - self.seconds()
 
 
 class Lease:
@@ -113,7 +120,7 @@ class Lease:
         self.results = out / "results"
         self.sizes = sizes
         self.stage2_alone = stage2_alone
-        self.clock = Clock(out / "seconds.txt", minutes)
+        self.clock = Clock(out, minutes)
         self.size = f"data.image_size={sizes.image}"
         workers = max(0, (os.cpu_count() or 1) - 2) if GPU else 0
         self.training_settings = [*TRAINING, f"data.root={out / 'store'}", self.size, f"data.workers={workers}"]
@@ -150,7 +157,7 @@ class Lease:
 
         The GPU's kernels are compiled beside it.
         """
-        if self.is_done("store"):
+        if self.clock.data_file.is_file():
             return
         kernels = subprocess.Popen([sys.executable, "-c", KERNELS if GPU else ""])
         mix = self.out / "mix"
@@ -171,6 +178,7 @@ class Lease:
         while kernels.poll() is None:
             self.clock.seconds()
             time.sleep(0.2)
+        self.clock.end_data()
 
     def training(self, part: str, settings: list[str], first: Path | None = None, schedule: str | None = None) -> None:
         """Train until the part's time is over.
@@ -336,9 +344,9 @@ def look(checkpoint: Path, settings: list[str]) -> dict[str, float]:
     qualities, sharp = [], []
     for scenes in data.val_dataloader():
         scenes = scenes.map(lambda tensor: tensor.to(module.device))
+        seen = replace(scenes, targets=scenes.targets[:, ::2])
         between = scenes.targets[:, 1::2]
-        seen = scenes.all_views()[:, ::2]
-        splats = module.model(scenes.reference.images, seen, scenes.depth_range).splatter_image
+        splats = module(seen, seen.targets.images.shape[1]).splatter_image
         gaussians = splats.gaussians(scenes.reference.cameras, scenes.depth_range)
         images = module.rasterizer(gaussians, between.cameras).over(module.background)[0].clamp(0, 1)
         views = between[0]

@@ -20,16 +20,18 @@ SCRIPT = ROOT / "notebooks/gpu_weights.py"
 GPU_WEIGHTS = SimpleNamespace(**runpy.run_path(str(SCRIPT)))
 
 
-def test_times_so_far_are_kept_and_shares_are_of_the_whole(tmp_path, monkeypatch):
+def test_times_so_far_are_kept_and_shares_are_of_the_time_after_the_data(tmp_path, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    clock = GPU_WEIGHTS.Clock(tmp_path / "seconds.txt", minutes=10)
-    now[0] += 120
-    assert clock.left_until(0.5) == pytest.approx(180)
+    clock = GPU_WEIGHTS.Clock(tmp_path, minutes=10)
+    now[0] += 100
+    clock.end_data()
+    now[0] += 20
+    assert clock.left_until(0.5) == pytest.approx(230)
     now[0] = 5000.0  # another day: the time between does not count
-    clock = GPU_WEIGHTS.Clock(tmp_path / "seconds.txt", minutes=10)
+    clock = GPU_WEIGHTS.Clock(tmp_path, minutes=10)
     now[0] += 60
-    assert clock.left_until(0.5) == pytest.approx(120)
+    assert clock.left_until(0.5) == pytest.approx(170)
 
 
 def test_seconds_are_written_as_lightning_takes_them():
