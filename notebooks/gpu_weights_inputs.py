@@ -26,6 +26,7 @@ QUALITY = 85
 HERE = Path(__file__).parent
 GENERAL = HERE.parent / "completesplat/weights/general"
 SMALL_SIZE = 32
+FRAMES = 10  # of a toy: stage 2 compares nine with the first
 
 
 def add(packed: tarfile.TarFile, name: str, content: bytes) -> None:
@@ -71,11 +72,11 @@ def pack_small(inputs: Path) -> None:
     """Pack the package's `general` and a few toys."""
     with tempfile.TemporaryDirectory() as folder:
         toys, captures = Path(folder, "toys"), Path(folder, "captures")
-        write_objects(toys, scenes=6, frames=6, size=SMALL_SIZE, seed=0, workers=1, progress=False)
+        write_objects(toys, scenes=6, frames=FRAMES, size=SMALL_SIZE, seed=0, workers=1, progress=False)
         settings = ["data=toy_objects", f"data.root={toys}", f"data.image_size={SMALL_SIZE}"]
         depths = ["data.depth_before=1", "data.depth_after=3"]
         write_captures = runpy.run_path(str(HERE / "as_captures.py"))["main"]
-        write_captures(captures, "toy_", "6", "train,val,test", *settings, *depths)
+        write_captures(captures, "toy_", str(FRAMES), "train,val,test", *settings, *depths)
         names = sorted(path.name for path in captures.iterdir())
         write_json(captures / "splits.json", {"train": names[2:], "val": names[:2], "test": []})
         pack(inputs, GENERAL, captures, [])
