@@ -138,16 +138,27 @@ class Lease:
         begun = time.monotonic()
         with log.open("a") as written:
             command = [sys.executable, *map(str, arguments)]
-            process = subprocess.Popen(command, stdout=written, stderr=subprocess.STDOUT)
-        signal.signal(signal.SIGTERM, lambda *_: process.terminate())  # a training then saves, and ends
+            # A group of its own: a second signal, such as one to all of this group, would end a training at once.
+            process = subprocess.Popen(command, stdout=written, stderr=subprocess.STDOUT, process_group=0)
+        stopped: list[int] = []
+
+        def stop(number: int, frame: object) -> None:
+            if not stopped:
+                process.terminate()  # a training then saves, and ends
+            stopped.append(number)
+
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, stop)
         while process.poll() is None:
             self.clock.seconds()
             time.sleep(0.2)
+        if process.returncode == 0:
+            log.replace(self.out / f"{part}.txt")
+            print(f"{part}: {time.monotonic() - begun:.0f} s, all so far {self.clock.seconds():.0f} s", flush=True)
+        if stopped or process.returncode != 0:
+            sys.exit(f"{part}: {'cut' if stopped else 'failed'}, status {process.returncode}, {log}")
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        if process.returncode != 0:
-            sys.exit(f"{part}: status {process.returncode}, {log}")
-        log.replace(self.out / f"{part}.txt")
-        print(f"{part}: {time.monotonic() - begun:.0f} s, all so far {self.clock.seconds():.0f} s", flush=True)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def verb(self, part: str, *arguments: object) -> None:
         self.run(part, "-m", "completesplat", *arguments, f"out={self.out / part}")
