@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-processes test-slow test-wheel test-browser fuzz check size lock bench gpu docs site notebooks release clean
+.PHONY: help demo demo-train test test-processes test-slow test-wheel test-browser fuzz check size lock bench gpu gpu-weights gpu-weights-inputs docs site notebooks release clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -103,6 +103,20 @@ bench: $(READY) ## Time the rasterizer backends, side by side
 
 gpu: $(READY) ## What only a GPU can show, 25 minutes, in outputs/gpu: tests, times, trainings (SMALL=1: tiny sizes, anywhere)
 	PYTHONPATH=. $(BIN)/python tests/gpu_day.py $(if $(SMALL),--small)
+
+# On a machine without a network, with what is needed installed: READY= BIN=FOLDER_OF_PYTHON. What is cut goes on where it was.
+WEIGHTS_OUT = outputs/gpu_weights$(if $(SMALL),_small)
+INPUTS ?= $(WEIGHTS_OUT)_inputs
+START ?= completesplat/weights/general
+MINUTES ?= 14
+
+gpu-weights-inputs: $(READY) ## Pack START=WEIGHTS and the captures SCANS=FOLDER MORE="FOLDER ..." for gpu-weights
+	PYTHONPATH=. $(BIN)/python notebooks/gpu_weights_inputs.py $(INPUTS) $(if $(SMALL),--small,$(START) $(SCANS) $(MORE))
+
+gpu-weights: $(READY) ## Better general weights in MINUTES=14 of a GPU, from INPUTS=FOLDER (SMALL=1: a rehearsal, anywhere)
+	$(if $(SMALL),test -d $(INPUTS) || $(MAKE) gpu-weights-inputs)
+	PYTHONPATH=.:$(PYTHONPATH) $(BIN)/python notebooks/gpu_weights.py $(INPUTS) $(WEIGHTS_OUT) --minutes $(MINUTES) \
+	  $(if $(STAGE2),--stage2) $(if $(SMALL),--small)
 
 docs: $(READY) ## The API reference, from the docstrings, in outputs/api
 	$(BIN)/pdoc --docformat google --output-directory outputs/api completesplat '!completesplat.data.rendered._scene_script' '!completesplat.data.rendered._scene_meshes'
