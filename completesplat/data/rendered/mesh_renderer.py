@@ -186,7 +186,9 @@ def _depth_from(axes: Float[np.ndarray, "3 3"], mesh: TexturedMesh) -> Float[np.
 class _Scene:
     """One object in its surroundings, drawn from one camera at a time."""
 
-    def __init__(self, mesh: TexturedMesh, light: LightArrays, planes: Planes, back: Bool[np.ndarray, " triangle"]) -> None:
+    def __init__(
+        self, mesh: TexturedMesh, light: LightArrays, planes: Planes, back: Bool[np.ndarray, " triangle"]
+    ) -> None:
         textures = mesh.textures
         self.mesh = mesh
         self.light = light
