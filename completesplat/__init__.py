@@ -1,6 +1,6 @@
 """Complete Gaussian splats from a single image with latent diffusion.
 
-model = completesplat.CompleteSplat.from_pretrained("toy_objects")
+model = completesplat.CompleteSplat.for_photo("photo.jpg")
 scenes = model("photo.jpg", samples=4, seed=0)
 completesplat.write_ply("scene.ply", scenes[0])
 """

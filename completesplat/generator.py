@@ -1,9 +1,10 @@
 """Models from one image to complete scenes, without Lightning, for use in other programs.
 
-model = CompleteSplat.from_pretrained("toy_objects")
+model = CompleteSplat.for_photo("photo.jpg")
 scenes = model("photo.jpg", samples=4, seed=0)
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -30,6 +31,8 @@ from completesplat.diffusion.sampling import (
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
+from completesplat.photo.choice import likeliest_for
+from completesplat.photo.reading import SMALLEST_SIDE, Framing, ImageLike, read_square
 from completesplat.scene import Views
 from completesplat.scene_model import DEFAULT_SAMPLING, OnScenes, Sampling, SceneModel, Visible
 from completesplat.splatter_image import SplatterImage
@@ -38,6 +41,8 @@ from completesplat.weights import first_line
 from completesplat.weights.allowed import PartConfig, check_architecture, class_of, stored_config
 from completesplat.weights.checkpoint_reading import mismatch, not_finite
 from completesplat.weights.opening import StoredModel, read_model
+
+logger = logging.getLogger(__name__)
 
 NETWORKS = ("autoreconstructor", "conditioning", "denoiser", "network")  # parts of models that have weights
 
@@ -176,6 +181,23 @@ class CompleteSplat(SceneModel):
         if name is not None:
             raise WeightsError(f"{path}: {name} is not finite")
         return model.eval()
+
+    @staticmethod
+    def for_photo(image: ImageLike) -> SceneModel:
+        """Load the weights in the package that are likeliest for a photo, as `predict` does, and log which and why.
+
+        Args:
+            image: a file, a PIL image, an array or a tensor.
+
+        Raises:
+            ImageError, MissingFile: the photo cannot be read.
+            WeightsError: the package has no weights.
+        """
+        read_square(image, Framing(SMALLEST_SIDE))  # which raises where the choice would go on
+        label = Path(image).name if isinstance(image, str | Path) else "the photo"
+        name, reason = likeliest_for([(label, image)], 1)
+        logger.info("weights: %s%s", name, reason)
+        return CompleteSplat.from_pretrained(name)
 
 
 class _Drawing:

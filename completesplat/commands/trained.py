@@ -237,7 +237,7 @@ def trained_model(**settings: Unpack[TestSettings]) -> TrainedModel:
     if weights is not None:
         if weights == AUTO:
             weights, reason = likeliest_for_test(data, seed)
-            print(f"weights: {weights}, which come with the package{reason}")
+            print(f"weights: {weights}{reason}")
         return GivenWeights(weights, settings["trust"], data, settings.get("typed", ()), rasterizer, sampler, seed)
     return GivenScenes(str(scenes), frame, align, method, data, rasterizer, sampler, seed)
 
@@ -292,7 +292,7 @@ def open_generator(config: Any, images: Sequence[Path], announced: bool = True) 
     model = CompleteSplat.from_pretrained(config.weights, config.trust)
     if config.weights in shipped():
         content = model.architecture["training"]["content"]
-        say(f"weights: {config.weights}, which come with the package and know {content}{reason}")
+        say(f"weights: {config.weights}, trained on {content}{reason}")
     if config.get("sampler") is not None:
         model.replace_sampler(OmegaConf.to_container(config.sampler))  # type: ignore[arg-type]
     if not model.draws_samples:

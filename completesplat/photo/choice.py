@@ -70,13 +70,14 @@ def likeliest_for(
     shares = [f"{weights} {total / len(names):.0%}" for weights, total in sums.most_common()]
     shares += [f"{weights} needs a plain background" for weights in shipped() if weights not in sums]
     whose = names[0] if number == 1 else f"{len(names)} of {number} images"
-    return sums.most_common(1)[0][0], f"; likeliest for {whose} ({', '.join(shares)})"
+    return sums.most_common(1)[0][0], f"; the likeliest for {whose}: {', '.join(shares)}"
 
 
 def _without_images(unreadable: bool) -> tuple[str, str]:
     name, *others = shipped_configs()
     why = "no image can be read" if unreadable else "there is no image to choose by"
-    return name, f"; {why} (weights=NAME takes others: {', '.join(others)})"
+    choices = " or ".join(f"weights={other}" for other in others)
+    return name, f"; taken because {why}, or give {choices}"
 
 
 def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str, Match]:

@@ -11,7 +11,10 @@ from completesplat.photo.reading import Photograph
 FAR = 1.5  # ratio of tan(fov / 2), photo to training, from which a warning is given
 UNLIKE = 2.0  # distance from the training images (`distance_to_training`) from which a warning is given
 RESIZING = 0.1  # change of a distance that resizing to another model's size and back may cause
-ELSEWHERE = "for objects weights=splatter_image:objaverse (226 MB), for scenes github.com/apple/ml-sharp"
+ELSEWHERE = (
+    "other objects: try weights=splatter_image:objaverse, a download of 226 MB; "
+    "whole places: try https://github.com/apple/ml-sharp"
+)
 
 
 def photo_warnings(photograph: Photograph, training: Mapping[str, Any], trained_degrees: float) -> list[str]:
@@ -27,8 +30,8 @@ def photo_warnings(photograph: Photograph, training: Mapping[str, Any], trained_
         lines += [] if line is None else [line]
     distance = None if photograph.visible is not None else distance_to_training(photograph.image, training)
     if distance is not None and distance > UNLIKE:
-        far = f"{distance:.1f} standard deviations, {UNLIKE:g} is far"
-        lines.append(f"unlike the training images ({far}): expect little of it in the scenes")
+        far = f"{distance:.1f} standard deviations away, where {UNLIKE:g} is far"
+        lines.append(f"this photo is unlike the training images ({far}): its scenes will look little like it")
         advice = nearer_weights(photograph, distance)
         lines += [] if advice is None else [advice]
     return lines
@@ -41,7 +44,7 @@ def nearer_weights(photograph: Photograph, distance: float) -> str | None:
     other = matches[name].distance if matches else math.inf
     parts = []
     if other < distance - RESIZING:
-        parts.append(f"weights={name} are nearer ({other:.1f})")
+        parts.append(f"weights={name} were trained on images that are nearer ({other:.1f})")
     if min(other, distance) > UNLIKE:
         parts.append(ELSEWHERE)
     return "; ".join(parts) or None

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.stats import norm
-from support import change_json, compose_config, shipped_folders, strict_json
+from skimage import data
+from support import change_json, compose_config, shipped_folders, strict_json, tiny_generator
 
 from completesplat.commands.trained import open_generator
-from completesplat.errors import WeightsError
+from completesplat.errors import ImageError, WeightsError
+from completesplat.generator import CompleteSplat
 from completesplat.photo.choice import likeliest_weights, match_shipped
 from completesplat.weights import SHIPPED, shipped
 
@@ -35,15 +37,15 @@ def test_the_likeliest_for_the_images_that_can_be_read_are_chosen_and_the_others
     red, green = (photo(tmp_path / f"{color}.png", color) for color in ("red", "lime"))
     (tmp_path / "broken.png").write_text("no image")
     name, reason = likeliest_weights([green], remove_background=False)
-    assert (name, reason) == ("greens", "; likeliest for lime.png (greens 100%, blues 0%, reds 0%)")
+    assert (name, reason) == ("greens", "; the likeliest for lime.png: greens 100%, blues 0%, reds 0%")
     # Two of eight features differ by 1 from the other weights' mean, and deviations are 0.1: sqrt(2 / 8) / 0.1 = 5.
     assert [x.distance for x in match_shipped(green).values()] == pytest.approx([0, 5, 5], abs=1e-3)
     images = [tmp_path / "broken.png", tmp_path / "gone.png", green, red, red]
     name, reason = likeliest_weights(images, False)
-    assert (name, reason) == ("reds", "; likeliest for 3 of 5 images (reds 67%, greens 33%, blues 0%)")
-    others = "(weights=NAME takes others: greens, reds)"
-    assert likeliest_weights(images[:2], False) == ("blues", f"; no image can be read {others}")
-    assert likeliest_weights([], False) == ("blues", f"; there is no image to choose by {others}")
+    assert (name, reason) == ("reds", "; the likeliest for 3 of 5 images: reds 67%, greens 33%, blues 0%")
+    others = "or give weights=greens or weights=reds"
+    assert likeliest_weights(images[:2], False) == ("blues", f"; taken because no image can be read, {others}")
+    assert likeliest_weights([], False) == ("blues", f"; taken because there is no image to choose by, {others}")
     for name in ("blues", "greens"):  # of one kind each
         change_json(package[name] / "config.json", lambda config: config["training"].update(log_odds=1.0))
     assert likeliest_weights(images[:2], False)[0] == "reds"
@@ -55,7 +57,7 @@ def test_the_likeliest_for_the_images_that_can_be_read_are_chosen_and_the_others
 def test_of_many_images_a_few_from_all_over_are_looked_at(package, tmp_path):
     many = [photo(tmp_path / f"{number}.png", "red" if number < 20 else "lime") for number in range(50)]
     name, reason = likeliest_weights(many, False)
-    assert (name, reason) == ("greens", "; likeliest for 8 of 50 images (greens 62%, reds 38%, blues 0%)")
+    assert (name, reason) == ("greens", "; the likeliest for 8 of 50 images: greens 62%, reds 38%, blues 0%")
 
 
 def test_probabilities_are_those_of_normal_distributions_and_log_odds(package, tmp_path):
@@ -114,8 +116,8 @@ def test_the_default_chooses_and_says_so_in_one_line(command, tmp_path):
     quick = ["samples=1", "steps=1", "color_fits=0", "video=[]"]
     finished = command.succeeds("predict", f"image={COUCH}", f"out={tmp_path / 'out'}", *quick)
     (line,) = [line for line in finished.out.splitlines() if line.startswith("weights: ")]
-    assert line.startswith("weights: rendered_couches, which come with the package and know renders of ")
-    assert "; likeliest for held_out.jpg (rendered_couches " in line
+    assert line.startswith("weights: rendered_couches, trained on renders of ")
+    assert "; the likeliest for held_out.jpg: rendered_couches " in line
     assert all(name in line for name in shipped())
     assert strict_json(tmp_path / "out/held_out/scene.json")["settings"]["weights"] == "rendered_couches"
 
@@ -126,6 +128,22 @@ def test_weights_by_name_are_taken_as_they_are(verb, capsys, monkeypatch):
     config = compose_config(verb, f"image={COUCH}", "weights=toy_objects")
     open_generator(config, [COUCH])
     assert config.weights == "toy_objects"
-    line = "weights: toy_objects, which come with the package and know procedural toy objects, not photographs\n"
+    line = "weights: toy_objects, trained on procedural toy objects, not photographs\n"
     assert capsys.readouterr().out == line
     assert compose_config(verb, f"image={COUCH}").weights == "auto"
+
+
+def test_python_chooses_as_predict_does_and_refuses_what_is_no_photo(tmp_path, caplog, monkeypatch):
+    opened = []
+    model = tiny_generator()
+    monkeypatch.setattr(CompleteSplat, "from_pretrained", staticmethod(lambda name: opened.append(name) or model))
+    caplog.set_level("INFO")
+    CompleteSplat.for_photo(str(COUCH))
+    CompleteSplat.for_photo(data.astronaut())
+    assert opened == ["rendered_couches", "general"]
+    assert "weights: rendered_couches; the likeliest for held_out.jpg: rendered_couches " in caplog.text
+    assert "weights: general; the likeliest for the photo: general " in caplog.text
+    (tmp_path / "a.jpg").write_text("no photo")
+    with pytest.raises(ImageError):
+        CompleteSplat.for_photo(tmp_path / "a.jpg")
+    assert len(opened) == 2
