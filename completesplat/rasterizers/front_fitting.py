@@ -1,7 +1,7 @@
 """Gaussians fitted to an image of them, as far as they are seen in it."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -16,10 +16,27 @@ RATES = {"colors": 0.1, "opacities": 0.4, "scales": 0.12}
 BETAS = 0.9, 0.999
 DAMPING = 0.01
 """Adam's epsilon: a Gaussian moves slowly if the image's squared error changes by less than this with its values."""
-WARM_UP = 8  # rounds in which the rates rise, so that a scene that is nearly right moves little
 ENOUGH = 1e-3
 """Mean squared error (30 dB) at which fitting ends, because more of it makes the sides of a scene worse."""
 SMALLEST = 1e-4  # opacity's distance from 0 and 1
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Pace of a fit.
+
+    Attributes:
+        warm_up: rounds in which the rates rise, so that a scene that is nearly right moves little.
+        rate: factor of `RATES`.
+        enough: mean squared error at which the fit ends.
+    """
+
+    warm_up: int = 8
+    rate: float = 1.0
+    enough: float = ENOUGH
+
+
+DEFAULT_PACE = Pace()
 
 
 def fit_front(
@@ -30,10 +47,11 @@ def fit_front(
     rounds: int,
     background: float,
     visible: Float[Tensor, "batch 1 height width"] | None = None,
+    pace: Pace = DEFAULT_PACE,
 ) -> Gaussians:
     """Fit colours, opacities and scales of Gaussians [batch], so that each set looks like its image from its camera.
 
-    Each round is a step of Adam on the squared error, until it is `ENOUGH`. The best of all rounds is returned.
+    Each round is a step of Adam on the squared error, until it is `pace.enough`. The best of all rounds is returned.
     Gaussians that the image hides stay as they are, and none changes its place. Of `DirectionalGaussians`, the means of
     the colours change.
 
@@ -60,16 +78,16 @@ def fit_front(
             if error.item() < least:
                 best = moved.detach()
                 least = error.item()
-            if number > rounds or least <= ENOUGH * mask.sum().item() / 2:
+            if number > rounds or least <= pace.enough * mask.sum().item() / 2:
                 break
             grads = torch.autograd.grad(error, moves)
             # torch.optim's Adam is the same, but its first step imports torch's compiler, which takes a second.
-            factor = min(1, number / WARM_UP) * (1 + math.cos(math.pi * (number - 1) / rounds)) / 2
+            factor = min(1, number / pace.warm_up) * (1 + math.cos(math.pi * (number - 1) / rounds)) / 2
             for move, mean, square, grad, rate in zip(moves, means, squares, grads, RATES.values(), strict=True):
                 mean.lerp_(grad, 1 - BETAS[0])
                 square.lerp_(grad.square(), 1 - BETAS[1])
                 deviation = (square / (1 - BETAS[1] ** number)).sqrt() + DAMPING
-                move.data -= rate * factor * mean / (1 - BETAS[0] ** number) / deviation
+                move.data -= pace.rate * rate * factor * mean / (1 - BETAS[0] ** number) / deviation
     return best
 
 
