@@ -348,7 +348,7 @@ class SceneModel(nn.Module):
         return read_photograph(image, self.framing, fov_degrees, remove_background, mask, box)
 
     def camera(self, photograph: Photograph, size: int | None = None) -> Cameras:
-        """Return the camera that took a photo, at the origin of the world, with images of the model's or another size."""
+        """Return the camera that took a photo, at the origin of the world, for the model's image size or another."""
         size = self.image_size if size is None else size
         device = self.up.device
         return Cameras(torch.eye(4, device=device), pinhole(photograph.fov_degrees, size).to(device), (size, size))

@@ -159,7 +159,7 @@ def split(gaussians: Gaussians, chosen: Bool[Tensor, " gaussian"], camera: Camer
     whole = gaussians[chosen]
     order = _across(whole, camera).norm(dim=-2).argsort(dim=-1, descending=True)
     axes = quaternion_to_matrix(whole.quaternions) * whole.scales[:, None, :]
-    first, second, third = axes.gather(-1, order[:, None, :].expand_as(axes)).unbind(-1)
+    first, second = axes.gather(-1, order[:, None, :2].expand(-1, 3, -1)).unbind(-1)
     lengths = whole.scales.gather(-1, order)
     longest = SMALLER * lengths[:, 0]
     parts_lengths = torch.stack([longest, SMALLER * lengths[:, 1], torch.minimum(lengths[:, 2], longest)], dim=-1)
