@@ -1,7 +1,8 @@
 """Gaussians fitted to an image of them, as far as they are seen in it."""
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
@@ -11,7 +12,6 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer
 
-# Rates of Adam: sRGB units, logits of opacities, logarithms of scales.
 RATES = {"colors": 0.1, "opacities": 0.4, "scales": 0.12}
 BETAS = 0.9, 0.999
 DAMPING = 0.01
@@ -27,13 +27,11 @@ class Pace:
 
     Attributes:
         warm_up: rounds in which the rates rise, so that a scene that is nearly right moves little.
-        rate: factor of `RATES`.
-        enough: mean squared error at which the fit ends.
+        rates: Adam's rates, by name: sRGB units, logits of opacities, logarithms of scales.
     """
 
     warm_up: int = 8
-    rate: float = 1.0
-    enough: float = ENOUGH
+    rates: Mapping[str, float] = field(default_factory=lambda: RATES)
 
 
 DEFAULT_PACE = Pace()
@@ -51,7 +49,7 @@ def fit_front(
 ) -> Gaussians:
     """Fit colours, opacities and scales of Gaussians [batch], so that each set looks like its image from its camera.
 
-    Each round is a step of Adam on the squared error, until it is `pace.enough`. The best of all rounds is returned.
+    Each round is a step of Adam on the squared error, until it is `ENOUGH`. The best of all rounds is returned.
     Gaussians that the image hides stay as they are, and none changes its place. Of `DirectionalGaussians`, the means of
     the colours change.
 
@@ -78,16 +76,16 @@ def fit_front(
             if error.item() < least:
                 best = moved.detach()
                 least = error.item()
-            if number > rounds or least <= pace.enough * mask.sum().item() / 2:
+            if number > rounds or least <= ENOUGH * mask.sum().item() / 2:
                 break
             grads = torch.autograd.grad(error, moves)
             # torch.optim's Adam is the same, but its first step imports torch's compiler, which takes a second.
             factor = min(1, number / pace.warm_up) * (1 + math.cos(math.pi * (number - 1) / rounds)) / 2
-            for move, mean, square, grad, rate in zip(moves, means, squares, grads, RATES.values(), strict=True):
+            for move, mean, square, grad, rate in zip(moves, means, squares, grads, pace.rates.values(), strict=True):
                 mean.lerp_(grad, 1 - BETAS[0])
                 square.lerp_(grad.square(), 1 - BETAS[1])
                 deviation = (square / (1 - BETAS[1] ** number)).sqrt() + DAMPING
-                move.data -= pace.rate * rate * factor * mean / (1 - BETAS[0] ** number) / deviation
+                move.data -= rate * factor * mean / (1 - BETAS[0] ** number) / deviation
     return best
 
 
