@@ -2,7 +2,7 @@
 
 python notebooks/fronts.py PHOTO ...                                 # with the nearest weights, as `predict` takes them
 python notebooks/fronts.py weights=NAME experiment=... data=... ...  # a test set: input views and novel views
-python notebooks/fronts.py detail=512 PHOTO ...                      # at this size, with `color_fits` alone and detail
+python notebooks/fronts.py detail=512 PHOTO ...                      # `general` at this size, without detail and with it
 """
 
 import statistics
@@ -13,9 +13,10 @@ import torch
 
 import completesplat
 from completesplat.metrics.images import psnr
+from completesplat.photo.choice import match_shipped
 from completesplat.rasterizers.front_detail import seen_larger
 from completesplat.rasterizers.selection import auto
-from completesplat.scene_model import Sampling, match_shipped
+from completesplat.scene_model import Sampling
 
 ROUNDS, rasterizer = (0, 2, 5, 10, 20, 40), auto()
 models, results = {}, {rounds: [] for rounds in ROUNDS}
@@ -47,7 +48,7 @@ def energy(image):
 
 def score_detail(name, detail):
     """Print PSNR and gradient energy over the photo's, at a size, of a photo's front without detail and with it."""
-    model, background = model_of(next(iter(match_shipped(name))))
+    model, background = model_of("general")
     photo = model.read(name)
     size = model.front_size(photo, detail)
     image, camera = photo.square_at(size)[None], model.camera(photo, size)[None, None]
