@@ -2,7 +2,7 @@
 
 python notebooks/fronts.py PHOTO ...                                 # with the nearest weights, as `predict` takes them
 python notebooks/fronts.py weights=NAME experiment=... data=... ...  # a test set: input views and novel views
-python notebooks/fronts.py detail=512 PHOTO ...                      # `general` at this size, without detail and with it
+python notebooks/fronts.py detail=512 PHOTO ...                      # by `general`, without detail and with it
 """
 
 import statistics
