@@ -109,3 +109,16 @@ def test_pixels_in_a_box_or_a_mask_have_no_influence(predict, tmp_path):
     whole = predict("skip_weight=0", "video=[]", image=tmp_path / "one/photo.png", out="whole")
     assert splats(masked) == splats(result[0])
     assert not set(splats(masked)) & set(splats(whole))
+
+
+def test_detail_gives_smaller_gaussians_and_larger_pictures(predict, tmp_path):
+    photo = tmp_path / "photo.png"
+    Image.effect_noise((70, 64), 80).convert("RGB").save(photo)
+    folder = predict("samples=1", "detail=64", "video=[wobble]", image=photo)
+    scene = strict_json(folder / "scene.json")
+    assert scene["reference_camera"]["image_size"] == [64, 64]
+    assert scene["settings"]["detail"] == 64
+    (count,) = scene["settings"]["gaussians"]
+    assert 2 * 32 * 32 < count <= 2 * 32 * 32 + 64 * 64 / 2
+    assert len(PlyData.read(folder / "sample_00.ply")["vertex"].data) == count
+    assert Image.open(folder / "photo.png").size == (64, 64)

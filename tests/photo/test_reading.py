@@ -262,3 +262,18 @@ def test_what_is_neither_a_file_nor_pixels_is_refused(source, monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # users have no type checker at run time
     with pytest.raises(ImageError, match=f"{type(source).__name__}: give a file name, a PIL image, an array or a"):
         read_square(source, Framing(SIZE))
+
+
+def test_the_square_is_kept_with_the_photos_own_pixels():
+    pixels = torch.randint(256, (3, 30, 40), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    photograph = read_square(pixels, Framing(SIDE))
+    assert photograph.square.size == (30, 30)
+    assert torch.equal(photograph.square_at(30), pixels[..., 5:35].float() / 255)
+    assert torch.equal(photograph.square_at(SIDE), photograph.image)
+
+
+def test_deep_grey_keeps_its_depth_in_the_square():
+    values = np.linspace(0, 1, 20 * 20, dtype=np.float32).reshape(20, 20)
+    photograph = read_square(Image.fromarray(values), Framing(SIDE))
+    assert photograph.square_at(20).shape == (3, 20, 20)
+    np.testing.assert_allclose(photograph.square_at(20)[0], values, atol=1e-6)
