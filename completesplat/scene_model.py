@@ -39,6 +39,8 @@ OnScenes = Callable[[int, int, Gaussians], None]
 OnFit = Callable[[int], None]
 """Callback: (number of the sample) -> None."""
 OBJECT_SHARE = 0.9  # of the image's side that an object on a background fills, as on imported turntables
+COLOR_FITS = 40
+"""Default number of rounds of fitting a photo's scenes to it, at the model's size; `Sampling` has the paper's, 0."""
 DETAIL = 512
 """Default of the largest side, in pixels, of the image that a scene's front is fitted to."""
 _rasterizer = cache(auto)
@@ -225,7 +227,8 @@ class SceneModel(nn.Module):
         """Generate complete scenes from one photo, in its camera's frame (+x right, +y down, +z forward).
 
         They look right from `camera(photograph, front_size(photograph, detail))`, because a rasterizer's blur is part
-        of them (`completesplat.rasterizers.front_detail.seen_larger`). `detail=0` gives the paper's plain samples.
+        of them (`completesplat.rasterizers.front_detail.seen_larger`). Like `predict`, this fits scenes to the photo by
+        default. `color_fits=0, detail=0` gives the paper's plain samples.
 
         Args:
             image: a file, a PIL image, an array or a tensor (see `read`), or what `read` returned.
@@ -234,7 +237,7 @@ class SceneModel(nn.Module):
             on_fit: called with the number of each sample before its front is fitted to more than the model's size.
             detail: longest side of the image that fronts are fitted to, with smaller Gaussians where the photo has more
                 detail; at most the photo's own. At the model's size or less, `color_fits` alone fit. 0: none do.
-            **settings: `samples`, `skip_weight`, `color_fits`, `steps`, `seed`, ...: see `Sampling`.
+            **settings: `samples`, `skip_weight`, `color_fits` (by default 40), `steps`, `seed`, ...: see `Sampling`.
 
         Raises:
             CompleteSplatError: the image is not readable, the weights are not float32, or `visible` or a setting is
@@ -247,7 +250,7 @@ class SceneModel(nn.Module):
         check_settings(Sampling, settings)
         check_value("detail", Detail, detail)
         device = self.up.device
-        sampling = Sampling(**{"bfloat16": has_bfloat16(device.type), **settings})
+        sampling = Sampling(**{"bfloat16": has_bfloat16(device.type), "color_fits": COLOR_FITS, **settings})
         if detail == 0:
             sampling = replace(sampling, color_fits=0)
         photograph = image if isinstance(image, Photograph) else self.read(image)
