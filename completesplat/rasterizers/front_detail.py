@@ -13,7 +13,7 @@ from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import Cameras, crop_resize, transform_points
 from completesplat.geometry.rotations import quaternion_to_matrix
 from completesplat.rasterizers import Rasterizer, RenderingConstants
-from completesplat.rasterizers.front_fitting import Pace, fit_front
+from completesplat.rasterizers.front_fitting import ENOUGH, Pace, fit_front
 from completesplat.tensors import TensorDataclass
 
 APART = 0.7
@@ -25,8 +25,9 @@ SMALLEST_ERROR = 1e-3  # squared error of a Gaussian's pixels, in all, below whi
 PARTS_PER_PIXEL = 0.5  # Gaussians that splits may add for each pixel of the photo
 ROUNDS = 8  # of fitting after each split but the last
 LAST_ROUNDS = 12
-# Opacities change little, because what lets the photo's view shine through is wrong from the side.
-PACE = Pace(warm_up=3, rates={"colors": 0.15, "opacities": 0.15, "scales": 0.18})
+# Opacities change little, because what lets the photo's view shine through is wrong from the side. Parts are small, so
+# that they may grow.
+PACE = Pace(warm_up=3, rates={"colors": 0.15, "opacities": 0.15, "scales": 0.18}, only_falling=())
 ENTRIES = 256  # of the table of opacities
 
 
@@ -115,15 +116,20 @@ def worth_splitting(
 ) -> Bool[Tensor, " gaussian"]:
     """Return which Gaussians of a batch of one to split: those larger than pixels that show most of the image's error.
 
+    None are split where the image is met as nearly as fitting meets it (`ENOUGH`), because splits alone cost a little.
+
     Args:
         most: largest number of them.
     """
     errors = _shown_errors(gaussians, target, rasterizer, background)[0]
+    total = errors.sum().item()
     across = _across(gaussians[0], target.camera[0]).norm(dim=-2).topk(2).values[:, 1]
     depth = transform_points(target.camera.world_to_camera, gaussians.means)[0, :, 2]
     pixels = across * target.camera.intrinsics[0, 0, 0] / depth
     errors = torch.where((depth > 0) & (pixels > SMALLEST_SPLIT), errors, 0)
     chosen = torch.zeros_like(errors, dtype=torch.bool)
+    if total <= ENOUGH * target.image.numel():
+        return chosen
     chosen[errors.topk(min(most, len(errors))).indices] = True
     return chosen & (errors > SMALLEST_ERROR)
 

@@ -1,7 +1,7 @@
 """Gaussians fitted to an image of them, as far as they are seen in it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -19,8 +19,6 @@ DAMPING = 0.01
 ENOUGH = 1e-3
 """Mean squared error (30 dB) at which fitting ends, because more of it makes the sides of a scene worse."""
 SMALLEST = 1e-4  # opacity's distance from 0 and 1
-ONLY_FALLING = ("opacities", "scales")
-"""What fitting does not raise: a Gaussian that grows hides, from other sides, what lies behind it."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +28,12 @@ class Pace:
     Attributes:
         warm_up: rounds in which the rates rise, so that a scene that is nearly right moves little.
         rates: Adam's rates, by name: sRGB units, logits of opacities, logarithms of scales.
+        only_falling: what is not raised, because a Gaussian that grows hides, from other sides, what lies behind it.
     """
 
     warm_up: int = 8
     rates: Mapping[str, float] = field(default_factory=lambda: RATES)
+    only_falling: Collection[str] = ("opacities", "scales")
 
 
 DEFAULT_PACE = Pace()
@@ -52,8 +52,8 @@ def fit_front(
     """Fit colours, opacities and scales of Gaussians [batch], so that each set looks like its image from its camera.
 
     Each round is a step of Adam on the squared error, until it is `ENOUGH`. The best of all rounds is returned.
-    Gaussians that the image hides stay as they are. None changes its place, becomes more opaque or grows. Of
-    `DirectionalGaussians`, the means of the colours change.
+    Gaussians that the image hides stay as they are. None changes its place, and by default none becomes more opaque or
+    grows. Of `DirectionalGaussians`, the means of the colours change.
 
     This also works where autograd is off, as in `torch.inference_mode()`.
 
@@ -89,7 +89,7 @@ def fit_front(
                 square.lerp_(grad.square(), 1 - BETAS[1])
                 deviation = (square / (1 - BETAS[1] ** number)).sqrt() + DAMPING
                 move.data -= rate * factor * mean / (1 - BETAS[0] ** number) / deviation
-                if name in ONLY_FALLING:
+                if name in pace.only_falling:
                     move.data.clamp_(max=0)
     return best
 

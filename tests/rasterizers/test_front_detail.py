@@ -132,6 +132,15 @@ def test_only_what_lacks_detail_is_split_and_the_photo_is_met():
     assert errors[1] < errors[0] / 2
 
 
+def test_a_front_that_is_near_enough_is_left_as_it_is():
+    scene = wall(2, 0.5, 0.999)
+    targets = front_targets(CAMERA, lambda side: torch.full((3, side, side), 0.52), LARGE)
+    after = fit_detail(scene, CAMERA, targets, RENDER, 0.5)
+    expected = seen_larger(scene, CAMERA, targets[-1].camera)
+    for name, values in vars(expected).items():
+        torch.testing.assert_close(getattr(after, name), values, msg=name)
+
+
 def test_the_number_of_gaussians_is_bounded(monkeypatch):
     monkeypatch.setattr(front_detail, "PARTS_PER_PIXEL", 0.1)
     scene = wall(2, 0.5)
