@@ -1,0 +1,543 @@
+"""What makes sides and backs sharp: short trainings with one change each (experiments.md, "Sides and backs").
+
+python notebooks/sides_study.py train SCANS WEIGHTS OUT [steps=100] [steps2=150] [seeds=0,1] [runs=control,...]
+python notebooks/sides_study.py table OUT
+
+SCANS is a folder of captures with splits.json, whose "train" and "val" are used, WEIGHTS the weights that all trainings
+continue from. Each training appends one line to OUT/results.jsonl when it is done, and is skipped when it has one. All
+runs of a stage have equally many steps, and the same random numbers in each step where they draw the same. Stage 2
+takes stage 1 of its row's first seed, so that latents are encoded once.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from statistics import mean
+
+import torch
+from lightning import Trainer
+from torch import nn
+
+import completesplat
+from completesplat.autoreconstructor.view_encoders import sweep
+from completesplat.data.loading.view_selection import spread_around
+from completesplat.evaluation.regions import object_only
+from completesplat.geometry.cameras import nearest_to_axes
+from completesplat.metrics.images import psnr, sharpness
+from completesplat.scene import CachedScene
+from completesplat.scene_model import Sampling
+from completesplat.splatter_image import zeroed
+from completesplat.tensors import stack
+from completesplat.training.callbacks import StepSeeds
+from completesplat.training.latent_diffusion import LatentDiffusion
+
+ENCODED = 6  # views that the posterior sees of a validation scan
+SIDES = {"aside": (30, 100), "behind": (100, 181)}  # degrees between optical axes
+OBJECT_RADIUS = 0.9  # scene units around the cameras' common point; an object's half size is 0.57
+REFERENCES = 2  # latents of a training object
+LEVELS = 8  # noise levels of the denoiser's validation loss
+SAMPLES = 2
+SETTINGS = [
+    "data.image_size=64",
+    "data.workers=0",
+    "data.batch_size=4",
+    "data.evaluation_targets=null",
+    "autoreconstructor.reconstructor.parameterization.within_range=true",
+    "schedule.warmup_steps=10",
+]
+STAGE1 = ["experiment=anything_var", "loss=things", "data.random_background=0.5", *SETTINGS]
+STAGE1 += ["optimizer.lr=2.5e-3", "optimizer.adam_lr=7.5e-4"]
+STAGE2 = ["experiment=anything_diffusion", *SETTINGS, "model.autoreconstructor_checkpoint=null"]
+STAGE2 += ["optimizer.lr=7e-3", "optimizer.adam_lr=2e-3"]
+STAGE2_BATCH = 16
+
+
+# Changes of stage 1. Each is made to the module before training, when it has the weights to start from.
+
+
+def unchanged(module, steps):
+    """Change nothing."""
+
+
+def without_alpha(module, steps):
+    """Leave out the shipped term on opacity within the masks."""
+    del module.loss.terms["translucency"]
+
+
+def near_object(gaussians, cameras):
+    """Return Gaussians [batch] whose opacity is 0 unless they are near the point that cameras [batch view] look at.
+
+    A background is painted by Gaussians, too, so the opacity of all of them says nothing about the object.
+    """
+    count = len(cameras.world_to_camera)
+    centers = torch.stack([nearest_to_axes(cameras[scene]) for scene in range(count)]).float()
+    near = (gaussians.means - centers[:, None]).norm(dim=-1) < OBJECT_RADIUS
+    return replace(gaussians, opacities=gaussians.opacities * near)
+
+
+class ObjectOpacity:
+    """Squared error of the opacity of the Gaussians near the object against the masks, which are exact."""
+
+    def __init__(self, rasterizer):
+        self.rasterizer = rasterizer
+
+    def __call__(self, prediction, truth):
+        """Return the mean over all pixels and views."""
+        near = near_object(prediction.gaussians, truth.cameras)
+        return nn.functional.mse_loss(self.rasterizer(near, truth.cameras).alpha, truth.masks)
+
+
+def object_opacity(module, steps):
+    """Add a term on the object's opacity."""
+    module.loss.terms["object"] = {"weight": 0.2, "term": ObjectOpacity(module.rasterizer)}
+
+
+def noisy_latents(module, steps):
+    """Add noise to half of the latents that the decoder is trained on, of up to half of their standard deviation."""
+
+    def add_noise(reconstructor, inputs):
+        latent, *others = inputs
+        if not reconstructor.training:
+            return None
+        share = (torch.rand(len(latent), 1, 1, 1) - 0.5).clamp(min=0)
+        return (latent + share * latent.detach().std((0, 2, 3), keepdim=True) * torch.randn(latent.shape), *others)
+
+    module.model.reconstructor.register_forward_pre_hook(add_noise)
+
+
+class SpreadSweep(nn.Module):
+    """Plane sweep that also sees how far the views differ at each depth, which is little on a surface.
+
+    Args:
+        trained: the sweep to start from. The new inputs' weights are zero at first.
+    """
+
+    def __init__(self, trained):
+        super().__init__()
+        self.planes = trained.planes
+        self.network = trained.network
+        self.network.conv_in = with_inputs(self.network.conv_in, 2 * trained.planes)
+
+    def forward(self, views, depth_range):
+        """Return what to add to the moments, as `PlaneSweep` does."""
+        with torch.autocast(views.images.device.type, enabled=False):
+            swept = sweep(views, depth_range, self.planes)
+            squares = sweep(replace(views, images=views.images.square()), depth_range, self.planes)
+            colors = (swept[:, :, :, :3] + 1) / 2
+            variance = (squares[:, :, :, :3] + 1) / 2 - colors.square()
+            seen = swept[:, :, :, 3:] != 0
+            spread = 4 * variance.clamp(min=0).mean(3, keepdim=True).sqrt() * seen
+        reference = nn.functional.avg_pool2d(views.images[:, 0], 2) * 2 - 1
+        return self.network(torch.cat([reference, swept.flatten(1, 3), spread.flatten(1, 3)], 1)).float()
+
+
+def spread_of_views(module, steps):
+    """Give the plane sweep the spread of the views beside their mean."""
+    module.model.view_encoder = SpreadSweep(module.model.view_encoder)
+
+
+@torch.no_grad()
+def with_inputs(convolution, count, before=None):
+    """Return a convolution with further inputs of weight zero, after the others or from the input `before` on."""
+    weight = convolution.weight
+    before = weight.shape[1] if before is None else before
+    settings = {"kernel_size": convolution.kernel_size, "padding": convolution.padding}
+    wider = zeroed(nn.Conv2d(weight.shape[1] + count, weight.shape[0], **settings))
+    wider.weight[:, :before] = weight[:, :before]
+    wider.weight[:, before + count :] = weight[:, before:]
+    wider.bias.copy_(convolution.bias)
+    return wider
+
+
+@torch.no_grad()
+def eight_channels(module, steps):
+    """Give the latent four more channels. They get random features at first, which the decoder does not use."""
+    model, old = module.model, 4
+    encoder, decoder, views = model.encoder, model.reconstructor, model.view_encoder
+    last = encoder.network.conv_out
+    wider = nn.Conv2d(last.weight.shape[1], 4 * old, 3, padding=1)
+    wider.weight[: 2 * old], wider.bias[: 2 * old] = last.weight, last.bias
+    encoder.network.conv_out = wider
+    quant = zeroed(nn.Conv2d(4 * old, 4 * old, 1))
+    mean_rows, variance_rows = slice(0, old), slice(2 * old, 3 * old)
+    for rows, source in ((mean_rows, slice(0, old)), (variance_rows, slice(old, 2 * old))):
+        quant.weight[rows, : 2 * old] = encoder.quant_conv.weight[source]
+        quant.bias[rows] = encoder.quant_conv.bias[source]
+    quant.weight[old : 2 * old, 2 * old : 3 * old, 0, 0] = torch.eye(old)
+    quant.bias[3 * old :] = -4
+    encoder.quant_conv = quant
+    last = views.network.conv_out
+    wider = nn.Conv2d(last.weight.shape[1], 4 * old, 3, padding=1)
+    wider.weight[mean_rows], wider.bias[mean_rows] = last.weight[:old], last.bias[:old]
+    wider.weight[variance_rows], wider.bias[variance_rows] = last.weight[old:], last.bias[old:]
+    wider.weight[3 * old :], wider.bias[3 * old :] = 0, 0
+    views.network.conv_out = wider
+    post = zeroed(nn.Conv2d(2 * old, 2 * old, 1))
+    post.weight[:old, :old], post.bias[:old] = decoder.post_quant_conv.weight, decoder.post_quant_conv.bias
+    post.weight[old:, old:, 0, 0] = torch.eye(old)
+    decoder.post_quant_conv = post
+    decoder.network.conv_in = with_inputs(decoder.network.conv_in, old)
+
+
+class Adversary:
+    """Patch discriminator of 0.5 M parameters on novel views, trained on the way, with hinge losses.
+
+    Until the step `start` it only learns. From then on its gradient in the images has half the length of that of the
+    mean square error.
+    """
+
+    def __init__(self, start, module):
+        self.start = start
+        self.module = module
+        widths = (3, 56, 112, 224)
+        layers = []
+        for inputs, outputs in pairwise(widths):
+            stride = 1 if outputs == widths[-1] else 2
+            layers += [nn.Conv2d(inputs, outputs, 4, stride, 1), nn.LeakyReLU(0.2)]
+        self.network = nn.Sequential(*layers, nn.Conv2d(widths[-1], 1, 4, 1, 1))
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=4e-4, betas=(0.5, 0.9))
+
+    def __call__(self, prediction, truth):
+        """Train the discriminator, and return the weighted loss of the images, or 0 before the start."""
+        drawn = prediction.images[:, 1:].flatten(0, 1)
+        true = truth.images[:, 1:].flatten(0, 1)
+        with torch.enable_grad():
+            scores = self.network(torch.cat([drawn.detach(), true]))
+            fake, real = scores.chunk(2)
+            loss = (1 + fake).relu().mean() + (1 - real).relu().mean()
+            self.optimizer.zero_grad()
+            loss.backward()
+            self.optimizer.step()
+        if self.module.global_step < self.start:
+            return drawn.new_zeros(())
+        deceived = -self.network(drawn).mean()
+        (gradient,) = torch.autograd.grad(deceived, drawn, retain_graph=True)
+        squares = 2 * 0.8 * (drawn - true).detach() / prediction.images.numel()
+        return deceived * (0.5 * squares.norm() / gradient.norm().clamp(min=1e-12))
+
+
+def patch_discriminator(module, steps):
+    """Train a patch discriminator in the second half, and the decoder alone with it in the last quarter."""
+    start = steps - steps // 4
+    adversary = Adversary(start, module)
+    module.loss.terms["adversary"] = {"weight": 1.0, "term": adversary, "start_step": steps // 2}
+
+    def detach(reconstructor, inputs):
+        latent, features, *others = inputs
+        if module.global_step < start or not reconstructor.training:
+            return None
+        return (latent.detach(), [feature.detach() for feature in features], *others)
+
+    module.model.reconstructor.register_forward_pre_hook(detach)
+
+
+# Changes of stage 2.
+
+
+class FeatureConditioning(nn.Module):
+    """Learned conditioning, and beside it the frozen encoder's features of the lowest resolution, in fewer channels."""
+
+    frozen = False
+
+    def __init__(self, learned, encoder, channels=32):
+        super().__init__()
+        self.learned = learned
+        self.encoder = encoder
+        self.levels = len(encoder.network.down_blocks)
+        self.narrow = nn.Sequential(nn.GroupNorm(8, 192), nn.Conv2d(192, channels, 1))
+
+    def forward(self, images):
+        """Return features of sRGB images in [0, 1], at the latent's resolution."""
+        with torch.no_grad():
+            features = self.encoder.features(images * 2 - 1, self.levels)[-1]
+        return torch.cat([self.learned(images), self.narrow(features)], 1)
+
+
+def encoder_features(parts):
+    """Condition the denoiser on the frozen encoder's features, too; the new inputs' weights are zero at first."""
+    parts.conditioning = FeatureConditioning(parts.conditioning, parts.autoreconstructor.encoder)
+    network = parts.denoiser.network
+    network.conv_in = with_inputs(network.conv_in, 32, before=16)
+
+
+class OnCachedLatents(LatentDiffusion):
+    """Stage 2 on latents that are given with their moments."""
+
+    def on_fit_start(self):
+        """Measure nothing."""
+
+
+# name: (item of the issue, change). Stage 2: name: (item, stage 1's row, refined latents, change of the networks).
+FIRST: dict[str, tuple[str, Callable]] = {
+    "control": ("", unchanged),
+    "object_opacity": ("c", object_opacity),
+    "noisy_latents": ("b", noisy_latents),
+    "spread_of_views": ("e", spread_of_views),
+    "eight_channels": ("g", eight_channels),
+    "patch_discriminator": ("d", patch_discriminator),
+    "without_alpha": ("c", without_alpha),
+}
+SECOND: dict[str, tuple[str, str, bool, Callable]] = {
+    "control2": ("", "control", False, lambda parts: None),
+    "refined_latents": ("a", "control", True, lambda parts: None),
+    "encoder_features": ("f", "control", False, encoder_features),
+    "noisy_latents2": ("b", "noisy_latents", False, lambda parts: None),
+}
+
+
+class Study:
+    """Data, weights to start from and results of all trainings.
+
+    Args:
+        scans, weights, out: folders, or a name of shipped weights.
+        steps, steps2: optimizer steps of each training of stage 1 and of stage 2.
+    """
+
+    def __init__(self, scans, weights, out, steps, steps2):
+        self.out = Path(out)
+        self.out.mkdir(parents=True, exist_ok=True)
+        self.root = f"data.root={scans}"
+        self.start = completesplat.CompleteSplat.from_pretrained(weights)
+        self.steps = steps
+        self.steps2 = steps2
+        self.config = completesplat.compose("fit", *STAGE1, self.root, "out=unused")
+        self.data, _ = completesplat.instantiate(self.config)
+        self.data.setup("fit")
+        for split in ("train", "val"):
+            store = self.data.store(split)
+            for name in store.names:
+                sequence = store.source.read(name)
+                for view in range(len(sequence.frames)):
+                    store.image(sequence, view)
+        self.validation = self.scenes("val", (0, 12))
+
+    def scenes(self, split, references):
+        """Return scenes of all objects of a split. The first targets are those that the posterior may see."""
+        store = self.data.store(split)
+        scenes = []
+        for name in store.names:
+            sequence = store.source.read(name)
+            frames = len(sequence.frames)
+            for reference in references:
+                seen = spread_around(frames, reference, ENCODED)
+                rest = [view for view in range(frames) if view != reference and view not in seen]
+                scenes.append(store.scene(sequence, reference, seen + rest))
+        return scenes
+
+    def trainer(self, steps, seed, **settings):
+        """Return a trainer that writes nothing."""
+        return Trainer(
+            max_steps=steps,
+            callbacks=[StepSeeds(seed)],
+            precision=self.config.trainer.precision,
+            gradient_clip_val=1.0,
+            limit_val_batches=0,
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            **settings,
+        )
+
+    def first_module(self, name, seed):
+        """Return stage 1's module with its change and the weights to start from."""
+        torch.manual_seed(seed)
+        _, module = completesplat.instantiate(self.config)
+        module.model.load_state_dict(self.start.autoreconstructor.state_dict())
+        FIRST[name][1](module, self.steps)
+        return module
+
+    def train_first(self, name, seed):
+        """Train stage 1, keep its weights and return its scores."""
+        module = self.first_module(name, seed)
+        self.data.seed = seed
+        before = time.process_time()
+        self.trainer(self.steps, seed).fit(module, datamodule=self.data)
+        seconds = (time.process_time() - before) / max(1, self.steps)
+        model = module.model.eval()
+        torch.save(model.state_dict(), self.out / f"{name}-{seed}.pt")
+        return {"seconds_a_step": seconds, **self.posterior_scores(module)}
+
+    @torch.no_grad()
+    def posterior_scores(self, module):
+        """Return the scores of the posterior's mean on views that it did not see."""
+        drawn = []
+        for scene in self.validation:
+            batch = stack([scene])
+            views = batch.all_views()[:, : 1 + ENCODED]
+            image = module.model.eval()(batch.reference.images, views, batch.depth_range).splatter_image
+            gaussians = image.gaussians(batch.reference.cameras, batch.depth_range)
+            drawn.append(self.rendered(module, gaussians, scene))
+        return scores(drawn)
+
+    def rendered(self, module, gaussians, scene):
+        """Return true views that the posterior does not see, and of each sample its images and the object's opacity."""
+        truth = scene.targets[ENCODED:]
+        images = module.render_from(gaussians, truth.cameras).over(module.background)
+        near = near_object(gaussians, truth.cameras.repeated(len(gaussians.means)))
+        return truth, images.clamp(0, 1), module.render_from(near, truth.cameras).alpha
+
+    def latents(self, stage1, split, references, refined):
+        """Return encoded scenes of a split, which are kept in a file."""
+        file = self.out / f"latents-{stage1}-{split}{'-refined' if refined else ''}.pt"
+        if not file.exists():
+            module = self.first_module(stage1, 0)
+            module.model.load_state_dict(torch.load(self.out / f"{stage1}-0.pt", weights_only=True))
+            module.eval().requires_grad_(False)
+            encoded = [self.encoded(module, scene, refined) for scene in self.scenes(split, references)]
+            torch.save([vars(scene) for scene in encoded], file)
+        return [CachedScene(**fields) for fields in torch.load(file, weights_only=True)]
+
+    def encoded(self, module, scene, refined):
+        """Return a scene's posterior, whose mean may go 8 gentle steps towards what renders all views best."""
+        batch = stack([scene])
+        views = batch.all_views()[:, : 1 + ENCODED]
+        model = module.model
+        posterior, features = model.posterior(batch.reference.images, views, batch.depth_range)
+        latent = posterior.mean.clone().requires_grad_()
+        optimizer = torch.optim.Adam([latent], lr=0.02)
+        for _ in range(8 if refined else 0):
+            gaussians = model.reconstructor(latent, features).gaussians(batch.reference.cameras, batch.depth_range)
+            drawn = module.rasterizer(gaussians, views.cameras).over(module.background)
+            optimizer.zero_grad()
+            (drawn - views.images).square().mean().backward()
+            optimizer.step()
+        fields = (latent.detach()[0], posterior.log_variance[0], scene.reference.images)
+        return CachedScene(*fields, scene.reference_frame, scene.names)
+
+    def second_module(self, name, cached):
+        """Return stage 2's module with its change, the weights to start from and the latents' moments."""
+        stage1, change = SECOND[name][1], SECOND[name][3]
+        config = completesplat.compose("fit", *STAGE2, self.root, "out=unused")
+        config.model._target_ = f"{__name__}.OnCachedLatents"
+        _, module = completesplat.instantiate(config)
+        parts = module.completesplat
+        parts.load_state_dict(self.start.state_dict())
+        parts.autoreconstructor.load_state_dict(torch.load(self.out / f"{stage1}-0.pt", weights_only=True))
+        means = torch.stack([scene.mean for scene in cached])
+        variance = means.var((0, 2, 3)) + torch.stack([scene.log_variance for scene in cached]).exp().mean((0, 2, 3))
+        parts.set_latent_moments(means.mean((0, 2, 3)).tolist(), variance.sqrt().tolist())
+        change(parts)
+        return module
+
+    def train_second(self, name, seed):
+        """Train stage 2 and return the denoiser's loss and the scores of samples, each counted by itself."""
+        _, stage1, refined, _ = SECOND[name]
+        cached = self.latents(stage1, "train", range(0, 24, 24 // REFERENCES), refined)
+        held_out = self.latents(stage1, "val", (0, 12), refined)
+        torch.manual_seed(seed)
+        module = self.second_module(name, cached)
+        order = torch.Generator().manual_seed(seed)
+        loader = torch.utils.data.DataLoader(cached, STAGE2_BATCH, True, collate_fn=stack, generator=order)
+        before = time.process_time()
+        self.trainer(self.steps2, seed).fit(module, loader)
+        seconds = (time.process_time() - before) / max(1, self.steps2)
+        module.eval()
+        return {"seconds_a_step": seconds, "loss": self.loss(module, held_out), **self.sample_scores(module)}
+
+    @torch.no_grad()
+    def loss(self, module, held_out):
+        """Return the mean error of the denoiser on held-out latents, with fixed noise at evenly spaced levels."""
+        parts = module.completesplat
+        batch = stack(held_out)
+        latent = parts.standardised(batch.mean)
+        noise = torch.randn(latent.shape, generator=torch.Generator().manual_seed(0))
+        conditioning = parts.conditioning(batch.condition)
+        errors = []
+        for level in range(LEVELS):
+            timestep = torch.full((len(latent),), (2 * level + 1) * 1000 // (2 * LEVELS))
+            noisy = parts.sampler.add_noise(latent, noise, timestep)
+            errors.append((parts.denoiser(noisy, timestep, conditioning) - (noise - latent)).square().mean().item())
+        return mean(errors)
+
+    @torch.no_grad()
+    def sample_scores(self, module):
+        """Return the scores of samples, on the views that the posterior's are measured on."""
+        drawn = []
+        for scene in self.validation:
+            batch = stack([scene])
+            inputs = (batch.reference.images, batch.reference.cameras, batch.depth_range)
+            gaussians = module.completesplat.generate(*inputs, Sampling(samples=SAMPLES, seed=0))
+            drawn.append(self.rendered(module, gaussians, scene))
+        return scores(drawn)
+
+    def run(self, name, seed):
+        """Train and score one run, and append its line."""
+        print(name, seed, flush=True)
+        steps, train = (self.steps, self.train_first) if name in FIRST else (self.steps2, self.train_second)
+        row = {"name": name, "seed": seed, "steps": steps, **train(name, seed)}
+        print(json.dumps(row), flush=True)
+        with (self.out / "results.jsonl").open("a") as file:
+            file.write(json.dumps(row) + "\n")
+
+
+def scores(drawn):
+    """Return PSNR of all pixels and with a black background, sharpness and object's opacity within masks, by side."""
+    results = {}
+    for side, (least, most) in SIDES.items():
+        true, images, alphas = [], [], []
+        for views, rendered, opacity in drawn:
+            angles = torch.rad2deg(views.cameras.world_to_camera[:, 2, 2].clamp(-1, 1).acos())
+            chosen = (angles > least) & (angles <= most)
+            for sample in range(len(rendered)):
+                true.append(replace(views, cameras=None)[chosen])
+                images.append(rendered[sample, chosen])
+                alphas.append(opacity[sample, chosen])
+        truth = torch.cat([views.images for views in true])
+        masks = torch.cat([views.masks for views in true])
+        image = torch.cat(images)
+        results |= {
+            f"psnr_{side}": psnr(image, truth).mean().item(),
+            f"object_{side}": psnr(object_only(image, masks), object_only(truth, masks)).mean().item(),
+            f"sharpness_{side}": sharpness(image, truth, masks > 0.5),
+            f"opacity_{side}": torch.cat(alphas)[masks > 0.5].mean().item(),
+        }
+    return results
+
+
+def read_results(out):
+    """Return the lines of a study that has begun."""
+    file = Path(out) / "results.jsonl"
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def table(out):
+    """Print a table for each stage: means over seeds, and half of the distance between the lowest and the highest."""
+    rows = read_results(out)
+    for names in (FIRST, SECOND):
+        keys = [key for row in rows if row["name"] in names for key in row if key not in ("name", "seed", "steps")]
+        keys = list(dict.fromkeys(keys))
+        print("| | seeds | " + " | ".join(keys) + " |\n|" + "---|" * (len(keys) + 2))
+        for name in names:
+            runs = [row for row in rows if row["name"] == name]
+            cells = []
+            for key in keys if runs else ():
+                values = [run[key] for run in runs]
+                digits = 3 if key.startswith(("sharp", "loss", "opac")) else 2
+                cells.append(f"{mean(values):.{digits}f} ± {(max(values) - min(values)) / 2:.{digits}f}")
+            if runs:
+                print(f"| {name} {names[name][0]} | {len(runs)} | " + " | ".join(cells) + " |")
+        print()
+
+
+def main(verb, *words):
+    """Do what the command says."""
+    if verb == "table":
+        table(*words)
+        return
+    places = [word for word in words if "=" not in word]
+    given = dict(word.split("=", 1) for word in words if "=" in word)
+    study = Study(*places, int(given.get("steps", 100)), int(given.get("steps2", 150)))
+    names = given.get("runs", ",".join([*FIRST, *SECOND])).split(",")
+    for seed in map(int, given.get("seeds", "0,1").split(",")):
+        for name in names:
+            if not any(row["name"] == name and row["seed"] == seed for row in read_results(study.out)):
+                study.run(name, seed)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
