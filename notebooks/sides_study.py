@@ -1,12 +1,13 @@
 """What makes sides and backs sharp: short trainings with one change each (experiments.md, "Sides and backs").
 
-python notebooks/sides_study.py train SCANS WEIGHTS OUT [steps=100] [steps2=150] [seeds=0,1] [runs=control,...]
+python notebooks/sides_study.py train SCANS WEIGHTS OUT [steps=60] [steps2=60] [runs=start-0,control-0,...]
 python notebooks/sides_study.py table OUT
 
-SCANS is a folder of captures with splits.json, whose "train" and "val" are used, WEIGHTS the weights that all trainings
-continue from. Each training appends one line to OUT/results.jsonl when it is done, and is skipped when it has one. All
-runs of a stage have equally many steps, and the same random numbers in each step where they draw the same. Stage 2
-takes stage 1 of its row's first seed, so that latents are encoded once.
+SCANS is a folder of captures with splits.json, whose "train" and "val" are used, WEIGHTS the weights to start from. The
+run `start` continues them at 64 px, and all others continue from its weights. Each run appends one line to
+OUT/results.jsonl when it is done, and is skipped when it has one. All runs of a stage have equally many steps, and the
+same random numbers in each step where they draw the same. Stage 2 takes stage 1 of its row's first seed, so that
+latents are encoded once.
 """
 
 import json
@@ -273,6 +274,7 @@ class OnCachedLatents(LatentDiffusion):
 
 # name: (item of the issue, change). Stage 2: name: (item, stage 1's row, refined latents, change of the networks).
 FIRST: dict[str, tuple[str, Callable]] = {
+    "start": ("", unchanged),
     "control": ("", unchanged),
     "object_opacity": ("c", object_opacity),
     "noisy_latents": ("b", noisy_latents),
@@ -287,6 +289,14 @@ SECOND: dict[str, tuple[str, str, bool, Callable]] = {
     "encoder_features": ("f", "control", False, encoder_features),
     "noisy_latents2": ("b", "noisy_latents", False, lambda parts: None),
 }
+
+
+# Controls first, then one seed of everything, so that a queue that is cut off says most.
+FIRST_SEEDS = ["object_opacity", "noisy_latents", "spread_of_views", "eight_channels", "patch_discriminator"]
+FIRST_SEEDS += ["control2", "encoder_features", "refined_latents"]
+RUNS = ["start-0", "control-0", "control-1"]
+RUNS += [f"{name}-{seed}" for seed in (0, 1) for name in FIRST_SEEDS]
+RUNS += [f"{name}-{seed}" for name in ("without_alpha", "noisy_latents2") for seed in (0, 1)]
 
 
 class Study:
@@ -347,7 +357,10 @@ class Study:
         """Return stage 1's module with its change and the weights to start from."""
         torch.manual_seed(seed)
         _, module = completesplat.instantiate(self.config)
-        module.model.load_state_dict(self.start.autoreconstructor.state_dict())
+        if name == "start":
+            module.model.load_state_dict(self.start.autoreconstructor.state_dict())
+        else:
+            module.model.load_state_dict(torch.load(self.out / "start-0.pt", weights_only=True))
         FIRST[name][1](module, self.steps)
         return module
 
@@ -531,12 +544,11 @@ def main(verb, *words):
         return
     places = [word for word in words if "=" not in word]
     given = dict(word.split("=", 1) for word in words if "=" in word)
-    study = Study(*places, int(given.get("steps", 100)), int(given.get("steps2", 150)))
-    names = given.get("runs", ",".join([*FIRST, *SECOND])).split(",")
-    for seed in map(int, given.get("seeds", "0,1").split(",")):
-        for name in names:
-            if not any(row["name"] == name and row["seed"] == seed for row in read_results(study.out)):
-                study.run(name, seed)
+    study = Study(*places, int(given.get("steps", 60)), int(given.get("steps2", 60)))
+    for run in given["runs"].split(",") if "runs" in given else RUNS:
+        name, seed = run.rsplit("-", 1)
+        if not any(row["name"] == name and row["seed"] == int(seed) for row in read_results(study.out)):
+            study.run(name, int(seed))
 
 
 if __name__ == "__main__":
