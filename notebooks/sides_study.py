@@ -34,7 +34,7 @@ from completesplat.training.latent_diffusion import LatentDiffusion
 
 ENCODED = 6  # views that the posterior sees of a validation scan
 SIDES = {"aside": (30, 100), "behind": (100, 181)}  # degrees between optical axes
-REFERENCES = 2  # latents of a training object
+REFERENCES = 1  # latents of a training object
 LEVELS = 8  # noise levels of the denoiser's validation loss
 SAMPLES = 2
 SETTINGS = [
@@ -79,11 +79,11 @@ SECOND: dict[str, tuple[str, str, bool, Callable]] = {
 
 
 # Controls first, then one seed of everything, so that a queue that is cut off says most.
-FIRST_SEEDS = ["object_opacity", "noisy_latents", "spread_of_views", "eight_channels", "patch_discriminator"]
-FIRST_SEEDS += ["control2", "encoder_features", "refined_latents"]
-RUNS = ["start-0", "control-0", "control-1"]
-RUNS += [f"{name}-{seed}" for seed in (0, 1) for name in FIRST_SEEDS]
-RUNS += [f"{name}-{seed}" for name in ("without_alpha", "noisy_latents2") for seed in (0, 1)]
+CONTROLS = ["start-0", "control-0", "control-1"]
+CHANGED = ["object_opacity", "noisy_latents", "spread_of_views", "eight_channels", "patch_discriminator"]
+RUNS = CONTROLS + [f"{name}-{seed}" for seed in (0, 1) for name in CHANGED]
+RUNS += [f"{name}-{seed}" for seed in (0, 1) for name in ("control2", "encoder_features")]
+RUNS += [f"{name}-{seed}" for name in ("without_alpha", "noisy_latents2", "refined_latents") for seed in (0, 1)]
 
 
 class Study:
