@@ -40,7 +40,7 @@ def views(images: Tensor) -> Views:
 
 
 def prediction(images: Tensor, posterior: Posterior | None = None, **gaussians: float) -> Prediction:
-    return Prediction(images, torch.ones_like(images[:, :, :1]), some_gaussians(len(images), **gaussians), posterior)
+    return Prediction(images, some_gaussians(len(images), **gaussians), posterior)
 
 
 def opened(root: Path, *settings: str):

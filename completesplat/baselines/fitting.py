@@ -149,9 +149,8 @@ def fit_gaussians(
             # Indexing copies the views, so autograd can use them even if they were made in inference mode.
             truth = views[:, chosen.to(views.images.device)]
             gaussians = raw.gaussians()
-            rendering = rasterizer(gaussians, truth.cameras)
-            images = rendering.over(background)
-            total, _ = loss(Prediction(images, rendering.alpha, gaussians, None), truth, step)
+            images = rasterizer(gaussians, truth.cameras).over(background)
+            total, _ = loss(Prediction(images, gaussians, None), truth, step)
             optimizer.zero_grad()
             torch.autograd.backward(total)
             optimizer.step()

@@ -12,20 +12,17 @@ from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.losses.ssim import structural_similarity
-from completesplat.quantities import Natural, NonNegative
+from completesplat.quantities import Natural, NonNegative, Positive
+from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Views
 from completesplat.tensors import TensorDataclass
 
 
 @dataclass(frozen=True)
 class Prediction(TensorDataclass):
-    """Rendered images of the reference and all targets (sRGB), their Gaussians, and the posterior if any.
-
-    `alphas` are the opacities of the rendered pixels: what lies behind the Gaussians shows with the rest.
-    """
+    """Rendered images of the reference and all targets (sRGB), their Gaussians, and the posterior if any."""
 
     images: Float[Tensor, "batch view 3 height width"]
-    alphas: Float[Tensor, "batch view 1 height width"]
     gaussians: Gaussians
     posterior: Posterior | None
 
@@ -101,15 +98,39 @@ class StructuralDissimilarity:
         return 1 - structural_similarity(prediction.images.flatten(0, 1), truth.images.flatten(0, 1)).mean()
 
 
-class Translucency:
-    """Mean of 1 - opacity over what the masks show, so that objects are solid from all sides.
+class Silhouettes:
+    """Mean squared difference between the masks and what the object's own Gaussians show, in a drawn part of the views.
 
-    Pixels outside of the masks do not count, because a background may be painted by Gaussians, too.
+    Gaussians of the pixels within the reference's mask are the object's. Drawn in white, with all others in black, they
+    should show the mask of each view. So an object is solid from behind, too: where it is thin, Gaussians of the
+    background can have its colours, but they are black here. The reference is always among the views that are drawn.
+
+    Args:
+        rasterizer: draws the Gaussians once more.
+        views: number of views beside the reference that are drawn in each step.
+
+    Raises:
+        CompleteSplatError: on a call, the Gaussians are not those of a Splatter Image of the reference.
     """
 
+    def __init__(self, rasterizer: Rasterizer, views: Positive = 3) -> None:
+        self.rasterizer = rasterizer
+        self.views = views
+
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
-        missing = (1 - prediction.alphas) * truth.masks
-        return missing.sum() / truth.masks.sum().clamp(min=1)
+        others = torch.randperm(truth.masks.shape[1] - 1)[: self.views] + 1
+        seen = truth[:, [0, *others.tolist()]]
+        gaussians = prediction.gaussians
+        reference = truth.masks[:, 0].flatten(1)
+        layers, rest = divmod(gaussians.count, reference.shape[1])
+        if rest:
+            raise CompleteSplatError(
+                "the term Silhouettes needs Gaussians of the reference's pixels: it is for stage 1"
+            )
+        white = reference.repeat(1, layers)[..., None].expand(gaussians.means.shape)
+        objects = Gaussians(gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, white)
+        shown = self.rasterizer(objects, seen.cameras).color[:, :, :1]
+        return nn.functional.mse_loss(shown, seen.masks)
 
 
 class KullbackLeibler:

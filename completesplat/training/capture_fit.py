@@ -185,8 +185,8 @@ class CaptureFit(Stage):
         settings = self.fitting
         with torch.autocast(self.device.type, enabled=False):
             rendering = self.rasterizer(gaussians[None], views.cameras)
-        prediction = Prediction(rendering.over(self.background), rendering.alpha, gaussians[None], None)
-        total, terms = self.loss(prediction, views, self.global_step)
+        images = rendering.over(self.background)
+        total, terms = self.loss(Prediction(images, gaussians[None], None), views, self.global_step)
         total = total + settings.opacity_weight * gaussians.opacities.mean()
         total = total + settings.scale_weight * gaussians.scales.mean()
         figures = {f"train/{name}": value for name, value in terms.items()}

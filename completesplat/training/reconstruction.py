@@ -175,9 +175,8 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         with torch.autocast(self.device.type, enabled=False):
             gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
             truth = scenes.all_views()
-            rendering = self.rasterizer(gaussians, truth.cameras)
-            images = rendering.over(self.background)
-            prediction = Prediction(images, rendering.alpha, gaussians, reconstruction.posterior)
+            images = self.rasterizer(gaussians, truth.cameras).over(self.background)
+            prediction = Prediction(images, gaussians, reconstruction.posterior)
             total, values = self.loss(prediction, truth, self.global_step)
             images = images.detach().clamp(0, 1)
             quality = psnr(images.flatten(0, 1), truth.images.flatten(0, 1)).mean()
@@ -273,7 +272,6 @@ class ReconstructorOnly(ReconstructionModule):
         """Return the loss of the reference views alone, with the terms of the current training step."""
         views: Views = scenes.reference.map(lambda tensor: tensor[:, None])
         gaussians = self.gaussians(codes, scenes)
-        rendering = self.rasterizer(gaussians, views.cameras)
-        images = rendering.over(self.background)
-        total, _ = self.loss(Prediction(images, rendering.alpha, gaussians, None), views, self.global_step)
+        images = self.rasterizer(gaussians, views.cameras).over(self.background)
+        total, _ = self.loss(Prediction(images, gaussians, None), views, self.global_step)
         return total

@@ -96,7 +96,7 @@ def test_the_loss_for_things_draws_views_and_makes_them_solid():
     config = compose_config("fit", "loss=things").loss
     terms = instantiate(config, _convert_="all").terms
     assert terms["efficientnet"]["term"].views == 3
-    assert set(terms) == {*compose_config("fit", "loss=perceptual").loss.terms, "translucency"}
+    assert set(terms) == {*compose_config("fit", "loss=perceptual").loss.terms, "silhouettes"}
 
 
 @pytest.mark.slow

@@ -5,16 +5,20 @@ import torch
 from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
 from hydra.utils import instantiate
 from kornia.metrics import ssim as kornia_ssim
-from scenes_for_training import prediction, quiet_trainer, scene_batch, views
-from support import NETWORKS, compose_config
+from scenes_for_training import SIZE, prediction, quiet_trainer, scene_batch, views
+from support import NETWORKS, compose_config, round_gaussians
+from torch import Tensor
 from torch.utils.data import DataLoader
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import pixel_rays
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.losses.ssim import structural_similarity
-from completesplat.losses.terms import KullbackLeibler, MeanSquaredError, StructuralDissimilarity, Translucency
+from completesplat.losses.terms import KullbackLeibler, MeanSquaredError, Silhouettes, StructuralDissimilarity
+from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import Views
 
 SHAPE = (2, 3, 3, 24, 24)
@@ -49,18 +53,37 @@ def test_ssim_is_computed_in_full_precision_and_a_training_may_follow_a_test(pai
     assert term(prediction(truth.images), truth).item() == pytest.approx(0, abs=1e-5)
 
 
-def test_translucency_is_what_opacity_lacks_within_the_masks_alone(pair):
-    alphas, masks = (torch.rand(2, 3, 1, 24, 24, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2))
-    predicted = replace(prediction(pair[0]), alphas=alphas.requires_grad_())
-    halves = masks.round()
-    truth = replace(views(pair[1]), masks=halves)
-    value = Translucency()(predicted, truth)
-    assert value.item() == pytest.approx((1 - alphas[halves > 0]).mean().item(), rel=1e-5)
-    value.backward()
-    assert (alphas.grad[halves > 0] < 0).all()
-    assert (alphas.grad[halves == 0] == 0).all()
-    assert Translucency()(predicted, replace(truth, masks=torch.zeros_like(masks))) == 0
-    assert Translucency()(replace(predicted, alphas=torch.ones_like(alphas)), replace(truth, masks=masks)) == 0
+def wall_of_gaussians(opacity: float) -> Gaussians:
+    """Gaussians of an image's pixels, one layer: the left half, at depth 1, hides the right half behind it."""
+    camera = scene_batch(1, 1).reference.cameras
+    rays = pixel_rays(camera).flatten(1, 2)
+    left = torch.arange(SIZE).expand(SIZE, SIZE).flatten() < SIZE // 2
+    behind = rays.view(1, SIZE, SIZE, 3).roll(SIZE // 2, dims=2).view(1, -1, 3) * 2
+    means = torch.where(left[None, :, None], rays, behind)
+    gaussians = round_gaussians(means[0], 0.02, 1.0, 0.5)[None]
+    return replace(gaussians, opacities=torch.where(left, opacity, 1.0)[None])
+
+
+def test_silhouettes_are_what_the_objects_own_gaussians_show():
+    scene = scene_batch(1, 2)
+    masks = (torch.arange(SIZE) < SIZE // 2).float().expand(1, 3, 1, SIZE, SIZE)
+    truth = replace(scene.all_views(), masks=masks)
+    term = Silhouettes(ReferenceRasterizer(), views=2)
+
+    def value(gaussians: Gaussians) -> Tensor:
+        return term(Prediction(truth.images, gaussians, None), truth)
+
+    solid = wall_of_gaussians(1.0)
+    thin = replace(solid, opacities=wall_of_gaussians(0.1).opacities.requires_grad_())
+    colors = replace(solid, colors=torch.rand_like(solid.colors))
+    assert value(solid) < 0.05
+    assert value(thin) > 3 * value(solid)
+    assert value(colors) == value(solid)
+    value(thin).backward()
+    left = masks[0, 0].flatten() > 0
+    assert (thin.opacities.grad[0, left] < 0).float().mean() > 0.9
+    with pytest.raises(CompleteSplatError, match="for stage 1"):
+        value(solid[:, :7])
 
 
 @pytest.mark.parametrize("size", [16, 64])
