@@ -7,10 +7,8 @@ import torch
 from torch import nn
 
 from completesplat.autoreconstructor.view_encoders import sweep
-from completesplat.geometry.cameras import nearest_to_axes
+from completesplat.losses.terms import Silhouettes
 from completesplat.splatter_image import zeroed
-
-OBJECT_RADIUS = 0.9  # scene units around the cameras' common point; an object's half size is 0.57
 
 
 # Changes of stage 1. Each is made to the module before training, when it has the weights to start from.
@@ -20,37 +18,9 @@ def unchanged(module, steps):
     """Change nothing."""
 
 
-def without_alpha(module, steps):
-    """Leave out the shipped term on opacity within the masks."""
-    del module.loss.terms["translucency"]
-
-
-def near_object(gaussians, cameras):
-    """Return Gaussians [batch] whose opacity is 0 unless they are near the point that cameras [batch view] look at.
-
-    A background is painted by Gaussians, too, so the opacity of all of them says nothing about the object.
-    """
-    count = len(cameras.world_to_camera)
-    centers = torch.stack([nearest_to_axes(cameras[scene]) for scene in range(count)]).float()
-    near = (gaussians.means - centers[:, None]).norm(dim=-1) < OBJECT_RADIUS
-    return replace(gaussians, opacities=gaussians.opacities * near)
-
-
-class ObjectOpacity:
-    """Squared error of the opacity of the Gaussians near the object against the masks, which are exact."""
-
-    def __init__(self, rasterizer):
-        self.rasterizer = rasterizer
-
-    def __call__(self, prediction, truth):
-        """Return the mean over all pixels and views."""
-        near = near_object(prediction.gaussians, truth.cameras)
-        return nn.functional.mse_loss(self.rasterizer(near, truth.cameras).alpha, truth.masks)
-
-
-def object_opacity(module, steps):
-    """Add a term on the object's opacity."""
-    module.loss.terms["object"] = {"weight": 0.2, "term": ObjectOpacity(module.rasterizer)}
+def silhouettes(module, steps):
+    """Draw the object's own Gaussians against the masks, which are exact (the term that loss=things has)."""
+    module.loss.terms["silhouettes"] = {"weight": 0.2, "term": Silhouettes(module.rasterizer)}
 
 
 def noisy_latents(module, steps):

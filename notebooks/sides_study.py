@@ -1,6 +1,6 @@
 """What makes sides and backs sharp: short trainings with one change each (experiments.md, "Sides and backs").
 
-python notebooks/sides_study.py train SCANS WEIGHTS OUT [steps=60] [steps2=60] [runs=start-0,control-0,...]
+python notebooks/sides_study.py train SCANS WEIGHTS OUT [steps=50] [steps2=50] [runs=start-0,control-0,...]
 python notebooks/sides_study.py table OUT
 
 SCANS is a folder of captures with splits.json, whose "train" and "val" are used, WEIGHTS the weights to start from. The
@@ -25,6 +25,7 @@ from lightning import Trainer
 import completesplat
 from completesplat.data.loading.view_selection import spread_around
 from completesplat.evaluation.regions import object_only
+from completesplat.geometry.cameras import nearest_to_axes
 from completesplat.metrics.images import psnr, sharpness
 from completesplat.scene import CachedScene
 from completesplat.scene_model import Sampling
@@ -33,6 +34,7 @@ from completesplat.training.callbacks import StepSeeds
 from completesplat.training.latent_diffusion import LatentDiffusion
 
 ENCODED = 6  # views that the posterior sees of a validation scan
+OBJECT_RADIUS = 0.9  # scene units around the cameras' common point; an object's half size is 0.57
 SIDES = {"aside": (30, 100), "behind": (100, 181)}  # degrees between optical axes
 REFERENCES = 1  # latents of a training object
 LEVELS = 8  # noise levels of the denoiser's validation loss
@@ -45,7 +47,13 @@ SETTINGS = [
     "autoreconstructor.reconstructor.parameterization.within_range=true",
     "schedule.warmup_steps=10",
 ]
-STAGE1 = ["experiment=anything_var", "loss=things", "data.random_background=0.5", *SETTINGS]
+STAGE1 = [
+    "experiment=anything_var",
+    "loss=things",
+    "loss.terms.silhouettes=null",
+    "data.random_background=0.5",
+    *SETTINGS,
+]
 STAGE1 += ["optimizer.lr=2.5e-3", "optimizer.adam_lr=7.5e-4"]
 STAGE2 = ["experiment=anything_diffusion", *SETTINGS, "model.autoreconstructor_checkpoint=null"]
 STAGE2 += ["optimizer.lr=7e-3", "optimizer.adam_lr=2e-3"]
@@ -63,12 +71,11 @@ class OnCachedLatents(LatentDiffusion):
 FIRST: dict[str, tuple[str, Callable]] = {
     "start": ("", changes.unchanged),
     "control": ("", changes.unchanged),
-    "object_opacity": ("c", changes.object_opacity),
+    "silhouettes": ("c", changes.silhouettes),
     "noisy_latents": ("b", changes.noisy_latents),
     "spread_of_views": ("e", changes.spread_of_views),
     "eight_channels": ("g", changes.eight_channels),
     "patch_discriminator": ("d", changes.patch_discriminator),
-    "without_alpha": ("c", changes.without_alpha),
 }
 SECOND: dict[str, tuple[str, str, bool, Callable]] = {
     "control2": ("", "control", False, lambda parts: None),
@@ -80,10 +87,10 @@ SECOND: dict[str, tuple[str, str, bool, Callable]] = {
 
 # Controls first, then one seed of everything, so that a queue that is cut off says most.
 CONTROLS = ["start-0", "control-0", "control-1"]
-CHANGED = ["object_opacity", "noisy_latents", "spread_of_views", "eight_channels", "patch_discriminator"]
+CHANGED = ["silhouettes", "noisy_latents", "spread_of_views", "eight_channels", "patch_discriminator"]
 RUNS = CONTROLS + [f"{name}-{seed}" for seed in (0, 1) for name in CHANGED]
 RUNS += [f"{name}-{seed}" for seed in (0, 1) for name in ("control2", "encoder_features")]
-RUNS += [f"{name}-{seed}" for name in ("without_alpha", "noisy_latents2", "refined_latents") for seed in (0, 1)]
+RUNS += [f"{name}-{seed}" for name in ("noisy_latents2", "refined_latents") for seed in (0, 1)]
 
 
 class Study:
@@ -178,7 +185,7 @@ class Study:
         """Return true views that the posterior does not see, and of each sample its images and the object's opacity."""
         truth = scene.targets[ENCODED:]
         images = module.render_from(gaussians, truth.cameras).over(module.background)
-        near = changes.near_object(gaussians, truth.cameras.repeated(len(gaussians.means)))
+        near = near_object(gaussians, truth.cameras.repeated(len(gaussians.means)))
         return truth, images.clamp(0, 1), module.render_from(near, truth.cameras).alpha
 
     def latents(self, stage1, split, references, refined):
@@ -275,6 +282,17 @@ class Study:
             file.write(json.dumps(row) + "\n")
 
 
+def near_object(gaussians, cameras):
+    """Return Gaussians [batch] whose opacity is 0 unless they are near the point that cameras [batch view] look at.
+
+    A background is painted by Gaussians, too, so the opacity of all of them says nothing about the object.
+    """
+    count = len(cameras.world_to_camera)
+    centers = torch.stack([nearest_to_axes(cameras[scene]) for scene in range(count)]).float()
+    near = (gaussians.means - centers[:, None]).norm(dim=-1) < OBJECT_RADIUS
+    return replace(gaussians, opacities=gaussians.opacities * near)
+
+
 def scores(drawn):
     """Return PSNR of all pixels and with a black background, sharpness and object's opacity within masks, by side."""
     results = {}
@@ -331,7 +349,7 @@ def main(verb, *words):
         return
     places = [word for word in words if "=" not in word]
     given = dict(word.split("=", 1) for word in words if "=" in word)
-    study = Study(*places, int(given.get("steps", 60)), int(given.get("steps2", 60)))
+    study = Study(*places, int(given.get("steps", 50)), int(given.get("steps2", 50)))
     for run in given["runs"].split(",") if "runs" in given else RUNS:
         name, seed = run.rsplit("-", 1)
         if not any(row["name"] == name and row["seed"] == int(seed) for row in read_results(study.out)):
