@@ -10,7 +10,6 @@ from completesplat.autoreconstructor.view_encoders import sweep
 from completesplat.losses.terms import Silhouettes
 from completesplat.splatter_image import zeroed
 
-
 # Changes of stage 1. Each is made to the module before training, when it has the weights to start from.
 
 
