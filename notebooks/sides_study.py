@@ -324,22 +324,36 @@ def read_results(out):
 
 
 def table(out):
-    """Print a table for each stage: means over seeds, and half of the distance between the lowest and the highest."""
+    """Print a table for each stage: means over seeds, and by how much they differ from the control.
+
+    The difference is that of runs of one seed, which see the same scenes in the same order: its mean over seeds, and
+    half of the distance between its lowest and its highest value. For controls that distance is of the values.
+    """
     rows = read_results(out)
-    for names in (FIRST, SECOND):
+    for names, control in ((FIRST, "control"), (SECOND, "control2")):
+        controls = {row["seed"]: row for row in rows if row["name"] == control}
         keys = [key for row in rows if row["name"] in names for key in row if key not in ("name", "seed", "steps")]
         keys = list(dict.fromkeys(keys))
         print("| | seeds | " + " | ".join(keys) + " |\n|" + "---|" * (len(keys) + 2))
         for name in names:
-            runs = [row for row in rows if row["name"] == name]
-            cells = []
-            for key in keys if runs else ():
-                values = [run[key] for run in runs]
-                digits = 3 if key.startswith(("sharp", "loss", "opac")) else 2
-                cells.append(f"{mean(values):.{digits}f} ± {(max(values) - min(values)) / 2:.{digits}f}")
+            runs = [
+                row for row in rows if row["name"] == name and (name in ("start", control) or row["seed"] in controls)
+            ]
             if runs:
+                cells = [table_cell(runs, {} if name in ("start", control) else controls, key) for key in keys]
                 print(f"| {name} {names[name][0]} | {len(runs)} | " + " | ".join(cells) + " |")
         print()
+
+
+def table_cell(runs, controls, key):
+    """Return the mean of runs with its spread, or with the difference from the controls and its spread."""
+    digits = 2 if key.startswith(("psnr", "object", "seconds")) else 3
+    values = [run[key] for run in runs]
+    compared = [run[key] - controls[run["seed"]][key] for run in runs] if controls else values
+    spread = (max(compared) - min(compared)) / 2
+    if not controls:
+        return f"{mean(values):.{digits}f} ± {spread:.{digits}f}"
+    return f"{mean(values):.{digits}f} ({mean(compared):+.{digits}f} ± {spread:.{digits}f})"
 
 
 def main(verb, *words):
