@@ -351,9 +351,9 @@ def table_cell(runs, controls, key):
     values = [run[key] for run in runs]
     compared = [run[key] - controls[run["seed"]][key] for run in runs] if controls else values
     spread = (max(compared) - min(compared)) / 2
-    if not controls:
-        return f"{mean(values):.{digits}f} ± {spread:.{digits}f}"
-    return f"{mean(values):.{digits}f} ({mean(compared):+.{digits}f} ± {spread:.{digits}f})"
+    shown = f"{mean(values):.{digits}f}"
+    around = f" ± {spread:.{digits}f}" if len(runs) > 1 else ""  # one seed has no spread
+    return f"{shown} ({mean(compared):+.{digits}f}{around})" if controls else shown + around
 
 
 def main(verb, *words):
