@@ -31,6 +31,7 @@ NonNegative = Annotated[float, Range(0)]
 Share = Annotated[float, Range(0, 1)]
 Seed = Annotated[int, Range(0, 2**63 - 1)]
 Side = Annotated[int, Range(8, 4096)]  # of an image, in pixels
+Detail = Annotated[int, Range(0, 2048)]  # largest side of the image that a scene's front is fitted to, in pixels
 
 # Sizes of networks. Their bounds lie beyond what anyone trains, and protect from configs that strangers wrote.
 Width = Annotated[int, Range(1, 8192)]

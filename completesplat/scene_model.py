@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,13 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
 from completesplat.photo.photograph import read_photograph
 from completesplat.photo.reading import Framing, ImageLike, Photograph
-from completesplat.quantities import Natural, Positive, Seed
+from completesplat.quantities import Detail, Natural, Positive, Seed
+from completesplat.rasterizers.front_detail import fit_detail, front_targets
 from completesplat.rasterizers.front_fitting import fit_front
 from completesplat.rasterizers.selection import auto
 from completesplat.scene import Views
 from completesplat.settings.composition import has_bfloat16
-from completesplat.settings.schema import check_settings
+from completesplat.settings.schema import check_settings, check_value
 from completesplat.splatter_image import Parameterization
 from completesplat.tensors import concatenate, in_float32
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
@@ -35,7 +36,11 @@ from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
 Visible = Float[Tensor, "batch 1 height width"]  # masks that are 0 where an image is hidden, and 1 elsewhere
 OnScenes = Callable[[int, int, Gaussians], None]
 """Callback: (number of the denoiser call, timestep, scenes as they are estimated now) -> None."""
+OnFit = Callable[[int], None]
+"""Callback: (number of the sample) -> None."""
 OBJECT_SHARE = 0.9  # of the image's side that an object on a background fills, as on imported turntables
+DETAIL = 512
+"""Default of the largest side, in pixels, of the image that a scene's front is fitted to."""
 _rasterizer = cache(auto)
 
 
@@ -51,7 +56,7 @@ class Sampling:
         guidance_weight: share of the unconditional prediction; more gives more diverse samples.
         skip_weight: default 1, the most faithful (supplement, "Diverse Sampling"), or 0 if something is hidden.
         seed: seed of all noise, or one for each image, whose samples then do not depend on the other images.
-        color_fits: rounds of fitting to the image (`fit_front`); 0 in the paper.
+        color_fits: rounds of fitting to the image at the model's size (`fit_front`); 0 in the paper.
         batch: the largest number of latents at a time; it changes only rounding. By default all, or fewer if a GPU's
             memory does not suffice. On a CPU, a small denoiser takes as many at a time as `part_of` returns, unless
             `on_step` is given.
@@ -143,7 +148,7 @@ class SceneModel(nn.Module):
         """Return scenes [batch * samples] fitted to what is visible of their images."""
         if not color_fits:
             return scenes
-        background = 0.5 if self.background is None else self.background
+        background = self._behind
         samples = len(scenes.means) // len(images)
         parts = []
         for i in range(len(scenes.means)):  # one after the other, for the memory
@@ -152,6 +157,43 @@ class SceneModel(nn.Module):
             scene = scenes[i : i + 1]
             parts.append(fit_front(scene, cameras[photo], images[photo], _rasterizer(), color_fits, background, mask))
         return concatenate(parts)
+
+    @property
+    def _behind(self) -> float:
+        """Grey value behind scenes that are fitted to images."""
+        return 0.5 if self.background is None else self.background
+
+    def detailed(
+        self,
+        scenes: Gaussians,
+        photograph: Photograph,
+        size: int,
+        visible: Visible | None = None,
+        on_fit: OnFit | None = None,
+    ) -> list[Gaussians]:
+        """Return scenes [sample] of a photo whose fronts have its detail (`fit_detail`), each without a batch.
+
+        Args:
+            size: side of the image that they are fitted to (`front_size`).
+            on_fit: called with the number of each sample before it is fitted.
+        """
+        if size <= self.image_size:
+            return [scenes[i] for i in range(len(scenes.means))]
+        camera = self.camera(photograph)[None]
+        targets = front_targets(camera, photograph.square_at, size, visible)
+        fitted = []
+        for i in range(len(scenes.means)):
+            if on_fit is not None:
+                on_fit(i)
+            fitted.append(fit_detail(scenes[i : i + 1], camera, targets, _rasterizer(), self._behind)[0])
+        return fitted
+
+    def front_size(self, photograph: Photograph, detail: Detail = DETAIL) -> int:
+        """Return the side of the image that a photo's scenes look right at: `detail` or less, and the model's or more.
+
+        The photo has no detail beyond its own pixels.
+        """
+        return max(self.image_size, min(detail, photograph.square.width))
 
     @property
     def parameterization(self) -> Parameterization:
@@ -176,14 +218,22 @@ class SceneModel(nn.Module):
         image: Photograph | ImageLike,
         visible: Float[Tensor, "1 _ _"] | None = None,
         on_step: OnScenes | None = None,
+        on_fit: OnFit | None = None,
+        detail: Detail = DETAIL,
         **settings: Any,
     ) -> list[Gaussians]:
         """Generate complete scenes from one photo, in its camera's frame (+x right, +y down, +z forward).
+
+        They look right from `camera(photograph, front_size(photograph, detail))`, because a rasterizer's blur is part
+        of them (`completesplat.rasterizers.front_detail.seen_larger`). `detail=0` gives the paper's plain samples.
 
         Args:
             image: a file, a PIL image, an array or a tensor (see `read`), or what `read` returned.
             visible: 0 where the image is hidden; by default what `read` was told.
             on_step: called after each denoising step; see `CompleteSplat.generate`.
+            on_fit: called with the number of each sample before its front is fitted to more than the model's size.
+            detail: longest side of the image that fronts are fitted to, with smaller Gaussians where the photo has more
+                detail; at most the photo's own. At the model's size or less, `color_fits` alone fit. 0: none do.
             **settings: `samples`, `skip_weight`, `color_fits`, `steps`, `seed`, ...: see `Sampling`.
 
         Raises:
@@ -195,22 +245,26 @@ class SceneModel(nn.Module):
             message = f"the model's weights are {dtype}; model.float() makes them float32, which scenes need"
             raise CompleteSplatError(message)
         check_settings(Sampling, settings)
+        check_value("detail", Detail, detail)
         device = self.up.device
         sampling = Sampling(**{"bfloat16": has_bfloat16(device.type), **settings})
+        if detail == 0:
+            sampling = replace(sampling, color_fits=0)
         photograph = image if isinstance(image, Photograph) else self.read(image)
         visible = photograph.visible if visible is None else visible
         shape = (1, self.image_size, self.image_size)
         if visible is not None and (visible.shape != shape or not ((visible >= 0) & (visible <= 1)).all()):
             raise CompleteSplatError(f"visible: needs values from 0 to 1 in shape {list(shape)}")
+        visible = None if visible is None else visible[None].to(device)
         scenes = self.eval().generate(
             photograph.image[None].to(device),
             self.camera(photograph)[None],
             self.depth_range_of(photograph)[None],
             sampling,
-            visible=None if visible is None else visible[None].to(device),
+            visible=visible,
             on_step=on_step,
         )
-        return [scenes[i] for i in range(len(scenes.means))]
+        return self.detailed(scenes, photograph, self.front_size(photograph, detail), visible, on_fit)
 
     def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
         """Return near and far of the scene in a photo: those of the training set.
@@ -298,11 +352,11 @@ class SceneModel(nn.Module):
         """Read an image at the model's size by `read_photograph`, which explains the arguments."""
         return read_photograph(image, self.framing, fov_degrees, remove_background, mask, box)
 
-    def camera(self, photograph: Photograph) -> Cameras:
-        """Return the camera that took a photo, at the origin of the world."""
+    def camera(self, photograph: Photograph, size: int | None = None) -> Cameras:
+        """Return the camera that took a photo, at the origin of the world, for the model's image size or another."""
+        size = self.image_size if size is None else size
         device = self.up.device
-        intrinsics = pinhole(photograph.fov_degrees, self.image_size).to(device)
-        return Cameras(torch.eye(4, device=device), intrinsics, (self.image_size, self.image_size))
+        return Cameras(torch.eye(4, device=device), pinhole(photograph.fov_degrees, size).to(device), (size, size))
 
     def save_pretrained(self, path: Path | str) -> None:
         """Write `config.json`, `model.safetensors` and their checksums into a folder, ready for the Hugging Face hub.

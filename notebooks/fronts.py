@@ -2,15 +2,18 @@
 
 python notebooks/fronts.py PHOTO ...                                 # with the nearest weights, as `predict` takes them
 python notebooks/fronts.py weights=NAME experiment=... data=... ...  # a test set: input views and novel views
+python notebooks/fronts.py detail=512 PHOTO ...                      # at this size, with `color_fits` alone and detail
 """
 
 import statistics
 import sys
+import time
 
 import torch
 
 import completesplat
 from completesplat.metrics.images import psnr
+from completesplat.rasterizers.front_detail import seen_larger
 from completesplat.rasterizers.selection import auto
 from completesplat.scene_model import Sampling, match_shipped
 
@@ -37,6 +40,40 @@ def score(images, cameras, depth_range, targets, model, background):
         )
 
 
+def energy(image):
+    """Return the sum of the mean squared differences of neighbouring pixels in rows and in columns."""
+    return sum(image.diff(dim=axis).square().mean().item() for axis in (-1, -2))
+
+
+def score_detail(name, detail):
+    """Print PSNR and gradient energy over the photo's, at a size, of a photo's front without detail and with it."""
+    model, background = model_of(next(iter(match_shipped(name))))
+    photo = model.read(name)
+    size = model.front_size(photo, detail)
+    image, camera = photo.square_at(size)[None], model.camera(photo, size)[None, None]
+    rows = []
+    plain = model(photo, color_fits=40, detail=model.image_size)[0][None]
+    began = time.process_time()
+    detailed = model.detailed(plain, photo, size)[0][None]
+    seconds = time.process_time() - began
+    for scene in (seen_larger(plain, model.camera(photo)[None], camera[:, 0]), detailed):
+        with torch.no_grad():
+            view = rasterizer(scene, camera).over(background)[0]
+        rows += psnr(view, image).item(), energy(view) / energy(image)
+    results[0].append((*rows, detailed.count, seconds))
+    text = "{:.2f} dB ({:.2f}); with detail {:.2f} dB ({:.2f})".format(*rows)
+    print(
+        f"{name.rpartition('/')[2]} at {size} px: {text}; {detailed.count:,} Gaussians, {seconds:.1f} CPU s", flush=True
+    )
+
+
+if sys.argv[1].startswith("detail="):
+    for name in sys.argv[2:]:
+        score_detail(name, int(sys.argv[1].removeprefix("detail=")))
+    columns = list(zip(*results[0], strict=True))
+    medians = ", ".join(f"{statistics.median(values):.2f}" for values in columns)
+    print(f"medians of {len(results[0])}: {medians}; most Gaussians {max(columns[4]):,}, seconds {max(columns[5]):.1f}")
+    sys.exit()
 if sys.argv[1].startswith("weights="):
     model, background = model_of(sys.argv[1].removeprefix("weights="))
     settings = "data.workers=0", "data.evaluation_batch_size=1", *sys.argv[2:]

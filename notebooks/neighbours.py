@@ -1,15 +1,18 @@
 """Views near a photo's, drawn from scenes of that photo, against true photos (experiments.md, "Anything").
 
-python notebooks/neighbours.py CAPTURES WEIGHTS ... [depth_after=4] [sheet=FILE]
+python notebooks/neighbours.py CAPTURES WEIGHTS ... [depth_after=4] [size=256] [sheet=FILE]
 
 CAPTURES are folders with transforms.json, whose first photo is the reference, and the views within 30 degrees of it, as
 seen from the object, are scored on all pixels. The object has the size of the reference's mask, if there is one. The
-copy, and the copy on a plane at the object's depth, are the rivals.
+copy, and the copy on a plane at the object's depth, are the rivals. With `size`, larger than the weights' images, views
+are drawn and scored at this size, also of scenes whose fronts have the photo's detail (`fit_detail`).
 """
 
 import statistics
 import sys
+import time
 from dataclasses import replace
+from functools import partial
 
 import torch
 from PIL import Image
@@ -22,6 +25,7 @@ from completesplat.errors import DataError
 from completesplat.export.images import to_pixels
 from completesplat.geometry.cameras import crop_resize, invert_rigid, nearest_to_axes, transform_points
 from completesplat.metrics.images import psnr
+from completesplat.rasterizers.front_detail import fit_detail, front_targets, seen_larger
 from completesplat.rasterizers.selection import auto
 from completesplat.scene_model import Sampling
 
@@ -69,12 +73,18 @@ def resized(images, size):
     return functional.interpolate(images, (size, size), mode="area")
 
 
+def photo_at(image, size):
+    return resized(image[None], size)[0]
+
+
 words = dict(word.split("=") for word in sys.argv[2:] if "=" in word)
 models = {name: completesplat.CompleteSplat.from_pretrained(name) for name in sys.argv[2:] if "=" not in name}
 least, size = (of(model.image_size for model in models.values()) for of in (min, max))
+if "size" in words:
+    least = size = int(words["size"])
 data = CaptureSetDataModule(sys.argv[1], test_fraction=1, val_fraction=0, image_size=size, batch_size=1)
 data.setup("test")
-source, scores, sheet = data.source("test"), {}, []
+source, scores, sheet, seconds = data.source("test"), {}, [], []
 for name in source.names:
     try:
         images, cameras, depth = near_views(source.read(name))
@@ -92,7 +102,16 @@ for name in source.names:
                 seen, views = resized(images, model.image_size), crop_resize(cameras, 0, 0, size, model.image_size)
                 scene = model.generate(seen[:1], views[:1], depth_range, Sampling(color_fits=rounds))
                 background = 0.5 if model.background is None else model.background
-                drawn[f"{weights}, {rounds} rounds"] = rasterizer(scene, views[None]).over(background)[0]
+                if "size" not in words:
+                    drawn[f"{weights}, {rounds} rounds"] = rasterizer(scene, views[None]).over(background)[0]
+                    continue
+                targets = front_targets(views[:1], partial(photo_at, images[0]), size)
+                began = time.process_time()
+                detailed = fit_detail(scene, views[:1], targets, rasterizer, background)
+                seconds.append(time.process_time() - began)
+                scenes = {"": seen_larger(scene, views[:1], cameras[:1]), ", detail": detailed}
+                for kind, scene in scenes.items():
+                    drawn[f"{weights}, {rounds} rounds{kind}"] = rasterizer(scene, cameras[None]).over(background)[0]
     images = resized(images, least)
     drawn = {method: resized(views, least) for method, views in drawn.items()}
     for method, views in drawn.items():
@@ -105,5 +124,7 @@ for method, rows in scores.items():
     above = sum(ours > rival for ours, rival in zip(novel, rivals, strict=True))
     text = f"input view: median {statistics.median(front):.2f}, worst {min(front):.2f} dB; "
     print(f"{method}: {text}neighbours: mean {statistics.mean(novel):.2f} dB, {above} of {len(rows)} above both rivals")
+if seconds:
+    print(f"detail: {statistics.mean(seconds):.2f} CPU seconds a scene")
 if "sheet" in words:
     Image.fromarray(to_pixels(torch.cat(sheet, -2))).save(words["sheet"])

@@ -13,11 +13,13 @@ from PIL import Image
 from published_weights import write_published
 from safetensors.torch import load_file, save
 from support import compose_config, python, tiny_generator
+from torch.nn.functional import interpolate
 
 from completesplat import scene_model
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
+from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene_model import Sampling
 from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE
 
@@ -386,3 +388,38 @@ def test_weights_of_objects_on_white_put_a_transparent_object_on_white_as_large_
     assert white[:, 0].all()
     assert white[-1].all()
     assert abs(red.float().mean().sqrt() - 0.9) < 0.1
+
+
+def test_detail_makes_the_front_sharper_than_the_models_own_size(model, folder):
+    side = 2 * model.image_size
+    stripes = torch.arange(side) // 4 % 2 * 0.8 + 0.1
+    image = stripes.expand(3, side, side)
+    photograph = model.read(image)
+    draw = partial(model, photograph, samples=2, steps=1, color_fits=2)
+    fitted = []
+    plain, same_size, detailed = draw(detail=0), draw(detail=model.image_size), draw(on_fit=fitted.append)
+    assert fitted == [0, 1]
+    assert same(plain[0], model(photograph, samples=2, steps=1, detail=0)[0])
+    assert same_size[0].count == plain[0].count < detailed[0].count
+    assert not same(plain[0], same_size[0])
+    assert model.front_size(photograph) == model.front_size(photograph, 2000) == side
+    assert model.camera(photograph, side).image_size == (side, side)
+    errors = []
+    for scene, size in ((same_size[0], model.image_size), (detailed[0], side)):
+        camera = model.camera(photograph, size)
+        view = ReferenceRasterizer()(scene[None], camera[None, None]).over(0.5)[0]
+        errors.append((interpolate(view, (side, side), mode="bilinear") - image).square().mean())
+    assert errors[1] < errors[0] / 1.5
+
+
+def test_a_photo_that_is_smaller_than_the_models_images_has_no_detail(model):
+    photograph = model.read(torch.rand(3, 16, 20, generator=torch.Generator().manual_seed(0)))
+    assert model.front_size(photograph) == model.image_size
+    scenes = model(photograph, steps=1, color_fits=1), model(photograph, steps=1, color_fits=1, detail=1)
+    assert same(scenes[0][0], scenes[1][0])
+
+
+@pytest.mark.parametrize("detail", [-1, 4096])
+def test_detail_beyond_its_range_is_refused(model, photo, detail):
+    with pytest.raises(CompleteSplatError, match="detail="):
+        model(photo, detail=detail)

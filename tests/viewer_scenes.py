@@ -7,7 +7,15 @@ from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.viewer.sample import Sample
 
 # Of two steps, which draw quickly.
-SETTINGS = {"samples": 2, "skip_weight": 1.0, "guidance_weight": 0.0, "color_fits": 0, "steps": 2, "seed": 0}
+SETTINGS = {
+    "samples": 2,
+    "skip_weight": 1.0,
+    "guidance_weight": 0.0,
+    "color_fits": 0,
+    "detail": 0,
+    "steps": 2,
+    "seed": 0,
+}
 BALLS = {
     "red": ((0.0, 0.0, 4.0), (0.9, 0.1, 0.1)),
     "green": ((0.0, -0.8, 4.0), (0.1, 0.8, 0.1)),

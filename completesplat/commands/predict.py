@@ -13,7 +13,10 @@ from typing import Any
 import numba.np.arraymath  # else the first kernel imports it, and scipy with it  # noqa: F401
 import torch
 from hydra.utils import instantiate
+from jaxtyping import Float
 from omegaconf import DictConfig
+from torch import Tensor
+from torch.nn import functional
 
 from completesplat.commands.inputs import find_images, left_out
 from completesplat.commands.trained import open_generator, shown_background
@@ -165,9 +168,14 @@ def predict_photo(
     photograph = model.read(image, config.fov, remove, config.mask, config.box)
     settings = generation_settings(config, model, photograph)
     begin(f"drawing {config.samples} sample{'s' if config.samples > 1 else ''}", advance=0)
-    scenes = model(photograph, batch=config.batch, **settings)
-    samples = placed_samples(scenes, model, photograph)
-    shown = photograph.image if photograph.visible is None else photograph.image * photograph.visible
+    size = model.front_size(photograph, config.detail)
+
+    def on_fit(sample: int) -> None:
+        begin(f"fitting the front of sample {sample} at {size} px", advance=0)
+
+    scenes = model(photograph, batch=config.batch, on_fit=on_fit, **settings)
+    samples = placed_samples(scenes, model, photograph, size)
+    shown = shown_photo(photograph, size)
     recorded = {**settings, **facts_of_photo(config, model, image, photograph)}
     write_prediction(folder, shown, samples, rasterizer, outputs, recorded, begin)
 
@@ -178,6 +186,7 @@ def generation_settings(config: DictConfig, model: SceneModel, photograph: Photo
         "samples": config.samples,
         "seed": config.seed,
         "color_fits": config.color_fits,
+        "detail": config.detail,
     }
     if isinstance(model, CompleteSplat):
         settings["guidance_weight"] = config.guidance_weight
@@ -187,9 +196,19 @@ def generation_settings(config: DictConfig, model: SceneModel, photograph: Photo
     return settings
 
 
-def placed_samples(scenes: Sequence[Gaussians], model: SceneModel, photograph: Photograph) -> list[PlacedScene]:
-    """Return a photo's scenes with its camera, on the CPU."""
-    camera = model.camera(photograph).to("cpu")
+def shown_photo(photograph: Photograph, size: int) -> Float[Tensor, "3 _ _"]:
+    """Return a photo at a size, black where it is hidden."""
+    image = photograph.square_at(size)
+    if photograph.visible is None:
+        return image
+    return image * functional.interpolate(photograph.visible[None], (size, size), mode="nearest")[0]
+
+
+def placed_samples(
+    scenes: Sequence[Gaussians], model: SceneModel, photograph: Photograph, size: int
+) -> list[PlacedScene]:
+    """Return a photo's scenes with its camera, whose images have this size, on the CPU."""
+    camera = model.camera(photograph, size).to("cpu")
     pivot = None
     if model.background is not None:  # images of objects, whose centre is in the middle of the depth range
         pivot = on_optical_axis(camera, model.middle_depth(model.depth_range_of(photograph)))

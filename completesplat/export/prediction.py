@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
+from torch.nn import functional
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import beyond_gamut, cleaned, transparent
@@ -23,7 +24,7 @@ from completesplat.export.scene_files import OutputFiles, pivot_of, write_scene
 from completesplat.export.video import orbit_views
 from completesplat.files import make_folder, write_text
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras
+from completesplat.geometry.cameras import Cameras, crop_resize
 from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.geometry.trajectories import PATHS
 from completesplat.rasterizers import Rasterizer
@@ -31,6 +32,7 @@ from completesplat.rasterizers import Rasterizer
 logger = logging.getLogger(__name__)
 
 DIRECTIONS = 8  # views around a sample on the contact sheet
+SHEET_SIDE = 256  # pixels of its images, at most
 PHOTO_FILE = "photo.png"
 SHEET_FILE = "sheet.png"
 UNFINISHED = ".unfinished"  # a file that is there until the others are written
@@ -55,7 +57,7 @@ def write_prediction(
     The files of an earlier prediction in the folder, finished or not, are removed first; others remain.
 
     Args:
-        image: the input image.
+        image: the input image, with the size of the samples' camera.
         samples: all with the image's camera; broken Gaussians are left out, with a warning.
         settings: recorded in `scene.json`; must hold the seed and the image's name.
         on_file: called with the name of each scene's file and video before it is written.
@@ -83,7 +85,8 @@ def write_prediction(
         views.append(around)
         depths.append(depth)
     title = f"{settings['image']}: views around each sample"
-    contact_sheet(folder / SHEET_FILE, title, image, torch.stack(views), torch.stack(depths))
+    small = functional.interpolate(image[None], views[0].shape[-2:], mode="bilinear", antialias=True)[0]
+    contact_sheet(folder / SHEET_FILE, title, small, torch.stack(views), torch.stack(depths))
     recorded = {**settings, **_facts(samples, outputs)}
     if outputs.maps:
         maps, ends = write_maps(folder, [sample.gaussians for sample in samples], samples[0].camera, rasterizer)
@@ -117,9 +120,9 @@ def _views_around(
 ) -> tuple[Float[Tensor, "view 3 height width"], Float[Tensor, "1 height width"]]:
     """Return views of a sample from all sides, and the depth of the first, which is the photo's."""
     assert sample.pivot is not None
-    views, depths = orbit_views(
-        rasterizer, sample.gaussians, sample.camera, sample.pivot, DIRECTIONS, background, sample.up
-    )
+    side = max(sample.camera.image_size)
+    camera = crop_resize(sample.camera, 0, 0, side, min(side, SHEET_SIDE))
+    views, depths = orbit_views(rasterizer, sample.gaussians, camera, sample.pivot, DIRECTIONS, background, sample.up)
     return views, depths[0]
 
 

@@ -40,6 +40,7 @@ class Photograph(TensorDataclass):
         fov_source: where the field of view is from: the user, EXIF, or the model's training images.
         photo_size: width and height of the whole photo, upright, in pixels.
         crop: whether the square is the central one, or was chosen for an object.
+        square: the same square with the photo's own pixels (`square_at`): RGB in sRGB, or grey floats from 0 to 1.
         visible: 0 where the image is hidden and 1 elsewhere; None if nothing is hidden.
     """
 
@@ -47,8 +48,13 @@ class Photograph(TensorDataclass):
     fov_degrees: float
     fov_source: Literal["given", "exif", "default"]
     photo_size: tuple[int, int]
+    square: Image.Image
     crop: Literal["center", "object"] = "center"
     visible: Float[Tensor, "1 size size"] | None = None
+
+    def square_at(self, size: int) -> Float[Tensor, "3 _ _"]:
+        """Return the square at another size, made of the photo's own pixels."""
+        return _resized(self.square, size)
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,7 @@ def read_square(
             upright = _cut_out(upright, framing.background)
         central = central_window(upright.size, min(upright.size))
         window = _object_window(upright, framing) or central
-        image = _to_tensor(cropped(upright, window), stored, framing.size, framing.background)
+        square = _normalized(cropped(upright, window), stored, framing.background)
     except ImageError as error:
         name = source if isinstance(source, (str, Path)) else "the image"
         raise ImageError(f"{name}: {error}") from error.__cause__
@@ -113,7 +119,7 @@ def read_square(
     fov, fov_source = _field_of_view(fov_degrees, exif, stored.size, framing)
     if crop == "object" and fov_source != "default" and framing.object_share is None:
         fov = _enlarged_fov(fov, (window[2] - window[0]) / min(upright.size))
-    return Photograph(image, fov, fov_source, upright.size, crop)
+    return Photograph(_resized(square, framing.size), fov, fov_source, upright.size, square, crop)
 
 
 def _field_of_view(
@@ -193,20 +199,25 @@ def _pixels(image: np.ndarray | Tensor) -> Image.Image:
     return Image.fromarray(np.rint(255 * values.astype(np.float32)).astype(np.uint8))
 
 
-def _to_tensor(square: Image.Image, stored: Image.Image, size: int, background: float) -> Float[Tensor, "3 size size"]:
-    """Convert pixels to sRGB in [0, 1].
+def _normalized(square: Image.Image, stored: Image.Image, background: float) -> Image.Image:
+    """Convert pixels to RGB in sRGB, or those of deep grey images to floats from 0 to 1.
 
     Args:
         stored: the opened file, because only it has TIFF tags.
     """
     if square.mode in DEEP_GREY_MODES:
-        grey = Image.fromarray(files.deep_grey(square, getattr(stored, "tag_v2", {})))
-        resized = np.asarray(grey.resize((size, size), Image.Resampling.LANCZOS))
-        return torch.from_numpy(resized.clip(0, 1)).expand(3, size, size).contiguous()
+        return Image.fromarray(files.deep_grey(square, getattr(stored, "tag_v2", {})))
     if square.mode not in files.EIGHT_BIT_MODES:
         raise ImageError(f"colour mode {square.mode} is not supported")
-    small = _to_srgb(square, background).resize((size, size), Image.Resampling.LANCZOS)
-    return torch.from_numpy(np.array(small)).permute(2, 0, 1).contiguous().float() / 255
+    return _to_srgb(square, background)
+
+
+def _resized(square: Image.Image, size: int) -> Float[Tensor, "3 _ _"]:
+    """Resize a `_normalized` square (Lanczos, antialiased) and return it in [0, 1]."""
+    pixels = np.array(square.resize((size, size), Image.Resampling.LANCZOS))
+    if square.mode == "F":
+        return torch.from_numpy(pixels.clip(0, 1)).expand(3, size, size).contiguous()
+    return torch.from_numpy(pixels).permute(2, 0, 1).contiguous().float() / 255
 
 
 def _to_srgb(square: Image.Image, background: float) -> Image.Image:

@@ -1,7 +1,8 @@
 """Gaussians fitted to an image of them, as far as they are seen in it."""
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
@@ -11,17 +12,31 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer
 
-# Rates of Adam: sRGB units, logits of opacities, logarithms of scales.
 RATES = {"colors": 0.1, "opacities": 0.4, "scales": 0.12}
 BETAS = 0.9, 0.999
 DAMPING = 0.01
 """Adam's epsilon: a Gaussian moves slowly if the image's squared error changes by less than this with its values."""
-WARM_UP = 8  # rounds in which the rates rise, so that a scene that is nearly right moves little
 ENOUGH = 1e-3
 """Mean squared error (30 dB) at which fitting ends, because more of it makes the sides of a scene worse."""
 SMALLEST = 1e-4  # opacity's distance from 0 and 1
 ONLY_FALLING = ("opacities", "scales")
 """What fitting does not raise: a Gaussian that grows hides, from other sides, what lies behind it."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Pace of a fit.
+
+    Attributes:
+        warm_up: rounds in which the rates rise, so that a scene that is nearly right moves little.
+        rates: Adam's rates, by name: sRGB units, logits of opacities, logarithms of scales.
+    """
+
+    warm_up: int = 8
+    rates: Mapping[str, float] = field(default_factory=lambda: RATES)
+
+
+DEFAULT_PACE = Pace()
 
 
 def fit_front(
@@ -32,6 +47,7 @@ def fit_front(
     rounds: int,
     background: float,
     visible: Float[Tensor, "batch 1 height width"] | None = None,
+    pace: Pace = DEFAULT_PACE,
 ) -> Gaussians:
     """Fit colours, opacities and scales of Gaussians [batch], so that each set looks like its image from its camera.
 
@@ -66,12 +82,13 @@ def fit_front(
                 break
             grads = torch.autograd.grad(error, moves)
             # torch.optim's Adam is the same, but its first step imports torch's compiler, which takes a second.
-            factor = min(1, number / WARM_UP) * (1 + math.cos(math.pi * (number - 1) / rounds)) / 2
-            for name, move, mean, square, grad in zip(RATES, moves, means, squares, grads, strict=True):
+            factor = min(1, number / pace.warm_up) * (1 + math.cos(math.pi * (number - 1) / rounds)) / 2
+            steps = zip(pace.rates.items(), moves, means, squares, grads, strict=True)
+            for (name, rate), move, mean, square, grad in steps:
                 mean.lerp_(grad, 1 - BETAS[0])
                 square.lerp_(grad.square(), 1 - BETAS[1])
                 deviation = (square / (1 - BETAS[1] ** number)).sqrt() + DAMPING
-                move.data -= RATES[name] * factor * mean / (1 - BETAS[0] ** number) / deviation
+                move.data -= rate * factor * mean / (1 - BETAS[0] ** number) / deviation
                 if name in ONLY_FALLING:
                     move.data.clamp_(max=0)
     return best

@@ -9,7 +9,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, NotRequired, TypedDict
 
 from completesplat.errors import CompleteSplatError
-from completesplat.quantities import CameraPath, Entries, Format, NonNegative, Positive, Range, Seed, Share
+from completesplat.quantities import CameraPath, Detail, Entries, Format, NonNegative, Positive, Range, Seed, Share
 
 NOT_A_LIST = "must be a list"
 NUMBERS: Mapping[type, type] = {int: Integral, float: Real}  # which include NumPy's numbers
@@ -60,6 +60,7 @@ class SceneSettings(TypedDict):
     trust: bool
     guidance_weight: Share
     color_fits: Annotated[int, Range(0, 100)]
+    detail: Detail
     steps: Annotated[int, Range(1, 1000)] | None
     fov: float | None
     frames: Annotated[int, Range(1, 1000)]

@@ -101,8 +101,10 @@ class Drawing:
         self.progress = completion.controls.progress
         self.name = name
         self.settings = settings
-        self.layers = completion.model.parameterization.layers
-        self.reference = completion.model.camera(photograph).to("cpu")
+        model = completion.model
+        self.layers = model.parameterization.layers
+        self.forming = model.camera(photograph).to("cpu")
+        self.reference = model.camera(photograph, model.front_size(photograph, settings["detail"])).to("cpu")
         self.earlier: list[Sample] = []
         if completion.controls.keep.value:
             self.earlier = [sample for sample in self.page.view.samples if sample.finished]
@@ -110,10 +112,13 @@ class Drawing:
 
     def arranged(self, scenes: Sequence[Gaussians], finished: bool) -> list[Sample]:
         """Return the earlier samples and then the new ones, without the first ones if there are too many."""
+        reference = self.reference if finished else self.forming
+        split = reference.image_size != self.forming.image_size  # so that its Gaussians are not ordered by layer
+        layers = 1 if split else self.layers
         new = []
         for i, scene in enumerate(scenes):
             settings = {**self.settings, "image": self.name, "sample": i}
-            new.append(Sample(scene.to("cpu"), self.layers, self.reference, settings, finished, exact=True))
+            new.append(Sample(scene.to("cpu"), layers, reference, settings, finished, exact=True))
         return [*self.earlier, *new][-MOST_SAMPLES:]
 
     def show_estimate(self, step: int, level: int, estimate: Gaussians) -> None:

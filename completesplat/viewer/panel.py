@@ -23,7 +23,15 @@ from completesplat.viewer.sample import MOST_LAYERS
 MOST_SAMPLES = 8
 MOST_STEPS = 100
 MOST_SEED = 99
-SLIDERS = ("samples", "skip_weight", "guidance_weight", "color_fits", "steps", "seed")  # settings of `CompleteSplat`
+SLIDERS = (
+    "samples",
+    "skip_weight",
+    "guidance_weight",
+    "color_fits",
+    "detail",
+    "steps",
+    "seed",
+)  # settings of `CompleteSplat`
 SIDE_BY_SIDE = "all, side by side"
 CUT_OUT = (
     "of the next images: only the object, on the weights' background (needs completesplat[background] or [grabcut])"
@@ -61,6 +69,7 @@ def add_completion_controls(gui: viser.GuiApi, model: SceneModel, start: dict[st
         diverse = "more: more diverse"
         slider = cast(Any, partial(gui.add_slider, visible=draws))
         fits = start["color_fits"]
+        detail = start["detail"]
         return SimpleNamespace(
             preview=preview,
             remove_background=remove,
@@ -68,6 +77,7 @@ def add_completion_controls(gui: viser.GuiApi, model: SceneModel, start: dict[st
             skip_weight=slider("Skip weight", 0.0, 1.0, 0.05, start["skip_weight"], hint=free),
             guidance_weight=slider("Guidance", 0.0, 1.0, 0.05, start["guidance_weight"], hint=diverse),
             color_fits=slider("Fits", 0, max(50, fits), 1, fits, hint="rounds of fitting to the image"),
+            detail=slider("Detail", 0, max(1024, detail), 1, detail, hint="pixels of the photo that the front shows"),
             steps=slider("Steps", 1, most_steps, 1, first_steps, hint="denoising steps"),
             seed=slider("Seed", 0, max(MOST_SEED, start["seed"]), 1, start["seed"]),
             live=gui.add_checkbox("Draw when a slider moves", True, visible=draws),
