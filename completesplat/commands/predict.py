@@ -13,10 +13,7 @@ from typing import Any
 import numba.np.arraymath  # else the first kernel imports it, and scipy with it  # noqa: F401
 import torch
 from hydra.utils import instantiate
-from jaxtyping import Float
 from omegaconf import DictConfig
-from torch import Tensor
-from torch.nn import functional
 
 from completesplat.commands.inputs import find_images, left_out
 from completesplat.commands.trained import open_generator, shown_background
@@ -165,7 +162,7 @@ def predict_photo(
     remove = config.background == REMOVE
     if remove:
         begin("removing the background", advance=0)
-    photograph = model.read(image, config.fov, remove, config.mask, config.box)
+    photograph = model.read(image, config.fov, remove, config.mask, config.box, config.crop)
     settings = generation_settings(config, model, photograph)
     begin(f"drawing {config.samples} sample{'s' if config.samples > 1 else ''}", advance=0)
     size = model.front_size(photograph, config.detail)
@@ -175,9 +172,8 @@ def predict_photo(
 
     scenes = model(photograph, batch=config.batch, on_fit=on_fit, **settings)
     samples = placed_samples(scenes, model, photograph, size)
-    shown = shown_photo(photograph, size)
     recorded = {**settings, **facts_of_photo(config, model, image, photograph)}
-    write_prediction(folder, shown, samples, rasterizer, outputs, recorded, begin)
+    write_prediction(folder, photograph.shown_at(size), samples, rasterizer, outputs, recorded, begin)
 
 
 def generation_settings(config: DictConfig, model: SceneModel, photograph: Photograph) -> dict[str, Any]:
@@ -194,14 +190,6 @@ def generation_settings(config: DictConfig, model: SceneModel, photograph: Photo
         settings["steps"] = model.sampler.steps if config.steps is None else config.steps
         settings["bfloat16"] = has_bfloat16(model.up.device.type)
     return settings
-
-
-def shown_photo(photograph: Photograph, size: int) -> Float[Tensor, "3 _ _"]:
-    """Return a photo at a size, black where it is hidden."""
-    image = photograph.square_at(size)
-    if photograph.visible is None:
-        return image
-    return image * functional.interpolate(photograph.visible[None], (size, size), mode="nearest")[0]
 
 
 def placed_samples(
@@ -226,6 +214,8 @@ def facts_of_photo(config: DictConfig, model: SceneModel, image: Path, photograp
     facts["screen_space_dilation"] = config.screen_space_dilation
     facts["mask"] = None if config.mask is None else printable(Path(config.mask).name)
     facts["box"] = None if config.box is None else list(config.box)
+    facts["crop"] = config.crop if isinstance(config.crop, str) else list(config.crop)
+    facts["photo_part"] = list(photograph.part)
     facts["fov_degrees"] = photograph.fov_degrees
     facts["fov_source"] = photograph.fov_source
     facts["depth_range"] = model.depth_range_of(photograph).tolist()
@@ -266,7 +256,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], outputs: Outp
     """Write the files of one scene that all images show, into a folder with the name of the first image.
 
     Raises:
-        CompleteSplatError: one image alone, or a mask, box, field of view or removed background besides the cameras.
+        CompleteSplatError: one image alone, or a mask, box, crop, field of view or removed background with the cameras.
         DataError, WeightsError: as `read_photographs`, `CompleteSplat.reconstruct`.
     """
     from completesplat.data.captures.transforms_json import read_photographs
@@ -276,6 +266,8 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], outputs: Outp
     others = [name for name in ("mask", "box", "fov") if config[name] is not None]
     if config.background == REMOVE:
         others.append("background=remove")
+    if config.crop != "whole":
+        others.append("crop")
     if others:
         raise CompleteSplatError(f"{others[0]} does not go with cameras=FILE")
     model = open_generator(config, images)
