@@ -362,6 +362,7 @@ class SceneModel(nn.Module):
         crop: Crop = "whole",
     ) -> Photograph:
         """Read an image at the model's size by `read_photograph`, which explains the arguments."""
+        check_value("crop", Crop, crop)
         return read_photograph(image, self.framing, fov_degrees, remove_background, mask, box, crop)
 
     def camera(self, photograph: Photograph, size: int | None = None) -> Cameras:

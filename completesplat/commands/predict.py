@@ -13,7 +13,9 @@ from typing import Any
 import numba.np.arraymath  # else the first kernel imports it, and scipy with it  # noqa: F401
 import torch
 from hydra.utils import instantiate
+from jaxtyping import Float
 from omegaconf import DictConfig
+from torch import Tensor
 
 from completesplat.commands.inputs import find_images, left_out
 from completesplat.commands.trained import open_generator, shown_background
@@ -23,7 +25,7 @@ from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.description import finished_digest, made_from
 from completesplat.export.formats import CONVERTED, FORMATS
-from completesplat.export.placed_scene import PlacedScene, on_optical_axis
+from completesplat.export.placed_scene import PlacedScene
 from completesplat.export.prediction import write_prediction
 from completesplat.export.progress import PhotoProgress
 from completesplat.export.scene_files import OutputFiles
@@ -42,6 +44,7 @@ from completesplat.wording import counted, folder_names, printable, safe_name
 logger = logging.getLogger(__name__)
 
 OF_RUNS = ("image", "out", "shard", "shards", "devices")  # settings on which no single prediction depends
+OF_OBJECT = 0.1  # difference of a channel from the background of weights, from which a pixel is the object's
 sha256_of_weights = cache(sha256_of)  # a process has one model, of up to gigabytes
 
 
@@ -197,10 +200,19 @@ def placed_samples(
 ) -> list[PlacedScene]:
     """Return a photo's scenes with its camera, whose images have this size, on the CPU."""
     camera = model.camera(photograph, size).to("cpu")
-    pivot = None
+    mask = object_mask(photograph, model.background)
+    depth = None
     if model.background is not None:  # images of objects, whose centre is in the middle of the depth range
-        pivot = on_optical_axis(camera, model.middle_depth(model.depth_range_of(photograph)))
-    return [PlacedScene(scene.to("cpu"), camera, model.up.cpu(), pivot) for scene in scenes]
+        depth = model.middle_depth(model.depth_range_of(photograph))
+    return [PlacedScene(scene.to("cpu"), camera, model.up.cpu(), mask=mask, depth=depth) for scene in scenes]
+
+
+def object_mask(photograph: Photograph, background: float | None) -> Float[Tensor, "1 size size"] | None:
+    """Return where the object of a photo is: what was cut out, or what differs from the background of the weights."""
+    if photograph.cut_out is not None or background is None:
+        return photograph.cut_out
+    different = (photograph.image - background).abs().amax(0, keepdim=True) > OF_OBJECT
+    return different.float()
 
 
 def facts_of_photo(config: DictConfig, model: SceneModel, image: Path, photograph: Photograph) -> dict[str, Any]:

@@ -75,15 +75,16 @@ def window_of(size: tuple[int, int], crop: Crop) -> Window:
     if crop == "whole":
         return central_window(size, min(max(size), MOST_ASPECT * shorter))
     x, y, share = (float(value) for value in crop)
-    side = round(share * shorter)
-    right = round(x * size[0] + side)
-    lower = round(y * size[1] + side)
-    if not (x >= 0 and y >= 0 and right <= size[0] and lower <= size[1] and side >= SMALLEST_SIDE):
+    side = share * shorter
+    right = x * size[0] + side
+    lower = y * size[1] + side
+    if not (x >= 0 and y >= 0 and right < size[0] + 0.5 and lower < size[1] + 0.5 and side >= SMALLEST_SIDE):
         raise CompleteSplatError(
             f"crop={list(crop)}: give [x,y,size], in shares of width, height and shorter side, of a square within the"
             f" photo, of {SMALLEST_SIDE} pixels or more"
         )
-    return right - side, lower - side, right, lower
+    ends = min(round(right), size[0]), min(round(lower), size[1])
+    return ends[0] - round(side), ends[1] - round(side), *ends
 
 
 def part_within(window: Window, size: tuple[int, int]) -> Window:

@@ -56,7 +56,7 @@ class Photograph(TensorDataclass):
         photo_size: width and height of the whole photo, upright, in pixels.
         square: the same square with the photo's own pixels (`square_at`): RGB in sRGB, or grey floats from 0 to 1.
         window: the square in the photo's pixels; it may extend beyond the photo.
-        part: the photo's part of the square (left, top, right and bottom in shares of its side), around which its border
+        part: the photo's part of the square (left, top, right, bottom in shares of its side), around which its border
             is continued. `ALL` for a cut-out object, which lies on the background of the weights.
         axis: where the optical axis meets the square, from the left and from the top, in shares of its side.
         cut_out: opacity of the object in the square, if the rest is transparent or was removed.
@@ -234,7 +234,7 @@ def _opacity(image: Image.Image, window: Window, size: int) -> Float[Tensor, "1 
 def _field_of_view(
     given: float | None, exif: Tags, size: tuple[int, int], framing: Framing
 ) -> tuple[float, Literal["given", "exif", "default"]]:
-    """Return the field of view in degrees across the photo's longer side, or the default of a square, and its source."""
+    """Return the field of view in degrees across the photo's longer side, or a square's default, and its source."""
     if given is not None:
         return float(given), "given"
     recorded = photo_fov(exif, size) if framing.reads_exif else None

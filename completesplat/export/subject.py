@@ -1,0 +1,139 @@
+"""The object that a photo is of: its place and size in a scene, and the camera that sees it from all around."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from completesplat.export.placed_scene import PlacedScene
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, crop_resize, pixel_centers, rays_through, transform_points
+from completesplat.rasterizers import Rasterizer
+from completesplat.tensors import TensorDataclass
+
+SIDE = 48  # pixels of the image in which an object is sought
+WIDTH = 0.25  # standard deviation of the kernel, in halves of the image's width at its place
+REACH = 3.0  # standard deviations of the kernel within which what is seen is taken for the object
+NEARNESS = 2  # exponent of 1 / depth in the weights
+ROUNDS = 10  # of the mean shift
+ALMOST_ALL = 0.98  # share of an object's pixels that its radius holds
+HIDDEN_DEPTH = 0.5  # of the half size of an object's front: how far its middle lies behind the front
+MARGIN = 1.05  # of the distance at which an object just fits into the frame
+
+
+@dataclass(frozen=True)
+class Subject(TensorDataclass):
+    """Middle of an object in the world, and the radius of a ball around it that holds the object."""
+
+    center: Float[Tensor, "3"]
+    radius: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Front(TensorDataclass):
+    """What a camera sees of a scene at some pixels, in the frame of the camera."""
+
+    rays: Float[Tensor, "pixel 3"]
+    points: Float[Tensor, "pixel 3"]
+    opacity: Float[Tensor, " pixel"]
+
+
+def subject_of(scene: PlacedScene, rasterizer: Rasterizer) -> Subject:
+    """Return what orbits of a scene turn around: the known pivot, or the object in its camera's image.
+
+    The object is where the scene's mask is. Without one, it is at the mode of the points that the camera sees, weighted
+    by opacity and nearness.
+    """
+    if scene.pivot is not None:
+        return Subject(scene.pivot)
+    height, width = scene.camera.image_size
+    side = max(height, width)
+    camera = crop_resize(scene.camera, (width - side) / 2, (height - side) / 2, side, SIDE)
+    front = _front(scene.gaussians, camera, rasterizer)
+    if len(front.points) == 0:
+        return Subject(_on_axis(scene))
+    half_width = SIDE / (2 * camera.intrinsics[0, 0].item())  # at a depth of 1
+    inside = _in_mask(scene, front, camera)
+    if inside is None or not inside.any():
+        middle = _mode(front, half_width)
+        depth = middle[2].item()
+        ray = middle / depth
+        inside = (front.points - middle).norm(dim=-1) < REACH * WIDTH * half_width * depth
+        points = front.points[inside]
+        half_size = _radius(points, middle)
+    else:
+        rays = front.rays[inside]
+        ray = (rays.amin(0) + rays.amax(0)) / 2
+        depths = front.points[inside, 2]
+        depth = depths.median().item()
+        half_size = (rays.amax(0) - rays.amin(0)).max().item() / 2 * depth
+        # At the outline of the object, depths are partly of what lies behind it.
+        points = rays * depths.clamp(depth - half_size, depth + half_size)[:, None]
+    center = ray * (depth + HIDDEN_DEPTH * half_size if scene.depth is None else scene.depth)
+    radius = max(half_size, _radius(points, center))
+    return Subject(transform_points(scene.camera.camera_to_world, center[None])[0], radius)
+
+
+def all_around(camera: Cameras, subject: Subject) -> Cameras:
+    """Return a camera in the direction of an unbatched one, from which an object stays in the frame all around.
+
+    It is no nearer to the object, and its optical axis meets the middle of the image.
+    """
+    height, width = camera.image_size
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[:2, 2] = intrinsics.new_tensor([width / 2, height / 2])
+    half_angles = (math.atan(size / (2 * intrinsics[axis, axis].item())) for axis, size in enumerate((width, height)))
+    needed = MARGIN * subject.radius / math.sin(min(half_angles))
+    arm = camera.centers - subject.center
+    eye = subject.center + arm * max(1.0, needed / max(arm.norm().item(), 1e-9))
+    moved = camera.world_to_camera.clone()
+    moved[:3, 3] = -moved[:3, :3] @ eye
+    return Cameras(moved, intrinsics, camera.image_size)
+
+
+@torch.no_grad()
+def _front(gaussians: Gaussians, camera: Cameras, rasterizer: Rasterizer) -> _Front:
+    """Return what a camera sees at all pixels that are more than half opaque."""
+    rendering = rasterizer(gaussians[None], camera[None][None])[0, 0]
+    depth = rendering.surface_depth()[0].flatten()
+    rays = rays_through(camera.intrinsics, pixel_centers(SIDE, SIDE).to(depth).flatten(0, 1))
+    seen = depth > 0
+    return _Front(rays[seen], rays[seen] * depth[seen, None], rendering.alpha[0].flatten()[seen])
+
+
+def _in_mask(scene: PlacedScene, front: _Front, camera: Cameras) -> Bool[Tensor, " pixel"] | None:
+    """Return which pixels show the object by the scene's mask, or None without a mask."""
+    if scene.mask is None:
+        return None
+    mask = functional.interpolate(scene.mask[None], (SIDE, SIDE), mode="area")[0, 0]
+    pixels = front.rays @ camera.intrinsics.T
+    columns, rows = pixels[:, :2].floor().long().clamp(0, SIDE - 1).unbind(-1)
+    return mask[rows, columns] > 0.5
+
+
+def _mode(front: _Front, half_width: float) -> Float[Tensor, "3"]:
+    """Return the point around which most is seen, by mean shift from the densest pixel."""
+    weights = front.opacity * front.points[:, 2] ** -NEARNESS
+    width = WIDTH * half_width * front.points[:, 2]
+    kernel = torch.exp(-(torch.cdist(front.points, front.points) / width[:, None]).square() / 2)
+    best = (kernel @ weights).argmax()
+    middle = front.points[best]
+    for _ in range(ROUNDS):
+        near = weights * torch.exp(-((front.points - middle).norm(dim=-1) / width[best]).square() / 2)
+        middle = (near[:, None] * front.points).sum(0) / near.sum()
+    return middle
+
+
+def _radius(points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> float:
+    """Return the radius of the ball around a centre that holds almost all points."""
+    return torch.quantile((points - center).norm(dim=-1), ALMOST_ALL).item()
+
+
+def _on_axis(scene: PlacedScene) -> Float[Tensor, "3"]:
+    """Return the point on the optical axis at the known depth, or at the median depth of all Gaussians."""
+    depths = transform_points(scene.camera.world_to_camera, scene.gaussians.means)[:, 2]
+    axis = scene.camera.camera_to_world[:3, 2]
+    return scene.camera.centers + axis * (depths.median().item() if scene.depth is None else scene.depth)
