@@ -204,7 +204,8 @@ def placed_samples(
     depth = None
     if model.background is not None:  # images of objects, whose centre is in the middle of the depth range
         depth = model.middle_depth(model.depth_range_of(photograph))
-    return [PlacedScene(scene.to("cpu"), camera, model.up.cpu(), mask=mask, depth=depth) for scene in scenes]
+    own = photograph.own_at(model.image_size)
+    return [PlacedScene(scene.to("cpu"), camera, model.up.cpu(), None, mask, own, depth) for scene in scenes]
 
 
 def object_mask(photograph: Photograph, background: float | None) -> Float[Tensor, "1 size size"] | None:

@@ -54,6 +54,7 @@ class PlacedScene:
         up: direction up in the world, the axis of orbits.
         pivot: point in the world around which orbits turn, if it is known.
         mask: where the object is in the camera's image (`subject_of`), if that is known.
+        own: where the camera's image is the photo's own, if its border is continued.
         depth: depth of the object's middle, if it is known.
         coordinates: those of the scene's files.
     """
@@ -63,5 +64,6 @@ class PlacedScene:
     up: Float[Tensor, "3"] = field(default_factory=lambda: torch.tensor([0.0, -1.0, 0.0]))
     pivot: Float[Tensor, "3"] | None = None
     mask: Float[Tensor, "1 _ _"] | None = None
+    own: Float[Tensor, "1 _ _"] | None = None
     depth: float | None = None
     coordinates: FileCoordinates = FileCoordinates()

@@ -16,7 +16,7 @@ from completesplat.tensors import TensorDataclass
 
 SIDE = 48  # pixels of the image in which an object is sought
 WIDTH = 0.25  # standard deviation of the kernel, in halves of the image's width at its place
-REACH = 3.0  # standard deviations of the kernel within which what is seen is taken for the object
+REACH = 4.0  # standard deviations of the kernel within which what is seen may be the object's
 NEARNESS = 2  # exponent of 1 / depth in the weights
 ROUNDS = 10  # of the mean shift
 ALMOST_ALL = 0.98  # share of an object's pixels that its radius holds
@@ -44,8 +44,8 @@ class _Front(TensorDataclass):
 def subject_of(scene: PlacedScene, rasterizer: Rasterizer) -> Subject:
     """Return what orbits of a scene turn around: the known pivot, or the object in its camera's image.
 
-    The object is where the scene's mask is. Without one, it is at the mode of the points that the camera sees, weighted
-    by opacity and nearness.
+    The object is where the scene's mask is. Without one, it is what lies around the mode of the points that the camera
+    sees, weighted by opacity and nearness, and not on the other side of the gap between near and far.
     """
     if scene.pivot is not None:
         return Subject(scene.pivot)
@@ -53,25 +53,22 @@ def subject_of(scene: PlacedScene, rasterizer: Rasterizer) -> Subject:
     side = max(height, width)
     camera = crop_resize(scene.camera, (width - side) / 2, (height - side) / 2, side, SIDE)
     front = _front(scene.gaussians, camera, rasterizer)
+    if scene.own is not None:
+        own = _within(scene.own, front, camera)
+        front = front.map(lambda values: values[own])
     if len(front.points) == 0:
         return Subject(_on_axis(scene))
     half_width = SIDE / (2 * camera.intrinsics[0, 0].item())  # at a depth of 1
-    inside = _in_mask(scene, front, camera)
+    inside = None if scene.mask is None else _within(scene.mask, front, camera)
     if inside is None or not inside.any():
-        middle = _mode(front, half_width)
-        depth = middle[2].item()
-        ray = middle / depth
-        inside = (front.points - middle).norm(dim=-1) < REACH * WIDTH * half_width * depth
-        points = front.points[inside]
-        half_size = _radius(points, middle)
-    else:
-        rays = front.rays[inside]
-        ray = (rays.amin(0) + rays.amax(0)) / 2
-        depths = front.points[inside, 2]
-        depth = depths.median().item()
-        half_size = (rays.amax(0) - rays.amin(0)).max().item() / 2 * depth
-        # At the outline of the object, depths are partly of what lies behind it.
-        points = rays * depths.clamp(depth - half_size, depth + half_size)[:, None]
+        inside = _around_mode(front, half_width)
+    rays = front.rays[inside]
+    ray = (rays.amin(0) + rays.amax(0)) / 2
+    depths = front.points[inside, 2]
+    depth = depths.median().item()
+    half_size = (rays.amax(0) - rays.amin(0)).max().item() / 2 * depth
+    # At the outline of the object, depths are partly of what lies behind it.
+    points = rays * depths.clamp(depth - half_size, depth + half_size)[:, None]
     center = ray * (depth + HIDDEN_DEPTH * half_size if scene.depth is None else scene.depth)
     radius = max(half_size, _radius(points, center))
     return Subject(transform_points(scene.camera.camera_to_world, center[None])[0], radius)
@@ -104,27 +101,41 @@ def _front(gaussians: Gaussians, camera: Cameras, rasterizer: Rasterizer) -> _Fr
     return _Front(rays[seen], rays[seen] * depth[seen, None], rendering.alpha[0].flatten()[seen])
 
 
-def _in_mask(scene: PlacedScene, front: _Front, camera: Cameras) -> Bool[Tensor, " pixel"] | None:
-    """Return which pixels show the object by the scene's mask, or None without a mask."""
-    if scene.mask is None:
-        return None
-    mask = functional.interpolate(scene.mask[None], (SIDE, SIDE), mode="area")[0, 0]
-    pixels = front.rays @ camera.intrinsics.T
-    columns, rows = pixels[:, :2].floor().long().clamp(0, SIDE - 1).unbind(-1)
-    return mask[rows, columns] > 0.5
+def _within(mask: Float[Tensor, "1 _ _"], front: _Front, camera: Cameras) -> Bool[Tensor, " pixel"]:
+    """Return which pixels lie where a mask of the camera's image is not 0."""
+    small = functional.interpolate(mask[None], (SIDE, SIDE), mode="area")[0, 0]
+    columns, rows = (front.rays @ camera.intrinsics.T)[:, :2].floor().long().clamp(0, SIDE - 1).unbind(-1)
+    return small[rows, columns] > 0.5
 
 
-def _mode(front: _Front, half_width: float) -> Float[Tensor, "3"]:
-    """Return the point around which most is seen, by mean shift from the densest pixel."""
-    weights = front.opacity * front.points[:, 2] ** -NEARNESS
-    width = WIDTH * half_width * front.points[:, 2]
-    kernel = torch.exp(-(torch.cdist(front.points, front.points) / width[:, None]).square() / 2)
+def _around_mode(front: _Front, half_width: float) -> Bool[Tensor, " pixel"]:
+    """Return which pixels show what lies around the mode, which is found by mean shift from the densest pixel."""
+    depths = front.points[:, 2]
+    weights = front.opacity * depths**-NEARNESS
+    widths = WIDTH * half_width * depths
+    kernel = torch.exp(-(torch.cdist(front.points, front.points) / widths[:, None]).square() / 2)
     best = (kernel @ weights).argmax()
-    middle = front.points[best]
+    mode = front.points[best]
     for _ in range(ROUNDS):
-        near = weights * torch.exp(-((front.points - middle).norm(dim=-1) / width[best]).square() / 2)
-        middle = (near[:, None] * front.points).sum(0) / near.sum()
-    return middle
+        near = weights * torch.exp(-((front.points - mode).norm(dim=-1) / widths[best]).square() / 2)
+        mode = (near[:, None] * front.points).sum(0) / near.sum()
+    gap = _gap(depths)
+    close = (front.points - mode).norm(dim=-1) < REACH * widths[best]
+    alike = close & ((depths < gap) == (mode[2] < gap))
+    return alike if alike.any() else close
+
+
+def _gap(depths: Float[Tensor, " pixel"]) -> Float[Tensor, ""]:
+    """Return the depth that parts near from far: the one with the largest variance of 1 / depth between both (Otsu)."""
+    ordered = (1 / depths).sort().values
+    count = len(ordered)
+    if count < 2:
+        return depths.new_tensor(math.inf)
+    below = torch.arange(1, count, device=depths.device)
+    sums = ordered.cumsum(0)[:-1]
+    apart = sums / below - (ordered.sum() - sums) / (count - below)
+    place = (below * (count - below) * apart.square()).argmax()
+    return 2 / (ordered[place] + ordered[place + 1])
 
 
 def _radius(points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> float:
