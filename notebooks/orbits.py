@@ -44,7 +44,7 @@ def off_center(folder, number):
 
 
 def inner_part(mask, photograph):
-    """Return a mask of a photo as its square has it, without the outline, where depths are partly of what lies behind."""
+    """Return a mask of a photo in its square without its outline, where depths are partly of what lies behind."""
     size = photograph.image.shape[-1]
     square = continued(Image.fromarray(mask), photograph.window).resize((size, size), Image.Resampling.BOX)
     outside = 1 - torch.from_numpy(np.array(square)).float()[None] / 255
