@@ -48,7 +48,7 @@ def inner_part(mask, photograph):
     size = photograph.image.shape[-1]
     square = continued(Image.fromarray(mask), photograph.window).resize((size, size), Image.Resampling.BOX)
     outside = 1 - torch.from_numpy(np.array(square)).float()[None] / 255
-    return 1 - functional.max_pool2d(outside, 5, stride=1, padding=2)[0]
+    return 1 - functional.max_pool2d(outside, 3, stride=1, padding=1)[0]
 
 
 def box_of(scene, camera, mask):
@@ -71,6 +71,9 @@ def main():
         image, mask = off_center(folder, number)
         photograph = model.read(image)
         seen = inner_part(mask, photograph)
+        if not (seen > 0.5).any():
+            print(f"{folder.name}: too thin")
+            continue
         camera = model.camera(photograph)
         scene = model(photograph, color_fits=20, detail=model.image_size)[0]
         placed = PlacedScene(scene, camera, model.up, own=photograph.own_at(model.image_size))

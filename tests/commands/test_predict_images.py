@@ -17,13 +17,13 @@ from support import compose_config, some_gaussians, strict_json
 
 from completesplat.commands import trained
 from completesplat.commands.inputs import find_images
-from completesplat.commands.predict import output_files, run
+from completesplat.commands.predict import object_mask, output_files, run
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import FORMATS
 from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.generator import CompleteSplat
-from completesplat.photo.reading import Photograph
+from completesplat.photo.reading import Framing, Photograph, read_square
 
 QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
 
@@ -296,6 +296,21 @@ def test_a_field_of_view_is_of_the_whole_photo_also_if_an_object_needs_a_larger_
     for settings in (["fov=50"], ["fov=50", "box=[0,0,0.5,0.5]"]):
         predict.succeeds(tmp_path / "a.png", *settings)
         assert strict_json(tmp_path / "out/a/scene.json")["settings"]["fov_degrees"] == pytest.approx(50)
+
+
+def test_the_object_is_what_was_cut_out_or_differs_from_the_background_of_the_weights():
+    image = Image.new("RGBA", (16, 16), "white")
+    image.paste("blue", (2, 4, 6, 10))
+    on_white = read_square(image, Framing(16))
+    assert object_mask(on_white, None) is None
+    expected = torch.zeros(1, 16, 16)
+    expected[:, 4:10, 2:6] = 1
+    assert torch.equal(object_mask(on_white, 1.0), expected)
+    image.paste((0, 0, 0, 0), (8, 0, 16, 16))
+    expected[:] = 1
+    expected[..., 8:] = 0
+    for background in (None, 1.0):
+        assert torch.equal(object_mask(read_square(image, Framing(16)), background), expected)
 
 
 def test_what_is_taken_of_a_photo_is_said_recorded_and_shown(predict, tmp_path):
