@@ -18,6 +18,7 @@ SIDE = 48  # pixels of the image in which an object is sought
 WIDTH = 0.25  # standard deviation of the kernel, in halves of the image's width at its place
 REACH = 4.0  # standard deviations of the kernel within which what is seen may be the object's
 NEARNESS = 2  # exponent of 1 / depth in the weights
+STANDING_OUT = 6  # exponent of the median depth of a pixel's row over its own: a floor's is 1, an object's is larger
 ROUNDS = 10  # of the mean shift
 ALMOST_ALL = 0.98  # share of an object's pixels that its radius holds
 HIDDEN_DEPTH = 0.5  # of the half size of an object's front: how far its middle lies behind the front
@@ -37,15 +38,16 @@ class _Front(TensorDataclass):
     """What a camera sees of a scene at some pixels, in the frame of the camera."""
 
     rays: Float[Tensor, "pixel 3"]
+    weights: Float[Tensor, " pixel"]
     points: Float[Tensor, "pixel 3"]
-    opacity: Float[Tensor, " pixel"]
 
 
 def subject_of(scene: PlacedScene, rasterizer: Rasterizer) -> Subject:
     """Return what orbits of a scene turn around: the known pivot, or the object in its camera's image.
 
     The object is where the scene's mask is. Without one, it is what lies around the mode of the points that the camera
-    sees, weighted by opacity and nearness, and not on the other side of the gap between near and far.
+    sees, weighted by opacity, by nearness and by how much nearer they are than others in their row of pixels. It ends
+    at the gap between near and far.
     """
     if scene.pivot is not None:
         return Subject(scene.pivot)
@@ -95,10 +97,13 @@ def all_around(camera: Cameras, subject: Subject) -> Cameras:
 def _front(gaussians: Gaussians, camera: Cameras, rasterizer: Rasterizer) -> _Front:
     """Return what a camera sees at all pixels that are more than half opaque."""
     rendering = rasterizer(gaussians[None], camera[None][None])[0, 0]
-    depth = rendering.surface_depth()[0].flatten()
+    rows = rendering.surface_depth()[0]
+    typical = torch.where(rows > 0, rows, torch.nan).nanmedian(dim=1, keepdim=True).values
+    weights = rendering.alpha[0] * (typical / rows) ** STANDING_OUT * rows**-NEARNESS
+    depth = rows.flatten()
     rays = rays_through(camera.intrinsics, pixel_centers(SIDE, SIDE).to(depth).flatten(0, 1))
     seen = depth > 0
-    return _Front(rays[seen], rays[seen] * depth[seen, None], rendering.alpha[0].flatten()[seen])
+    return _Front(rays[seen], weights.flatten()[seen], rays[seen] * depth[seen, None])
 
 
 def _within(mask: Float[Tensor, "1 _ _"], front: _Front, camera: Cameras) -> Bool[Tensor, " pixel"]:
@@ -111,13 +116,12 @@ def _within(mask: Float[Tensor, "1 _ _"], front: _Front, camera: Cameras) -> Boo
 def _around_mode(front: _Front, half_width: float) -> Bool[Tensor, " pixel"]:
     """Return which pixels show what lies around the mode, which is found by mean shift from the densest pixel."""
     depths = front.points[:, 2]
-    weights = front.opacity * depths**-NEARNESS
     widths = WIDTH * half_width * depths
     kernel = torch.exp(-(torch.cdist(front.points, front.points) / widths[:, None]).square() / 2)
-    best = (kernel @ weights).argmax()
+    best = (kernel @ front.weights).argmax()
     mode = front.points[best]
     for _ in range(ROUNDS):
-        near = weights * torch.exp(-((front.points - mode).norm(dim=-1) / widths[best]).square() / 2)
+        near = front.weights * torch.exp(-((front.points - mode).norm(dim=-1) / widths[best]).square() / 2)
         mode = (near[:, None] * front.points).sum(0) / near.sum()
     gap = _gap(depths)
     close = (front.points - mode).norm(dim=-1) < REACH * widths[best]
