@@ -34,7 +34,7 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.photo.choice import likeliest_for
 from completesplat.photo.reading import SMALLEST_SIDE, Framing, ImageLike, read_square
 from completesplat.scene import Views
-from completesplat.scene_model import DEFAULT_SAMPLING, OnScenes, Sampling, SceneModel, Visible
+from completesplat.scene_model import DEFAULT_SAMPLING, OnScenes, Sampling, SceneModel, Visible, both
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import concatenate, in_float32
 from completesplat.weights import first_line
@@ -126,12 +126,14 @@ class CompleteSplat(SceneModel):
         depth_range: DepthRange,
         sampling: Sampling = DEFAULT_SAMPLING,
         visible: Visible | None = None,
+        own: Visible | None = None,
         on_step: OnScenes | None = None,
     ) -> Gaussians:
         """Draw Gaussians [batch * samples]: the scenes of one image next to each other, in the frame of its camera.
 
         Args:
             visible: 0 where an image is hidden; hidden pixels have no influence.
+            own: 0 where an image continues its photo's border, which scenes are not fitted to.
             on_step: called after each denoiser call of each part with its number, the timestep, the estimated scenes.
 
         Raises:
@@ -143,7 +145,7 @@ class CompleteSplat(SceneModel):
         with one_thread_each(self.denoiser, images.device) as threads:
             drawing = _Drawing(self, images, cameras, depth_range, sampling, skip_weight, on_step)
             scenes = drawing.scenes(threads)
-        return self.fitted(scenes, images, cameras, visible, sampling.color_fits)
+        return self.fitted(scenes, images, cameras, both(visible, own), sampling.color_fits)
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Use another sampler from now on, with the noise schedule and prediction type of training.

@@ -41,4 +41,6 @@ Few = Annotated[int, Range(1, 16)]
 
 Format = Literal["ply", "compressed.ply", "splat", "spz", "glb", "usdz", "mesh", "sog", "html"]  # of a scene's files
 SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")  # files of Gaussians that are read
+# Part of a photo: all of it, the square in its middle, or [x, y, size] in shares of its width, height and shorter side.
+Crop = Literal["whole", "center"] | Annotated[Sequence[float], Entries(3, 3)]
 CameraPath = Literal["orbit", "swipe", "wobble"]  # of a video

@@ -22,7 +22,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
 from completesplat.photo.photograph import read_photograph
 from completesplat.photo.reading import Framing, ImageLike, Photograph
-from completesplat.quantities import Detail, Natural, Positive, Seed
+from completesplat.quantities import Crop, Detail, Natural, Positive, Seed
 from completesplat.rasterizers.front_detail import fit_detail, front_targets
 from completesplat.rasterizers.front_fitting import fit_front
 from completesplat.rasterizers.selection import auto
@@ -44,6 +44,13 @@ COLOR_FITS = 40
 DETAIL = 512
 """Default of the largest side, in pixels, of the image that a scene's front is fitted to."""
 _rasterizer = cache(auto)
+
+
+def both(first: Visible | None, second: Visible | None) -> Visible | None:
+    """Return the product of two masks, of which None is 1 everywhere."""
+    if first is None or second is None:
+        return second if first is None else first
+    return first * second
 
 
 @dataclass(frozen=True)
@@ -125,12 +132,14 @@ class SceneModel(nn.Module):
         depth_range: DepthRange,
         sampling: Sampling = DEFAULT_SAMPLING,
         visible: Visible | None = None,
+        own: Visible | None = None,
         on_step: OnScenes | None = None,
     ) -> Gaussians:
         """Reconstruct the scene of each image, in its camera's frame.
 
         Args:
             visible: 0 where an image is hidden; hidden pixels have no influence.
+            own: 0 where an image continues its photo's border, which the scene is not fitted to.
             on_step: never called, because these models have no denoising steps.
 
         Raises:
@@ -142,12 +151,12 @@ class SceneModel(nn.Module):
             images = images * visible + (self.background or 0) * (1 - visible)
         reconstruction: Reconstruction = self.eval().reconstruction_model(images)
         scenes = reconstruction.splatter_image.gaussians(cameras, depth_range)
-        return self.fitted(scenes, images, cameras, visible, sampling.color_fits)
+        return self.fitted(scenes, images, cameras, both(visible, own), sampling.color_fits)
 
     def fitted(
-        self, scenes: Gaussians, images: Images, cameras: Cameras, visible: Visible | None, color_fits: int
+        self, scenes: Gaussians, images: Images, cameras: Cameras, part: Visible | None, color_fits: int
     ) -> Gaussians:
-        """Return scenes [batch * samples] fitted to what is visible of their images."""
+        """Return scenes [batch * samples] fitted to their images, where `part` is not 0."""
         if not color_fits:
             return scenes
         background = self._behind
@@ -155,7 +164,7 @@ class SceneModel(nn.Module):
         parts = []
         for i in range(len(scenes.means)):  # one after the other, for the memory
             photo = slice(i // samples, i // samples + 1)
-            mask = None if visible is None else visible[photo]
+            mask = None if part is None else part[photo]
             scene = scenes[i : i + 1]
             parts.append(fit_front(scene, cameras[photo], images[photo], _rasterizer(), color_fits, background, mask))
         return concatenate(parts)
@@ -182,7 +191,7 @@ class SceneModel(nn.Module):
         if size <= self.image_size:
             return [scenes[i] for i in range(len(scenes.means))]
         camera = self.camera(photograph)[None]
-        targets = front_targets(camera, photograph.square_at, size, visible)
+        targets = front_targets(camera, photograph.square_at, size, visible, photograph.own_at)
         fitted = []
         for i in range(len(scenes.means)):
             if on_fit is not None:
@@ -259,12 +268,14 @@ class SceneModel(nn.Module):
         if visible is not None and (visible.shape != shape or not ((visible >= 0) & (visible <= 1)).all()):
             raise CompleteSplatError(f"visible: needs values from 0 to 1 in shape {list(shape)}")
         visible = None if visible is None else visible[None].to(device)
+        own = photograph.own_at(self.image_size)
         scenes = self.eval().generate(
             photograph.image[None].to(device),
             self.camera(photograph)[None],
             self.depth_range_of(photograph)[None],
             sampling,
             visible=visible,
+            own=None if own is None else own[None].to(device),
             on_step=on_step,
         )
         return self.detailed(scenes, photograph, self.front_size(photograph, detail), visible, on_fit)
@@ -327,7 +338,7 @@ class SceneModel(nn.Module):
     def framing(self) -> Framing:
         """Return how photos are framed for this model, which is how its training images were.
 
-        The central square is enlarged where a cut-out or transparent object reaches beyond it. A model of objects on a
+        The square of a cut-out or transparent object is the central one, enlarged to hold it. A model of objects on a
         background gets such an object on it, as large as in training. It ignores EXIF records: unless a
         field of view is given, it assumes that of its training images.
         """
@@ -351,15 +362,19 @@ class SceneModel(nn.Module):
         remove_background: bool = False,
         mask: ImageLike | None = None,
         box: Sequence[float] | None = None,
+        crop: Crop = "whole",
     ) -> Photograph:
         """Read an image at the model's size by `read_photograph`, which explains the arguments."""
-        return read_photograph(image, self.framing, fov_degrees, remove_background, mask, box)
+        check_value("crop", Crop, crop)
+        return read_photograph(image, self.framing, fov_degrees, remove_background, mask, box, crop)
 
     def camera(self, photograph: Photograph, size: int | None = None) -> Cameras:
         """Return the camera that took a photo, at the origin of the world, for the model's image size or another."""
         size = self.image_size if size is None else size
         device = self.up.device
-        return Cameras(torch.eye(4, device=device), pinhole(photograph.fov_degrees, size).to(device), (size, size))
+        intrinsics = pinhole(photograph.fov_degrees, size)
+        intrinsics[:2, 2] = size * torch.tensor(photograph.axis)
+        return Cameras(torch.eye(4, device=device), intrinsics.to(device), (size, size))
 
     def save_pretrained(self, path: Path | str) -> None:
         """Write `config.json`, `model.safetensors` and their checksums into a folder, ready for the Hugging Face hub.

@@ -10,7 +10,8 @@ import torch
 
 import completesplat
 from completesplat.export.images import image_sheet, strip, write_png
-from completesplat.export.scene_files import seen_center
+from completesplat.export.placed_scene import PlacedScene
+from completesplat.export.subject import subject_of
 from completesplat.geometry.trajectories import orbit
 from completesplat.rasterizers.selection import auto
 
@@ -19,7 +20,7 @@ model, rasterizer, rows = completesplat.CompleteSplat.from_pretrained("general")
 for name in sys.argv[2:]:
     photo = model.read(name)
     camera, (scene,) = model.camera(photo), model(photo, color_fits=40)
-    pivot = seen_center(rasterizer, scene, camera)
+    pivot = subject_of(PlacedScene(scene, camera, model.up), rasterizer).center
     cameras = orbit(camera, pivot, model.up, 360 // STEP)[torch.tensor(SHOWN)]
     with torch.no_grad():
         scenes = scene.map(lambda tensor: tensor.expand(len(SHOWN), *tensor.shape))

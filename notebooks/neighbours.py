@@ -77,54 +77,62 @@ def photo_at(image, size):
     return resized(image[None], size)[0]
 
 
-words = dict(word.split("=") for word in sys.argv[2:] if "=" in word)
-models = {name: completesplat.CompleteSplat.from_pretrained(name) for name in sys.argv[2:] if "=" not in name}
-least, size = (of(model.image_size for model in models.values()) for of in (min, max))
-if "size" in words:
-    least = size = int(words["size"])
-data = CaptureSetDataModule(sys.argv[1], test_fraction=1, val_fraction=0, image_size=size, batch_size=1)
-data.setup("test")
-source, scores, sheet, seconds = data.source("test"), {}, [], []
-for name in source.names:
-    try:
-        images, cameras, depth = near_views(source.read(name))
-    except DataError as error:
-        print(error)
-        continue
-    if len(images) < 2:
-        continue
-    drawn = {"copy": images[:1].expand_as(images), "plane": on_a_plane(images[0], cameras[0], depth, cameras)}
-    for weights, model in models.items():
-        before, after = 1.0, float(words.get("depth_after", 4))
-        depth_range = torch.tensor([[max(0.1, depth - before), depth + after]])
-        for rounds in ROUNDS:
-            with torch.no_grad():
-                seen, views = resized(images, model.image_size), crop_resize(cameras, 0, 0, size, model.image_size)
-                scene = model.generate(seen[:1], views[:1], depth_range, Sampling(color_fits=rounds))
-                background = 0.5 if model.background is None else model.background
-                if "size" not in words:
-                    drawn[f"{weights}, {rounds} rounds"] = rasterizer(scene, views[None]).over(background)[0]
-                    continue
-                targets = front_targets(views[:1], partial(photo_at, images[0]), size)
-                began = time.process_time()
-                detailed = fit_detail(scene, views[:1], targets, rasterizer, background)
-                seconds.append(time.process_time() - began)
-                scenes = {"": seen_larger(scene, views[:1], cameras[:1]), ", detail": detailed}
-                for kind, scene in scenes.items():
-                    drawn[f"{weights}, {rounds} rounds{kind}"] = rasterizer(scene, cameras[None]).over(background)[0]
-    images = resized(images, least)
-    drawn = {method: resized(views, least) for method, views in drawn.items()}
-    for method, views in drawn.items():
-        front, novel = psnr(views[:1], images[:1]).item(), psnr(views[1:], images[1:]).mean().item()
-        scores.setdefault(method, []).append((front, novel))
-    sheet.append(torch.cat([views[view] for views in (images, *drawn.values()) for view in (0, 1, -1)], -1))
-rivals = [max(copy, plane) for (_, copy), (_, plane) in zip(scores["copy"], scores["plane"], strict=True)]
-for method, rows in scores.items():
-    front, novel = zip(*rows, strict=True)
-    above = sum(ours > rival for ours, rival in zip(novel, rivals, strict=True))
-    text = f"input view: median {statistics.median(front):.2f}, worst {min(front):.2f} dB; "
-    print(f"{method}: {text}neighbours: mean {statistics.mean(novel):.2f} dB, {above} of {len(rows)} above both rivals")
-if seconds:
-    print(f"detail: {statistics.mean(seconds):.2f} CPU seconds a scene")
-if "sheet" in words:
-    Image.fromarray(to_pixels(torch.cat(sheet, -2))).save(words["sheet"])
+def main():
+    words = dict(word.split("=") for word in sys.argv[2:] if "=" in word)
+    models = {name: completesplat.CompleteSplat.from_pretrained(name) for name in sys.argv[2:] if "=" not in name}
+    least, size = (of(model.image_size for model in models.values()) for of in (min, max))
+    if "size" in words:
+        least = size = int(words["size"])
+    data = CaptureSetDataModule(sys.argv[1], test_fraction=1, val_fraction=0, image_size=size, batch_size=1)
+    data.setup("test")
+    source, scores, sheet, seconds = data.source("test"), {}, [], []
+    for name in source.names:
+        try:
+            images, cameras, depth = near_views(source.read(name))
+        except DataError as error:
+            print(error)
+            continue
+        if len(images) < 2:
+            continue
+        drawn = {"copy": images[:1].expand_as(images), "plane": on_a_plane(images[0], cameras[0], depth, cameras)}
+        for weights, model in models.items():
+            before, after = 1.0, float(words.get("depth_after", 4))
+            depth_range = torch.tensor([[max(0.1, depth - before), depth + after]])
+            for rounds in ROUNDS:
+                with torch.no_grad():
+                    seen, views = resized(images, model.image_size), crop_resize(cameras, 0, 0, size, model.image_size)
+                    scene = model.generate(seen[:1], views[:1], depth_range, Sampling(color_fits=rounds))
+                    background = 0.5 if model.background is None else model.background
+                    if "size" not in words:
+                        drawn[f"{weights}, {rounds} rounds"] = rasterizer(scene, views[None]).over(background)[0]
+                        continue
+                    targets = front_targets(views[:1], partial(photo_at, images[0]), size)
+                    began = time.process_time()
+                    detailed = fit_detail(scene, views[:1], targets, rasterizer, background)
+                    seconds.append(time.process_time() - began)
+                    scenes = {"": seen_larger(scene, views[:1], cameras[:1]), ", detail": detailed}
+                    for kind, scene in scenes.items():
+                        drawn[f"{weights}, {rounds} rounds{kind}"] = rasterizer(scene, cameras[None]).over(background)[
+                            0
+                        ]
+        images = resized(images, least)
+        drawn = {method: resized(views, least) for method, views in drawn.items()}
+        for method, views in drawn.items():
+            front, novel = psnr(views[:1], images[:1]).item(), psnr(views[1:], images[1:]).mean().item()
+            scores.setdefault(method, []).append((front, novel))
+        sheet.append(torch.cat([views[view] for views in (images, *drawn.values()) for view in (0, 1, -1)], -1))
+    rivals = [max(copy, plane) for (_, copy), (_, plane) in zip(scores["copy"], scores["plane"], strict=True)]
+    for method, rows in scores.items():
+        front, novel = zip(*rows, strict=True)
+        above = sum(ours > rival for ours, rival in zip(novel, rivals, strict=True))
+        text = f"input view: median {statistics.median(front):.2f}, worst {min(front):.2f} dB; "
+        rest = f"mean {statistics.mean(novel):.2f} dB, {above} of {len(rows)} above both rivals"
+        print(f"{method}: {text}neighbours: {rest}")
+    if seconds:
+        print(f"detail: {statistics.mean(seconds):.2f} CPU seconds a scene")
+    if "sheet" in words:
+        Image.fromarray(to_pixels(torch.cat(sheet, -2))).save(words["sheet"])
+
+
+if __name__ == "__main__":
+    main()

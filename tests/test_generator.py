@@ -69,6 +69,24 @@ def test_samples_are_fitted_to_the_visible_part_of_the_image_one_by_one(model, p
     assert not same(fitted[0], draw(visible=visible, color_fits=2)[0])
 
 
+def test_no_scene_is_fitted_to_a_border_that_is_continued(model, photo, monkeypatch):
+    fitted, fit = [], scene_model.fit_front
+
+    def watched(scene, cameras, images, rasterizer, rounds, background, visible=None, *pace):
+        fitted.append(visible)
+        return fit(scene, cameras, images, rasterizer, rounds, background, visible, *pace)
+
+    monkeypatch.setattr(scene_model, "fit_front", watched)
+    high = Image.open(photo).crop((0, 0, 24, 32))
+    draw = partial(model, steps=1, color_fits=1, detail=model.image_size)
+    draw(high)
+    assert torch.equal(fitted[0], model.read(high).own_at(model.image_size)[None])
+    draw(model.read(high, box=[0, 0, 1, 0.25]))
+    assert torch.equal(fitted[1] > 0, (fitted[0] > 0) & (model.read(high, box=[0, 0, 1, 0.25]).visible > 0)[None])
+    draw(model.read(high, crop="center"))
+    assert fitted[2] is None
+
+
 def test_a_photo_is_denoised_in_bfloat16_where_the_processor_has_it_and_decoded_in_float32(model, photo, monkeypatch):
     networks, seen = (model.denoiser.network, model.autoreconstructor.reconstructor.network), []
     hooks = [part.conv_in.register_forward_hook(lambda *_: seen.append(_[-1].dtype)) for part in networks]

@@ -16,7 +16,6 @@ from hydra.utils import instantiate
 from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
-from torch.nn import functional
 
 from completesplat.commands.inputs import find_images, left_out
 from completesplat.commands.trained import open_generator, shown_background
@@ -26,7 +25,7 @@ from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.description import finished_digest, made_from
 from completesplat.export.formats import CONVERTED, FORMATS
-from completesplat.export.placed_scene import PlacedScene, on_optical_axis
+from completesplat.export.placed_scene import PlacedScene
 from completesplat.export.prediction import write_prediction
 from completesplat.export.progress import PhotoProgress
 from completesplat.export.scene_files import OutputFiles
@@ -45,6 +44,7 @@ from completesplat.wording import counted, folder_names, printable, safe_name
 logger = logging.getLogger(__name__)
 
 OF_RUNS = ("image", "out", "shard", "shards", "devices")  # settings on which no single prediction depends
+OF_OBJECT = 0.1  # difference of a channel from the background of weights, from which a pixel is the object's
 sha256_of_weights = cache(sha256_of)  # a process has one model, of up to gigabytes
 
 
@@ -165,7 +165,7 @@ def predict_photo(
     remove = config.background == REMOVE
     if remove:
         begin("removing the background", advance=0)
-    photograph = model.read(image, config.fov, remove, config.mask, config.box)
+    photograph = model.read(image, config.fov, remove, config.mask, config.box, config.crop)
     settings = generation_settings(config, model, photograph)
     begin(f"drawing {config.samples} sample{'s' if config.samples > 1 else ''}", advance=0)
     size = model.front_size(photograph, config.detail)
@@ -175,9 +175,8 @@ def predict_photo(
 
     scenes = model(photograph, batch=config.batch, on_fit=on_fit, **settings)
     samples = placed_samples(scenes, model, photograph, size)
-    shown = shown_photo(photograph, size)
     recorded = {**settings, **facts_of_photo(config, model, image, photograph)}
-    write_prediction(folder, shown, samples, rasterizer, outputs, recorded, begin)
+    write_prediction(folder, photograph.shown_at(size), samples, rasterizer, outputs, recorded, begin)
 
 
 def generation_settings(config: DictConfig, model: SceneModel, photograph: Photograph) -> dict[str, Any]:
@@ -196,23 +195,25 @@ def generation_settings(config: DictConfig, model: SceneModel, photograph: Photo
     return settings
 
 
-def shown_photo(photograph: Photograph, size: int) -> Float[Tensor, "3 _ _"]:
-    """Return a photo at a size, black where it is hidden."""
-    image = photograph.square_at(size)
-    if photograph.visible is None:
-        return image
-    return image * functional.interpolate(photograph.visible[None], (size, size), mode="nearest")[0]
-
-
 def placed_samples(
     scenes: Sequence[Gaussians], model: SceneModel, photograph: Photograph, size: int
 ) -> list[PlacedScene]:
     """Return a photo's scenes with its camera, whose images have this size, on the CPU."""
     camera = model.camera(photograph, size).to("cpu")
-    pivot = None
+    mask = object_mask(photograph, model.background)
+    depth = None
     if model.background is not None:  # images of objects, whose centre is in the middle of the depth range
-        pivot = on_optical_axis(camera, model.middle_depth(model.depth_range_of(photograph)))
-    return [PlacedScene(scene.to("cpu"), camera, model.up.cpu(), pivot) for scene in scenes]
+        depth = model.middle_depth(model.depth_range_of(photograph))
+    own = photograph.own_at(model.image_size)
+    return [PlacedScene(scene.to("cpu"), camera, model.up.cpu(), None, mask, own, depth) for scene in scenes]
+
+
+def object_mask(photograph: Photograph, background: float | None) -> Float[Tensor, "1 size size"] | None:
+    """Return where the object of a photo is: what was cut out, or what differs from the background of the weights."""
+    if photograph.cut_out is not None or background is None:
+        return photograph.cut_out
+    different = (photograph.image - background).abs().amax(0, keepdim=True) > OF_OBJECT
+    return different.float()
 
 
 def facts_of_photo(config: DictConfig, model: SceneModel, image: Path, photograph: Photograph) -> dict[str, Any]:
@@ -226,6 +227,8 @@ def facts_of_photo(config: DictConfig, model: SceneModel, image: Path, photograp
     facts["screen_space_dilation"] = config.screen_space_dilation
     facts["mask"] = None if config.mask is None else printable(Path(config.mask).name)
     facts["box"] = None if config.box is None else list(config.box)
+    facts["crop"] = config.crop if isinstance(config.crop, str) else list(config.crop)
+    facts["photo_part"] = list(photograph.part)
     facts["fov_degrees"] = photograph.fov_degrees
     facts["fov_source"] = photograph.fov_source
     facts["depth_range"] = model.depth_range_of(photograph).tolist()
@@ -266,7 +269,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], outputs: Outp
     """Write the files of one scene that all images show, into a folder with the name of the first image.
 
     Raises:
-        CompleteSplatError: one image alone, or a mask, box, field of view or removed background besides the cameras.
+        CompleteSplatError: one image alone, or a mask, box, crop, field of view or removed background with the cameras.
         DataError, WeightsError: as `read_photographs`, `CompleteSplat.reconstruct`.
     """
     from completesplat.data.captures.transforms_json import read_photographs
@@ -276,6 +279,8 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], outputs: Outp
     others = [name for name in ("mask", "box", "fov") if config[name] is not None]
     if config.background == REMOVE:
         others.append("background=remove")
+    if config.crop != "whole":
+        others.append("crop")
     if others:
         raise CompleteSplatError(f"{others[0]} does not go with cameras=FILE")
     model = open_generator(config, images)

@@ -145,10 +145,10 @@ def page_of_model(server: Any, config: DictConfig, out: Path) -> Any:
     image = None if config.image is None else Path(config.image)
     remove = config.background == REMOVE
     model = open_generator(config, [] if image is None else [image])
-    photograph = None if image is None else model.read(image, config.fov, remove)
+    photograph = None if image is None else model.read(image, config.fov, remove, crop=config.crop)
     page = empty_page(server, config, out, model.up.tolist(), model)
     start = {name: config[name] for name in SLIDERS}
-    completion = Completion(page, model, {**start, "remove_background": remove})
+    completion = Completion(page, model, {**start, "remove_background": remove}, config.crop)
     if image is not None and photograph is not None:
         completion.load(printable(image.name), photograph)
     return page

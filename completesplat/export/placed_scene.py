@@ -53,6 +53,9 @@ class PlacedScene:
     Attributes:
         up: direction up in the world, the axis of orbits.
         pivot: point in the world around which orbits turn, if it is known.
+        mask: where the object is in the camera's image (`subject_of`), if that is known.
+        own: where the camera's image is the photo's own, if its border is continued.
+        depth: depth of the object's middle, if it is known.
         coordinates: those of the scene's files.
     """
 
@@ -60,9 +63,7 @@ class PlacedScene:
     camera: Cameras
     up: Float[Tensor, "3"] = field(default_factory=lambda: torch.tensor([0.0, -1.0, 0.0]))
     pivot: Float[Tensor, "3"] | None = None
+    mask: Float[Tensor, "1 _ _"] | None = None
+    own: Float[Tensor, "1 _ _"] | None = None
+    depth: float | None = None
     coordinates: FileCoordinates = FileCoordinates()
-
-
-def on_optical_axis(camera: Cameras, depth: float | Float[Tensor, ""]) -> Float[Tensor, "3"]:
-    """Return the point in the middle of a camera's view at a depth."""
-    return camera.camera_to_world[:3, 3] + camera.camera_to_world[:3, 2] * depth

@@ -20,18 +20,19 @@ from completesplat.export.formats import FORMATS
 from completesplat.export.formats import suffix as format_suffix
 from completesplat.export.images import SheetCell, color_depth, color_normals, image_sheet, strip, to_pixels, write_png
 from completesplat.export.placed_scene import PlacedScene
-from completesplat.export.scene_files import OutputFiles, pivot_of, write_scene
-from completesplat.export.video import orbit_views
+from completesplat.export.scene_files import OutputFiles, write_scene
+from completesplat.export.subject import all_around, subject_of
+from completesplat.export.video import render_views
 from completesplat.files import make_folder, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, crop_resize
 from completesplat.geometry.surfaces import normals_from_depth
-from completesplat.geometry.trajectories import PATHS
+from completesplat.geometry.trajectories import PATHS, turned
 from completesplat.rasterizers import Rasterizer
 
 logger = logging.getLogger(__name__)
 
-DIRECTIONS = 8  # views around a sample on the contact sheet
+ANGLES = (0, 15, 30, 60, 90, 180, 270, 330)  # degrees of the views around a sample on the contact sheet
 SHEET_SIDE = 256  # pixels of its images, at most
 PHOTO_FILE = "photo.png"
 SHEET_FILE = "sheet.png"
@@ -68,7 +69,7 @@ def write_prediction(
         DiskError: the disk is full, or the folder above `folder` is missing.
     """
     # Refuse samples without intact Gaussians before anything is written.
-    samples = [_prepared(sample, f"{settings['image']}: sample {i}", rasterizer) for i, sample in enumerate(samples)]
+    samples = [_prepared(sample, f"{settings['image']}: sample {i}") for i, sample in enumerate(samples)]
     make_folder(folder)
     _make_room(folder)
     write_png(folder / PHOTO_FILE, Image.fromarray(to_pixels(image)))
@@ -97,10 +98,9 @@ def write_prediction(
     (folder / UNFINISHED).unlink()
 
 
-def _prepared(sample: PlacedScene, name: str, rasterizer: Rasterizer) -> PlacedScene:
-    """Return a sample without broken Gaussians and with a pivot of orbits. Errors and warnings have its `name`."""
-    intact = replace(sample, gaussians=cleaned(sample.gaussians, name))
-    return replace(intact, pivot=pivot_of(intact, rasterizer))
+def _prepared(sample: PlacedScene, name: str) -> PlacedScene:
+    """Return a sample without broken Gaussians. Errors and warnings have its `name`."""
+    return replace(sample, gaussians=cleaned(sample.gaussians, name))
 
 
 def _make_room(folder: Path) -> None:
@@ -118,11 +118,16 @@ def _make_room(folder: Path) -> None:
 def _views_around(
     sample: PlacedScene, rasterizer: Rasterizer, background: float
 ) -> tuple[Float[Tensor, "view 3 height width"], Float[Tensor, "1 height width"]]:
-    """Return views of a sample from all sides, and the depth of the first, which is the photo's."""
-    assert sample.pivot is not None
+    """Return views of a sample at `ANGLES`, and the depth of the first, which is the photo's."""
     side = max(sample.camera.image_size)
     camera = crop_resize(sample.camera, 0, 0, side, min(side, SHEET_SIDE))
-    views, depths = orbit_views(rasterizer, sample.gaussians, camera, sample.pivot, DIRECTIONS, background, sample.up)
+    subject = subject_of(sample, rasterizer)
+    angles = torch.tensor(ANGLES).deg2rad().to(sample.up)
+    cameras = turned(all_around(camera, subject), subject.center, sample.up, angles)
+    cameras.world_to_camera[0] = camera.world_to_camera
+    cameras = replace(cameras, intrinsics=cameras.intrinsics.clone())
+    cameras.intrinsics[0] = camera.intrinsics
+    views, depths = render_views(rasterizer, sample.gaussians, cameras, background)
     return views, depths[0]
 
 
@@ -147,9 +152,9 @@ def contact_sheet(
     views: Float[Tensor, "sample view 3 height width"],
     depths: Float[Tensor, "sample 1 height width"],
 ) -> None:
-    """Write a PNG with the input image in the first column, and a row for each sample with its views and depth.
+    """Write a PNG with the input image in the first column, and a row for each sample: views at `ANGLES` and depth.
 
-    Depth is coloured on one scale for all rows. The views are spread evenly over a turn.
+    Depth is coloured on one scale for all rows.
     """
     colored, (near, far) = color_depth(depths)
     rows = [
@@ -157,8 +162,7 @@ def contact_sheet(
         for index, (images, depth) in enumerate(zip(views, colored, strict=True))
     ]
     rows[0][0] = SheetCell(reference)
-    count = views.shape[1]
-    angles = [f"{360 / count * k:g}°" for k in range(count)]
+    angles = [f"{angle}°" for angle in ANGLES]
     write_png(path, image_sheet(["input", *angles, f"depth {near:.3g} to {far:.3g}"], rows, title))
 
 

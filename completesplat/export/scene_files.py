@@ -4,20 +4,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from completesplat.export import mesh, usdz
 from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.compressed import SpzVersion
 from completesplat.export.formats import suffix as format_suffix
 from completesplat.export.formats import write_format
-from completesplat.export.placed_scene import PlacedScene, on_optical_axis
+from completesplat.export.placed_scene import PlacedScene
 from completesplat.export.splat_transform import PageView
+from completesplat.export.subject import all_around, subject_of
 from completesplat.export.video import render_views, write_video
-from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.trajectories import PATHS
 from completesplat.quantities import CameraPath, Format
 from completesplat.rasterizers import Rasterizer
@@ -74,11 +69,12 @@ def write_scene(
         File names by purpose.
     """
     gaussians = scene.gaussians
-    pivot = pivot_of(scene, rasterizer)
+    subject = subject_of(scene, rasterizer)
+    around = all_around(scene.camera, subject)
     dilated = with_screen_space_dilation(gaussians, scene.camera) if outputs.screen_space_dilation else gaussians
     stored = scene.coordinates.gaussians(dilated)
     camera = scene.coordinates.camera(scene.camera)
-    view = PageView(camera, scene.coordinates.points(pivot), scene.up, outputs.background)
+    view = PageView(camera, scene.coordinates.points(subject.center), scene.up, outputs.background)
     files: dict[str, str] = {}
     for kind in outputs.formats:
         on_file(name + format_suffix(kind))
@@ -86,28 +82,8 @@ def write_scene(
     for path in outputs.videos:
         video = f"{path}{suffix}.mp4"
         on_file(video)
-        cameras = PATHS[path](scene.camera, pivot, scene.up, outputs.frames)
+        cameras = PATHS[path](around, subject.center, scene.up, outputs.frames)
         frames, _ = render_views(rasterizer, gaussians, cameras, outputs.background)
         write_video(folder / video, frames)
         files[f"{path}{suffix}"] = video
     return files
-
-
-def pivot_of(scene: PlacedScene, rasterizer: Rasterizer) -> Float[Tensor, "3"]:
-    """Return the point around which orbits of a scene turn: the known one, or the `seen_center`."""
-    return seen_center(rasterizer, scene.gaussians, scene.camera) if scene.pivot is None else scene.pivot
-
-
-@torch.no_grad()
-def seen_center(rasterizer: Rasterizer, gaussians: Gaussians, camera: Cameras) -> Float[Tensor, "3"]:
-    """Return the point on the optical axis at the median depth of the image's central ninth.
-
-    If nothing is seen in the central ninth, the median depth of all Gaussians is used.
-    """
-    depth = rasterizer(gaussians[None], camera[None][None]).expected_depth()[0, 0, 0]
-    height, width = depth.shape
-    center = depth[height // 3 : height - height // 3, width // 3 : width - width // 3]
-    seen = center[center > 0]
-    if len(seen) == 0:
-        seen = transform_points(camera.world_to_camera, gaussians.means)[:, 2]
-    return on_optical_axis(camera, seen.median())

@@ -12,26 +12,12 @@ from completesplat.export.images import to_pixels
 from completesplat.files import atomic_path
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.geometry.trajectories import orbit
 from completesplat.rasterizers import Rasterizer
 
 SMALLEST_SIDE = 256
 CHUNK = 8  # views that are rendered at a time
 Frames = Float[Tensor, "frame 3 height width"]
 DepthMaps = Float[Tensor, "frame 1 height width"]
-
-
-def orbit_views(
-    rasterizer: Rasterizer,
-    gaussians: Gaussians,
-    reference: Cameras,
-    pivot: Float[Tensor, "3"],
-    frames: int,
-    background: float,
-    up: Float[Tensor, "3"],
-) -> tuple[Frames, DepthMaps]:
-    """Call `render_views` for a full turn around the upward axis through the pivot, from the reference camera on."""
-    return render_views(rasterizer, gaussians, orbit(reference, pivot, up, frames), background)
 
 
 @torch.no_grad()

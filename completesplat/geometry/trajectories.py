@@ -22,8 +22,12 @@ def orbit(reference: Cameras, pivot: Vector, up: Vector, frames: int, degrees: f
         Cameras with a leading axis of `frames`, each to the right of the one before: for a positive angle the path
         runs counter-clockwise as seen from above.
     """
+    return turned(reference, pivot, up, _full_turn(frames, up) * (degrees / 360))
+
+
+def turned(reference: Cameras, pivot: Vector, up: Vector, angles: Float[Tensor, " frame"]) -> Cameras:
+    """Return the cameras of an `orbit` at angles in radians."""
     axis = torch.nn.functional.normalize(up, dim=-1)
-    angles = _full_turn(frames, up) * (degrees / 360)
     arm = reference.centers - pivot
     cos = angles.cos()[:, None]
     sin = angles.sin()[:, None]

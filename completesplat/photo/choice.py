@@ -93,7 +93,8 @@ def match_shipped(image: ImageLike, remove_background: bool = False) -> dict[str
     """
     configs = shipped_configs()
     largest = max((config["image_size"] for config in configs.values()), default=1)
-    square = read_square(image, Framing(largest, whole_object=True), remove_background=remove_background).image
+    framing = Framing(largest, whole_object=True)
+    square = read_square(image, framing, remove_background=remove_background, crop="center").image
     distances = dict[str, float]()
     logarithms = list[float]()
     for name, config in configs.items():

@@ -1,4 +1,4 @@
-"""Squares that are cut out of images: around the principal point, in the middle, or around an object."""
+"""Squares that are cut out of images or laid around them: the whole image, its middle, a given part, or an object."""
 
 from typing import NamedTuple, TypeAlias
 
@@ -8,9 +8,12 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from completesplat.errors import BadCamera, ImageError
+from completesplat.errors import BadCamera, CompleteSplatError, ImageError
 from completesplat.photo.files import EIGHT_BIT_MODES
+from completesplat.quantities import Crop
 
+SMALLEST_SIDE = 8  # pixels of a photo, or of its square
+MOST_ASPECT = 3  # longer side over shorter side of a photo that is kept whole
 LARGEST_PADDED = 6000  # pixels; larger squares are reduced before they are padded, because their size has no bound
 
 Window: TypeAlias = tuple[int, int, int, int]
@@ -55,6 +58,41 @@ def central_window(size: tuple[int, int], side: int, left: int = 0, top: int = 0
     return left, top, left + side, top + side
 
 
+def window_of(size: tuple[int, int], crop: Crop) -> Window:
+    """Return the square that a choice of the crop means in a photo of this size (width, height).
+
+    Args:
+        crop: "whole": the square around the photo, or around its middle if one side is more than `MOST_ASPECT` times as
+            long as the other. "center": the largest square in its middle. [x, y, size]: the square whose upper left
+            corner lies at shares x of the width and y of the height, with a side of a share of the shorter side.
+
+    Raises:
+        CompleteSplatError: the given square does not lie within the photo.
+    """
+    shorter = min(size)
+    if crop == "center":
+        return central_window(size, shorter)
+    if crop == "whole":
+        return central_window(size, min(max(size), MOST_ASPECT * shorter))
+    x, y, share = (float(value) for value in crop)
+    side = share * shorter
+    right = x * size[0] + side
+    lower = y * size[1] + side
+    if not (x >= 0 and y >= 0 and right < size[0] + 0.5 and lower < size[1] + 0.5 and side >= SMALLEST_SIDE):
+        raise CompleteSplatError(
+            f"crop={list(crop)}: give [x,y,size], in shares of width, height and shorter side, of a square within the"
+            f" photo, of {SMALLEST_SIDE} pixels or more"
+        )
+    ends = min(round(right), size[0]), min(round(lower), size[1])
+    return ends[0] - round(side), ends[1] - round(side), *ends
+
+
+def part_within(window: Window, size: tuple[int, int]) -> Window:
+    """Return the part of a window that lies within an image of the size (width, height)."""
+    left, top, right, bottom = window
+    return max(left, 0), max(top, 0), min(right, size[0]), min(bottom, size[1])
+
+
 def window_with_object(image: Image.Image) -> Window | None:
     """Return the smallest square in the middle that holds the central one and the opaque part of an image.
 
@@ -64,7 +102,7 @@ def window_with_object(image: Image.Image) -> Window | None:
     Raises:
         ImageError: no pixel is opaque.
     """
-    box = _opaque_box(image)
+    box = opaque_box(image)
     if box is None:
         return None
     left, top, right, bottom = box
@@ -82,7 +120,7 @@ def window_around_object(image: Image.Image, share: float) -> Window | None:
     Raises:
         ImageError: no pixel is opaque.
     """
-    box = _opaque_box(image)
+    box = opaque_box(image)
     if box is None:
         return None
     left, top, right, bottom = box
@@ -90,7 +128,7 @@ def window_around_object(image: Image.Image, share: float) -> Window | None:
     return central_window(size, round(max(size) / share), left, top)
 
 
-def _opaque_box(image: Image.Image) -> Window | None:
+def opaque_box(image: Image.Image) -> Window | None:
     """Return left, top, right and bottom of what is not transparent, or None if all pixels are opaque."""
     if image.mode not in EIGHT_BIT_MODES or not image.has_transparency_data:
         return None
@@ -101,6 +139,14 @@ def _opaque_box(image: Image.Image) -> Window | None:
     if box is None:
         raise ImageError("nothing but transparency")
     return box
+
+
+def only_within(image: Image.Image, window: Window) -> Image.Image:
+    """Return an image that is transparent outside of a window within it."""
+    kept = Image.new("RGBA", image.size)
+    kept.paste(image.convert("RGBA").crop(window), window[:2])
+    kept.info["icc_profile"] = image.info.get("icc_profile")
+    return kept
 
 
 def cropped(image: Image.Image, window: Window) -> Image.Image:
@@ -114,3 +160,21 @@ def cropped(image: Image.Image, window: Window) -> Image.Image:
     top = top // factor
     side = side // factor
     return image.convert("RGBA").reduce(factor).crop((left, top, left + side, top + side))
+
+
+def continued(image: Image.Image, window: Window) -> Image.Image:
+    """Crop a square of an image in RGB or grey, whose border goes on where the square extends beyond the image.
+
+    A large square is reduced before it is padded.
+    """
+    part = part_within(window, image.size)
+    if part == window:
+        return image.crop(window)
+    factor = -(-(window[2] - window[0]) // LARGEST_PADDED)
+    side = (window[2] - window[0]) // factor
+    pixels = np.asarray(image.crop(part).reduce(factor))[:side, :side]
+    widths = [(0, 0)] * pixels.ndim
+    for axis in (0, 1):
+        before = min((part[1 - axis] - window[1 - axis]) // factor, side - pixels.shape[axis])
+        widths[axis] = (before, side - before - pixels.shape[axis])
+    return Image.fromarray(np.pad(pixels, widths, mode="edge"))

@@ -38,18 +38,18 @@ def read_exif(image: Image.Image) -> Tags:
     return tags
 
 
-def crop_fov(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:
-    """Return the field of view in degrees of the largest centred square, or None if it is not recorded.
+def photo_fov(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:
+    """Return the field of view in degrees across the longer side of a photo, or None if it is not recorded.
 
     The focal length in pixels is FocalLengthIn35mmFilm / 36 mm * longer side (the longer side of the image corresponds
     to the 36 mm of a full frame), else FocalLength * FocalPlaneXResolution, scaled from the recorded to the actual
-    image size. Then fov = 2 atan(shorter side / (2 focal)). The result is wrong for cropped or stitched images.
+    image size. Then fov = 2 atan(longer side / (2 focal)). The result is wrong for cropped or stitched images.
     """
     equivalent = _positive(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
     focal = equivalent / FULL_FRAME_WIDTH * max(size) if equivalent else _focal_from_sensor(exif, max(size))
     if focal is None:
         return None
-    fov = math.degrees(2 * math.atan(min(size) / (2 * focal)))
+    fov = math.degrees(2 * math.atan(max(size) / (2 * focal)))
     return fov if 1 < fov < 170 else None
 
 

@@ -14,17 +14,32 @@ import torch
 from jaxtyping import Float
 from PIL import Image, ImageCms
 from torch import Tensor
+from torch.nn import functional
 
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.photo import files
 from completesplat.photo.background import without_background
-from completesplat.photo.crop import Window, central_window, cropped, window_around_object, window_with_object
-from completesplat.photo.exif import ORIENTATION, Tags, crop_fov, read_exif
+from completesplat.photo.crop import (
+    SMALLEST_SIDE,
+    Window,
+    central_window,
+    continued,
+    cropped,
+    only_within,
+    opaque_box,
+    part_within,
+    window_around_object,
+    window_of,
+    window_with_object,
+)
+from completesplat.photo.exif import ORIENTATION, Tags, photo_fov, read_exif
+from completesplat.quantities import Crop
 from completesplat.tensors import TensorDataclass
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM")
-SMALLEST_SIDE = 8
 FOVS = (0.1, 179)  # degrees; float32 holds neither the focal lengths nor the depths of others
+ALL = (0.0, 0.0, 1.0, 1.0)  # left, top, right and bottom of a square, in shares of its side
+PALE = 0.65  # share of white over what is not the photo's, where people see it
 DEEP_GREY_MODES = (*files.SIXTEEN_BIT_MODES, "I", "F")
 
 ImageLike: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor
@@ -36,11 +51,15 @@ class Photograph(TensorDataclass):
 
     Attributes:
         image: a square of it, in sRGB from 0 to 1.
-        fov_degrees: field of view across a side of the square.
+        fov_degrees: field of view across a side of the square, if the optical axis meets the middle of the square.
         fov_source: where the field of view is from: the user, EXIF, or the model's training images.
         photo_size: width and height of the whole photo, upright, in pixels.
-        crop: whether the square is the central one, or was chosen for an object.
         square: the same square with the photo's own pixels (`square_at`): RGB in sRGB, or grey floats from 0 to 1.
+        window: the square in the photo's pixels; it may extend beyond the photo.
+        part: the photo's part of the square (left, top, right, bottom in shares of its side), around which its border
+            is continued. `ALL` for a cut-out object, which lies on the background of the weights.
+        axis: where the optical axis meets the square, from the left and from the top, in shares of its side.
+        cut_out: opacity of the object in the square, if the rest is transparent or was removed.
         visible: 0 where the image is hidden and 1 elsewhere; None if nothing is hidden.
     """
 
@@ -49,12 +68,39 @@ class Photograph(TensorDataclass):
     fov_source: Literal["given", "exif", "default"]
     photo_size: tuple[int, int]
     square: Image.Image
-    crop: Literal["center", "object"] = "center"
+    window: Window
+    part: tuple[float, float, float, float] = ALL
+    axis: tuple[float, float] = (0.5, 0.5)
+    cut_out: Float[Tensor, "1 size size"] | None = None
     visible: Float[Tensor, "1 size size"] | None = None
 
     def square_at(self, size: int) -> Float[Tensor, "3 _ _"]:
         """Return the square at another size, made of the photo's own pixels."""
         return _resized(self.square, size)
+
+    def own_at(self, size: int) -> Float[Tensor, "1 _ _"] | None:
+        """Return 1 in the photo's part of the square, at a size, and 0 around it; None if it is all of the square."""
+        if self.part == ALL:
+            return None
+        centers = (torch.arange(size) + 0.5) / size
+        left, top, right, bottom = self.part
+        rows = (centers > top) & (centers < bottom)
+        columns = (centers > left) & (centers < right)
+        return (rows[:, None] & columns).float()[None]
+
+    def shown_at(self, size: int) -> Float[Tensor, "3 _ _"]:
+        """Return the square for people, at a size: black where it is hidden, and pale around the photo."""
+        image = self.square_at(size)
+        if self.visible is not None:
+            image = image * functional.interpolate(self.visible[None], (size, size), mode="nearest")[0]
+        own = self.own_at(size)
+        return image if own is None else image + PALE * (1 - own) * (1 - image)
+
+    def middle_at(self, size: int) -> Float[Tensor, "3 _ _"]:
+        """Return the largest square in the middle of the photo's part of the square, at a size."""
+        left, top, right, bottom = (round(share * self.square.width) for share in self.part)
+        extent = (right - left, bottom - top)
+        return _resized(self.square.crop(central_window(extent, min(extent), left, top)), size)
 
 
 @dataclass(frozen=True)
@@ -67,9 +113,9 @@ class Framing:
         reads_exif: whether the field of view of a photo's EXIF record replaces `fov_degrees`, if it has one.
         background: grey value from 0 to 1 behind transparent and removed pixels, white by default.
         object_share: share of the square's side that the longer side of an object fills. The square is then cropped
-            around a cut-out or transparent object. None: the central square is cropped.
-        whole_object: whether the central square is enlarged such that it holds the whole cut-out or transparent object.
-            A field of view that is given or EXIF's grows with it; `fov_degrees` is of any square.
+            around a cut-out or transparent object. None: it does not depend on objects.
+        whole_object: whether the square of a cut-out or transparent object is the central one, enlarged such that it
+            holds the whole object.
         training: what the weights know about their training images (`TrainingImages`); None: nothing is to be compared.
     """
 
@@ -83,9 +129,13 @@ class Framing:
 
 
 def read_square(
-    source: ImageLike, framing: Framing, fov_degrees: float | None = None, remove_background: bool = False
+    source: ImageLike,
+    framing: Framing,
+    fov_degrees: float | None = None,
+    remove_background: bool = False,
+    crop: Crop = "whole",
 ) -> Photograph:
-    """Turn an image upright, crop a square and resize it (Lanczos, antialiased).
+    """Turn an image upright, crop a square or continue its border to one, and resize it (Lanczos, antialiased).
 
     Transparency is composited over the background. An animation yields its first frame. An embedded colour profile is
     converted to sRGB. Grey images of 16 bits are scaled to [0, 1]; grey images of floats must lie in [0, 1].
@@ -93,13 +143,16 @@ def read_square(
     Args:
         source: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, recognized by its content; a PIL image;
             an array [height, width, 3] or tensor [3, height, width] of bytes, or floats in [0, 1] (rounded to bytes).
-        fov_degrees: field of view of the central square, if it is known; with `object_share` that of the crop.
+        fov_degrees: field of view across the photo's longer side, if it is known; that of the square, if this is
+            cropped around an object (`Framing.object_share`).
         remove_background: whether to cut the object out of the whole image first (`without_background`).
+        crop: the part of the photo (`window_of`). A cut-out or transparent object is framed by the framing instead, and
+            is sought within [x, y, size].
 
     Raises:
         ImageError: the file is missing or not a complete image of one of these formats, has more than 64 million pixels
             (checked before decoding) or less than 8 pixels on a side, or its pixel values are ambiguous.
-        CompleteSplatError: the field of view is outside `FOVS`, or errors of `without_background`.
+        CompleteSplatError: the field of view is outside `FOVS`, or errors of `without_background` and `window_of`.
     """
     for fov in (fov_degrees, framing.fov_degrees):
         if fov is not None and not FOVS[0] <= fov <= FOVS[1]:
@@ -109,34 +162,90 @@ def read_square(
         upright = files.turn_upright(stored, exif.get(ORIENTATION))
         if remove_background:
             upright = _cut_out(upright, framing.background)
-        central = central_window(upright.size, min(upright.size))
-        window = _object_window(upright, framing) or central
-        square = _normalized(cropped(upright, window), stored, framing.background)
+        window = window_of(upright.size, crop)
+        transparent = opaque_box(upright) is not None
+        if transparent and not isinstance(crop, str):
+            upright = only_within(upright, window)
+        around = _object_window(upright, framing) if isinstance(crop, str) or framing.object_share else None
+        window = window if around is None else around
+        square = _square(upright, window, transparent, stored, framing.background)
     except ImageError as error:
         name = source if isinstance(source, (str, Path)) else "the image"
         raise ImageError(f"{name}: {error}") from error.__cause__
-    crop: Literal["center", "object"] = "center" if window == central else "object"
+    side = window[2] - window[0]
     fov, fov_source = _field_of_view(fov_degrees, exif, stored.size, framing)
-    if crop == "object" and fov_source != "default" and framing.object_share is None:
-        fov = _enlarged_fov(fov, (window[2] - window[0]) / min(upright.size))
-    return Photograph(_resized(square, framing.size), fov, fov_source, upright.size, square, crop)
+    axis = (0.5, 0.5)
+    if fov_source != "default" and (around is None or framing.object_share is None):
+        fov = _fov_of_share(fov, side / max(upright.size))
+        axis = ((upright.width / 2 - window[0]) / side, (upright.height / 2 - window[1]) / side)
+    return Photograph(
+        image=_resized(square, framing.size),
+        fov_degrees=fov,
+        fov_source=fov_source,
+        photo_size=upright.size,
+        square=square,
+        window=window,
+        part=ALL if transparent else _shares(window, upright.size),
+        axis=axis,
+        cut_out=_opacity(upright, window, framing.size) if transparent else None,
+    )
+
+
+def read_whole(source: ImageLike, background: float) -> Image.Image:
+    """Return a whole image, upright, in RGB or grey floats from 0 to 1. Arguments and errors are `read_square`'s."""
+    try:
+        stored, exif = _loaded(source)
+        return _normalized(files.turn_upright(stored, exif.get(ORIENTATION)), stored, background)
+    except ImageError as error:
+        name = source if isinstance(source, (str, Path)) else "the image"
+        raise ImageError(f"{name}: {error}") from error.__cause__
+
+
+def _square(
+    image: Image.Image, window: Window, transparent: bool, stored: Image.Image, background: float
+) -> Image.Image:
+    """Return a `_normalized` square of an image. Beyond it is background if it is `transparent`, else its border."""
+    if transparent:
+        return _normalized(cropped(image, window), stored, background)
+    left, top, right, bottom = part_within(window, image.size)
+    part = _normalized(image.crop((left, top, right, bottom)), stored, background)
+    return continued(part, (window[0] - left, window[1] - top, window[2] - left, window[3] - top))
+
+
+def _shares(window: Window, size: tuple[int, int]) -> tuple[float, float, float, float]:
+    """Return the part of a window that lies within an image of this size, in shares of the window's side."""
+    side = window[2] - window[0]
+    left, top, right, bottom = part_within(window, size)
+    return (
+        (left - window[0]) / side,
+        (top - window[1]) / side,
+        (right - window[0]) / side,
+        (bottom - window[1]) / side,
+    )
+
+
+def _opacity(image: Image.Image, window: Window, size: int) -> Float[Tensor, "1 size size"]:
+    """Return the opacity of a square of a transparent image."""
+    alpha = cropped(image, window).convert("RGBA").getchannel("A")
+    pixels = np.array(alpha.resize((size, size), Image.Resampling.BILINEAR), dtype=np.float32)
+    return torch.from_numpy(pixels / 255)[None]
 
 
 def _field_of_view(
     given: float | None, exif: Tags, size: tuple[int, int], framing: Framing
 ) -> tuple[float, Literal["given", "exif", "default"]]:
-    """Return the field of view in degrees of the central square, and where it is from."""
+    """Return the field of view in degrees across the photo's longer side, or a square's default, and its source."""
     if given is not None:
         return float(given), "given"
-    recorded = crop_fov(exif, size) if framing.reads_exif else None
+    recorded = photo_fov(exif, size) if framing.reads_exif else None
     if recorded is not None:
         return recorded, "exif"
     return float(framing.fov_degrees), "default"
 
 
-def _enlarged_fov(fov_degrees: float, ratio: float) -> float:
-    """Return the field of view of a square that is larger by this ratio."""
-    return math.degrees(2 * math.atan(ratio * math.tan(math.radians(fov_degrees) / 2)))
+def _fov_of_share(fov_degrees: float, share: float) -> float:
+    """Return the field of view across a share of the length that has this field of view."""
+    return math.degrees(2 * math.atan(share * math.tan(math.radians(fov_degrees) / 2)))
 
 
 def _object_window(image: Image.Image, framing: Framing) -> Window | None:

@@ -28,7 +28,8 @@ def photo_warnings(photograph: Photograph, training: Mapping[str, Any], trained_
     if "depth_before" not in training:  # with it, the depth range follows the field of view
         line = unusual_field_of_view(photograph, trained_degrees)
         lines += [] if line is None else [line]
-    distance = None if photograph.visible is not None else distance_to_training(photograph.image, training)
+    middle = photograph.middle_at(photograph.image.shape[-1])
+    distance = None if photograph.visible is not None else distance_to_training(middle, training)
     if distance is not None and distance > UNLIKE:
         far = f"{distance:.1f} standard deviations away, where {UNLIKE:g} is far"
         lines.append(f"this photo is unlike the training images ({far}): its scenes will look little like it")
@@ -39,7 +40,7 @@ def photo_warnings(photograph: Photograph, training: Mapping[str, Any], trained_
 
 def nearer_weights(photograph: Photograph, distance: float) -> str | None:
     """Name the shipped weights whose training images are nearer to a photo, and `ELSEWHERE` if these are far, too."""
-    matches = match_shipped(photograph.image)
+    matches = match_shipped(photograph.middle_at(photograph.image.shape[-1]))
     name = next(iter(matches), "")
     other = matches[name].distance if matches else math.inf
     parts = []

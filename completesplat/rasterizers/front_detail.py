@@ -49,6 +49,7 @@ def front_targets(
     image_at: Callable[[int], Float[Tensor, "3 _ _"]],
     size: int,
     visible: Float[Tensor, "1 1 height width"] | None = None,
+    own_at: Callable[[int], Float[Tensor, "1 _ _"] | None] = lambda side: None,
 ) -> list[FrontTarget]:
     """Return a photo's images whose sides grow to `size`, each at most twofold, from the side of a camera's image on.
 
@@ -56,6 +57,7 @@ def front_targets(
         camera: of the smallest image, which is not returned.
         image_at: returns the photo at a size.
         visible: mask of the smallest image.
+        own_at: returns a further mask at a size, or None.
     """
     least = camera.image_size[0]
     count = math.ceil(math.log2(size / least))
@@ -63,6 +65,9 @@ def front_targets(
     for number in range(1, count + 1):
         side = round(least * (size / least) ** (number / count))
         mask = None if visible is None else _enlarged_mask(visible, side)
+        own = own_at(side)
+        if own is not None:
+            mask = own[None].to(camera.intrinsics) * (1 if mask is None else mask)
         image = image_at(side)[None].to(camera.intrinsics)
         targets.append(FrontTarget(crop_resize(camera, 0, 0, least, side), image, mask))
     return targets

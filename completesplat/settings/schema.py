@@ -9,7 +9,18 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, NotRequired, TypedDict
 
 from completesplat.errors import CompleteSplatError
-from completesplat.quantities import CameraPath, Detail, Entries, Format, NonNegative, Positive, Range, Seed, Share
+from completesplat.quantities import (
+    CameraPath,
+    Crop,
+    Detail,
+    Entries,
+    Format,
+    NonNegative,
+    Positive,
+    Range,
+    Seed,
+    Share,
+)
 
 NOT_A_LIST = "must be a list"
 NUMBERS: Mapping[type, type] = {int: Integral, float: Real}  # which include NumPy's numbers
@@ -62,6 +73,7 @@ class SceneSettings(TypedDict):
     color_fits: Annotated[int, Range(0, 100)]
     detail: Detail
     steps: Annotated[int, Range(1, 1000)] | None
+    crop: Crop
     fov: float | None
     frames: Annotated[int, Range(1, 1000)]
     background: Share | Literal["remove"] | None

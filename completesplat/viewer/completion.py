@@ -12,7 +12,9 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.images import to_pixels
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
+from completesplat.photo.photograph import framing_line
 from completesplat.photo.reading import Photograph
+from completesplat.quantities import Crop
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.access import show_status
 from completesplat.viewer.page import SHOWN, Page
@@ -25,9 +27,10 @@ PAUSE = 0.2  # seconds between two images of a scene that forms
 class Completion:
     """Controls that complete a photo, added to a page. The model runs only in the page's worker."""
 
-    def __init__(self, page: Page, model: SceneModel, start: dict[str, Any]) -> None:
+    def __init__(self, page: Page, model: SceneModel, start: dict[str, Any], crop: Crop = "whole") -> None:
         self.page = page
         self.model = model
+        self.crop = crop
         self.photograph: tuple[str, Photograph] | None = None
         self.controls = add_completion_controls(page.server.gui, model, start)
         page.complete = self.complete
@@ -39,8 +42,11 @@ class Completion:
         """Show this photo in the panel, and draw its samples."""
         self.photograph = name, photograph
         self.page.photo.content = ""  # of an earlier scene
-        label = f"{name}, field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"
-        self.controls.preview.content = preview_of(to_pixels(photograph.image), label)
+        words = [name, f"field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"]
+        framed = framing_line(photograph)
+        words += [] if framed is None else [framed]
+        shown = photograph.shown_at(self.model.image_size)
+        self.controls.preview.content = preview_of(to_pixels(shown), ", ".join(words))
         self.page.view.set_up(self.model.up.tolist())
         self.request(client)
 
@@ -54,7 +60,7 @@ class Completion:
     def complete(self, image: Path, name: str, client: viser.ClientHandle | None) -> None:
         """Load an image file, or raise CompleteSplatError if it is none or its background cannot be removed."""
         show_status(self.page.server, f"reading {name}")
-        photograph = self.model.read(image, remove_background=self.controls.remove_background.value)
+        photograph = self.model.read(image, remove_background=self.controls.remove_background.value, crop=self.crop)
         self.load(name, photograph, client)
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:

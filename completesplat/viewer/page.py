@@ -18,9 +18,11 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.description import is_described
 from completesplat.export.formats import FORMATS, suffix, write_format
 from completesplat.export.images import to_pixels
+from completesplat.export.placed_scene import PlacedScene
 from completesplat.export.prediction import PHOTO_FILE
 from completesplat.export.splat_transform import PageView
-from completesplat.export.video import orbit_views, render_views, write_video
+from completesplat.export.subject import all_around, subject_of
+from completesplat.export.video import render_views, write_video
 from completesplat.files import write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit
@@ -149,15 +151,9 @@ class Saver:
     def _video(self, sample: Sample) -> Path:
         path = self._next("orbit", ".mp4")
         up = sample.reference.intrinsics.new_tensor(self.view.up.tolist())
-        frames, _ = orbit_views(
-            self.rasterizer(),
-            sample.gaussians,
-            sample.reference,
-            sample.pivot(),
-            self.frames,
-            self.background,
-            up,
-        )
+        subject = subject_of(PlacedScene(sample.gaussians, sample.reference, up), self.rasterizer())
+        cameras = orbit(all_around(sample.reference, subject), subject.center, up, self.frames)
+        frames, _ = render_views(self.rasterizer(), sample.gaussians, cameras, self.background)
         write_video(path, frames)
         return path
 

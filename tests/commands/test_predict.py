@@ -92,7 +92,7 @@ def test_pixels_in_a_box_or_a_mask_have_no_influence(predict, tmp_path):
     rng = np.random.default_rng(0)
     one = rng.integers(0, 256, (100, 120, 3), dtype=np.uint8)
     other = one.copy()
-    other[:, 60:110] = 255 - one[:, 60:110]  # the box, in the central square's pixels 10 to 110
+    other[:, 60:110] = 255 - one[:, 60:110]  # within the box, which is the right half
     result = []
     for name, pixels in (("one", one), ("other", other)):
         image = tmp_path / name / "photo.png"

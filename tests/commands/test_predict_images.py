@@ -17,14 +17,14 @@ from support import compose_config, some_gaussians, strict_json
 
 from completesplat.commands import trained
 from completesplat.commands.inputs import find_images
-from completesplat.commands.predict import output_files, run
+from completesplat.commands.predict import object_mask, output_files, run
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import FORMATS
 from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.installation import install_command
-from completesplat.photo.reading import Photograph
+from completesplat.photo.reading import Framing, Photograph, read_square
 
 QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
 
@@ -290,16 +290,47 @@ def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
         assert (len(cut), settings.get("background")) == (1, "remove" if removed else None)
 
 
-def test_a_hidden_part_of_the_central_square_does_not_go_with_an_object_that_is_larger_than_it(predict, tmp_path):
-    for top, status, message in ((40, 0, ""), (0, 2, "box= are of a photo's central square, but its object is")):
-        cut_out = Image.new("RGBA", (32, 96))
-        cut_out.paste("blue", (10, top, 22, 56))
-        cut_out.save(tmp_path / "a.png")
-        done = predict(tmp_path / "a.png", "box=[0,0,0.5,0.5]")
-        assert done.status == status
-        assert message in done.err
-    assert predict(tmp_path / "a.png", "fov=50").status == 0
-    assert strict_json(tmp_path / "out/a/scene.json")["settings"]["fov_degrees"] == pytest.approx(108.9, abs=0.1)
+def test_a_field_of_view_is_of_the_whole_photo_also_if_an_object_needs_a_larger_square(predict, tmp_path):
+    cut_out = Image.new("RGBA", (32, 96))
+    cut_out.paste("blue", (10, 0, 22, 56))
+    cut_out.save(tmp_path / "a.png")
+    for settings in (["fov=50"], ["fov=50", "box=[0,0,0.5,0.5]"]):
+        predict.succeeds(tmp_path / "a.png", *settings)
+        assert strict_json(tmp_path / "out/a/scene.json")["settings"]["fov_degrees"] == pytest.approx(50)
+
+
+def test_the_object_is_what_was_cut_out_or_differs_from_the_background_of_the_weights():
+    image = Image.new("RGBA", (16, 16), "white")
+    image.paste("blue", (2, 4, 6, 10))
+    on_white = read_square(image, Framing(16))
+    assert object_mask(on_white, None) is None
+    expected = torch.zeros(1, 16, 16)
+    expected[:, 4:10, 2:6] = 1
+    assert torch.equal(object_mask(on_white, 1.0), expected)
+    image.paste((0, 0, 0, 0), (8, 0, 16, 16))
+    expected[:] = 1
+    expected[..., 8:] = 0
+    for background in (None, 1.0):
+        assert torch.equal(object_mask(read_square(image, Framing(16)), background), expected)
+
+
+def test_what_is_taken_of_a_photo_is_said_recorded_and_shown(predict, tmp_path):
+    image = tmp_path / "a.png"
+    Image.new("RGB", (30, 40), "red").save(image)
+    whole = predict.succeeds(image)
+    assert "a.png: its border is continued to a square\n" in whole.out
+    settings = strict_json(tmp_path / "out/a/scene.json")["settings"]
+    assert (settings["crop"], settings["photo_part"]) == ("whole", [0.125, 0, 0.875, 1])
+    photo = Image.open(tmp_path / "out/a/photo.png")
+    assert photo.getpixel((photo.width // 2, 0)) == (255, 0, 0)
+    assert photo.getpixel((0, 0))[1] > 100  # pale
+    cut = predict.succeeds(image, "crop=[0,0.25,1]")
+    assert "a.png: 30 x 30 of its 30 x 40 pixels are taken, from (0, 10)\n" in cut.out
+    settings = strict_json(tmp_path / "out/a/scene.json")["settings"]
+    assert (settings["crop"], settings["photo_part"]) == ([0, 0.25, 1], [0, 0, 1, 1])
+    Image.new("RGB", (40, 8), "red").save(image)
+    assert "a.png: 24 x 8 of its 40 x 8 pixels are taken, from (8, 0); its border is" in predict.succeeds(image).out
+    assert "crop=middle: choose one of whole, center" in predict.refuses(image, "crop=middle")
 
 
 def test_videos_and_formats_are_written_and_recorded_and_a_strange_field_of_view_told(predict, tmp_path, monkeypatch):

@@ -6,8 +6,9 @@ import pytest
 import torch
 from support import round_gaussians
 
-from completesplat.export.video import orbit_views, write_video
+from completesplat.export.video import render_views, write_video
 from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.geometry.trajectories import orbit
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 PIVOT = torch.tensor([0.0, 0.0, 3.0])
@@ -54,7 +55,7 @@ def test_no_frames_another_format_and_nan_are_refused(tmp_path):
 
 def test_the_pivot_stays_in_the_centre_at_the_same_distance_in_front_of_the_background():
     orange = round_gaussians(torch.tensor([[0.0, 0.0, 3.0]]), 0.2, 1.0, [1.0, 0.5, 0.0])
-    images, depth = orbit_views(ReferenceRasterizer(), orange, CAMERA, PIVOT, 10, 0.75, UP)
+    images, depth = render_views(ReferenceRasterizer(), orange, orbit(CAMERA, PIVOT, UP, 10), 0.75)
     assert images.shape == (10, 3, 33, 33)  # more views than are rendered at a time
     torch.testing.assert_close(depth[:, 0, 16, 16], torch.full((10,), 3.0), rtol=0, atol=1e-4)
     torch.testing.assert_close(images[:, :, 16, 16], torch.tensor([1.0, 0.5, 0.0]).expand(10, 3), rtol=0, atol=3e-3)
@@ -71,7 +72,8 @@ def test_the_first_view_is_the_reference_view_and_the_axis_points_up():
     for camera in (CAMERA, turned):
         pivot = camera.camera_to_world[:3, :3] @ PIVOT
         here = gaussians.transform(camera.camera_to_world)
-        images, _ = orbit_views(rasterizer, here, camera, pivot, 4, 0.0, -camera.world_to_camera[1, :3])
+        around = orbit(camera, pivot, -camera.world_to_camera[1, :3], 4)
+        images, _ = render_views(rasterizer, here, around, 0.0)
         direct = rasterizer(here[None], camera[None, None])
         torch.testing.assert_close(images[0], direct.over(0.0)[0, 0], rtol=0, atol=1e-5)
         # Half a turn about the camera's vertical axis swaps left and right, but not top and bottom.

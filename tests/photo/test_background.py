@@ -54,21 +54,33 @@ def test_the_object_is_sought_in_all_of_the_image_and_fills_its_share_of_the_squ
     assert torch.equal(result, expected)
 
 
+def test_a_given_square_is_where_the_object_is_sought(rembg):
+    image = Image.new("RGB", (64, 32), "red")
+    image.paste("blue", (2, 4, 14, 10))
+    image.paste("blue", (40, 8, 56, 24))
+    right = read_square(image, Framing(24, object_share=0.5), remove_background=True, crop=[0.5, 0, 1])
+    assert right.window == (32, 0, 64, 32)
+    assert right.image[0].min() == 0
+    assert read_square(image, Framing(24, object_share=0.5), remove_background=True).window[2] > 64
+
+
 @pytest.mark.parametrize(("fov", "source"), [(40.0, "given"), (None, "default")])
 def test_the_central_square_grows_until_it_holds_the_whole_object_and_its_field_of_view_with_it(rembg, fov, source):
     image = Image.new("RGB", (32, 64), "red")
     image.paste("blue", (10, 4, 22, 58))  # a bottle, from 28 above the middle to 26 below
-    photo = read_square(image, Framing(28, 40.0, whole_object=True), fov, remove_background=True)
+    across = None if fov is None else math.degrees(2 * math.atan(2 * math.tan(math.radians(fov) / 2)))
+    photo = read_square(image, Framing(28, 40.0, whole_object=True), across, remove_background=True)
     expected = torch.ones(3, 56, 56)
     expected[:2, :54, 22:34] = 0
     assert torch.allclose(photo.image, expected.unflatten(2, (28, 2)).mean(3).unflatten(1, (28, 2)).mean(2), atol=0.2)
     grown = math.degrees(2 * math.atan(56 / 32 * math.tan(math.radians(40) / 2)))
-    assert (photo.crop, photo.fov_source) == ("object", source)
+    assert (photo.window, photo.fov_source) == ((-12, 4, 44, 60), source)
+    assert photo.cut_out.mean() == pytest.approx(12 * 54 / 56**2, abs=0.01)
     assert photo.fov_degrees == pytest.approx(grown if source == "given" else 40)
     inside = Image.new("RGB", (32, 64), "red")
     inside.paste("blue", (10, 20, 22, 40))
-    photo = read_square(inside, Framing(32, 40.0, whole_object=True), fov, remove_background=True)
-    assert (photo.crop, photo.fov_degrees) == ("center", 40)
+    photo = read_square(inside, Framing(32, 40.0, whole_object=True), across, remove_background=True)
+    assert (photo.window, photo.fov_degrees) == ((0, 16, 32, 48), pytest.approx(40))
 
 
 def test_an_object_as_long_as_an_image_may_be_is_reduced_before_its_square_is_made(tmp_path):

@@ -3,9 +3,12 @@ import struct
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image, ImageOps, TiffImagePlugin
 
-from completesplat.photo.exif import crop_fov
+from completesplat.generator import CompleteSplat
+from completesplat.geometry.cameras import pinhole, project
+from completesplat.photo.exif import photo_fov
 from completesplat.photo.reading import Framing, read_square
 
 SIZE = 16
@@ -25,7 +28,7 @@ def test_exif_orientation(tmp_path, orientation, name):
     exif[0x0112] = orientation
     stored.info.clear()
     stored.save(tmp_path / name, exif=exif)
-    got = read_square(tmp_path / name, Framing(64)).image.permute(1, 2, 0).numpy()
+    got = read_square(tmp_path / name, Framing(64), crop="center").image.permute(1, 2, 0).numpy()
     assert np.array_equal(got, np.float32(upright)[:, 16:80] / 255)
 
 
@@ -41,13 +44,13 @@ def exif_of(**tags):
     return exif
 
 
-def fov_of(tmp_path, exif, size=(60, 40), name="a.jpg", default=50.0, given=None):
+def fov_of(tmp_path, exif, size=(60, 40), name="a.jpg", default=50.0, given=None, crop="center"):
     # Pillow does not store the inner record of an Exif object in a TIFF, but does so for a plain mapping.
     tags = TiffImagePlugin.ImageFileDirectory_v2()
     tags[0x8769] = dict(exif.get_ifd(0x8769))
     options_for_tiff = {"tiffinfo": tags} if name == "a.tif" else {"exif": exif}
     Image.new("RGB", size).save(tmp_path / name, **options_for_tiff)
-    return read_square(tmp_path / name, Framing(SIZE, default), given)
+    return read_square(tmp_path / name, Framing(SIZE, default), given, crop=crop)
 
 
 def degrees(millimetres, focal):
@@ -60,8 +63,28 @@ def test_full_frame_focal_length_gives_the_field_of_view_of_the_square(tmp_path,
         photograph = fov_of(tmp_path, exif_of(equivalent=focal), size, name)
         assert photograph.fov_source == "exif"
         assert photograph.fov_degrees == pytest.approx(degrees(seen, focal))
+    photograph = fov_of(tmp_path, exif_of(equivalent=50), name=name, given=33.0, crop="whole")
+    assert (photograph.fov_degrees, photograph.fov_source) == (pytest.approx(33), "given")
     photograph = fov_of(tmp_path, exif_of(equivalent=50), name=name, given=33.0)
-    assert (photograph.fov_degrees, photograph.fov_source) == (33.0, "given")
+    assert photograph.fov_degrees == pytest.approx(degrees(2 / 3 * 36, 18 / math.tan(math.radians(33) / 2)))
+
+
+@pytest.mark.parametrize("size", [(60, 40), (40, 60), (40, 40), (40, 160)])
+@pytest.mark.parametrize("crop", ["whole", "center", [0.25, 0.1, 0.5]])
+def test_a_point_is_seen_where_the_known_camera_of_the_whole_photo_sees_it(tmp_path, tiny_weights, size, crop):
+    """Whatever is taken of the photo: the square's camera has the photo's focal length and axis."""
+    model = CompleteSplat.from_pretrained(tiny_weights)
+    Image.new("RGB", size).save(tmp_path / "a.jpg", exif=exif_of(equivalent=28))
+    photograph = model.read(tmp_path / "a.jpg", crop=crop)
+    camera = model.camera(photograph)
+    focal = 28 / 36 * max(size)
+    points = torch.tensor([[0.1, -0.2, 2.0], [-0.3, 0.1, 1.0]])
+    known = points[:, :2] / points[:, 2:] * focal + torch.tensor(size) / 2
+    left, top, right, _ = photograph.window
+    expected = (known - torch.tensor([left, top])) * model.image_size / (right - left)
+    torch.testing.assert_close(project(camera, points)[0], expected, rtol=1e-4, atol=1e-3)
+    unknown = model.camera(model.read(Image.new("RGB", size), crop=crop)).intrinsics
+    torch.testing.assert_close(unknown, pinhole(model.fov_degrees.item(), model.image_size))
 
 
 def test_focal_length_with_the_resolution_of_the_sensor(tmp_path):
@@ -83,8 +106,8 @@ def test_without_a_usable_focal_length_the_default_stands(tmp_path):
         photograph = fov_of(tmp_path, exif_of(**tags), default=61.0)
         assert (photograph.fov_degrees, photograph.fov_source) == (61.0, "default"), tags
     infinite = {0x920A: 35.0, 0xA20E: 100.0, 0xA002: math.inf, 0xA003: math.inf}
-    assert crop_fov(infinite, (60, 40)) == pytest.approx(degrees(40, 35 * 100 / 25.4))
-    assert crop_fov({0xA405: math.inf}, (60, 40)) is None
+    assert photo_fov(infinite, (60, 40)) == pytest.approx(degrees(60, 35 * 100 / 25.4))
+    assert photo_fov({0xA405: math.inf}, (60, 40)) is None
 
 
 def test_a_damaged_inner_record_leaves_the_orientation(tmp_path):

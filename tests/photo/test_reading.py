@@ -21,13 +21,13 @@ def photo(seed=0):
     return np.random.default_rng(seed).integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8)
 
 
-def read_back(tmp_path, image, name="a.png", size=SIZE, **options):
+def read_back(tmp_path, image, name="a.png", size=SIZE, crop="center", **options):
     image.save(tmp_path / name, **options)
-    return pixels(tmp_path / name, size)
+    return pixels(tmp_path / name, size, crop)
 
 
-def pixels(path, size=SIZE):
-    image = read_square(path, Framing(size)).image
+def pixels(path, size=SIZE, crop="center"):
+    image = read_square(path, Framing(size), crop=crop).image
     assert image.dtype == torch.float32
     assert 0 <= image.min() <= image.max() <= 1
     return image.permute(1, 2, 0).numpy()
@@ -155,6 +155,46 @@ def test_the_largest_square_is_cut_from_the_centre_of_any_shape(tmp_path):
         middle = image[32:64] if image.shape[0] > 32 else image[:, 32:64]
         assert np.array_equal(read_back(tmp_path, Image.fromarray(image), size=32), np.float32(middle) / 255)
     assert read_back(tmp_path, Image.new("RGB", (20_000, 8), "red")).shape == (SIZE, SIZE, 3)
+
+
+def test_a_whole_image_lies_in_the_middle_of_its_square_whose_border_is_continued(tmp_path):
+    high = photo()[:, 4:12].repeat(2, 0).repeat(2, 1)  # 32 high, 16 wide
+    for turned in (False, True):
+        image = high.transpose(1, 0, 2) if turned else high
+        got = read_back(tmp_path, Image.fromarray(image), size=32, crop="whole")
+        got = got.transpose(1, 0, 2) if turned else got
+        assert np.array_equal(got[:, 8:24], np.float32(high) / 255)
+        border = got[:, [*range(8), *range(24, 32)]]
+        assert 0 < np.abs(border.mean((0, 1)) - high[:, [0, -1]].mean((0, 1)) / 255).max() < 0.05
+    line = np.full((8, 30, 3), 255, np.uint8)
+    line[:, 3:27] = [255, 0, 0]
+    read = read_square(line, Framing(24))
+    assert (read.window, read.part) == ((3, -8, 27, 16), (0, pytest.approx(1 / 3), 1, pytest.approx(2 / 3)))
+    assert read.image[1].max() == 0  # of what is longer than 3:1 the ends are missing
+
+
+def test_a_given_square_is_cut_and_others_are_refused():
+    image = photo().repeat(4, 0).repeat(8, 1)  # 64 high, 128 wide
+    read = read_square(image, Framing(32), crop=[0.5, 0.25, 0.5])
+    assert read.window == (64, 16, 96, 48)
+    assert torch.equal(read.image, torch.from_numpy(image[16:48, 64:96]).permute(2, 0, 1) / 255)
+    assert read_square(image, Framing(32), crop=[0.5, 0, 1]).window == (64, 0, 128, 64)
+    for crop in ([0.8, 0, 1], [-0.1, 0, 0.5], [0, 0.6, 0.5], [0, 0, 0.1], [0, 0, 1.1], [math.nan, 0, 0.5]):
+        with pytest.raises(CompleteSplatError, match=r"give \[x,y,size\], in shares of width, height and shorter side"):
+            read_square(image, Framing(32), crop=crop)
+
+
+def test_what_is_the_photos_own_is_known_at_each_size_and_the_rest_is_pale():
+    read = read_square(np.zeros((64, 48, 3), np.uint8), Framing(16))
+    assert read.part == (0.125, 0, 0.875, 1)
+    own = read.own_at(8)
+    assert torch.equal(own, torch.tensor([0.0, 1, 1, 1, 1, 1, 1, 0]).expand(1, 8, 8))
+    assert read.own_at(64).sum() == 64 * 48
+    assert torch.equal(read.shown_at(8)[:1] > 0, own == 0)
+    assert read_square(np.zeros((16, 16, 3), np.uint8), Framing(16)).own_at(8) is None
+    bright = np.full((64, 64, 3), 255, np.uint8)
+    bright[:, :16] = 0
+    assert read_square(bright[:, 16:], Framing(16)).middle_at(8).min() == 1
 
 
 def test_resizing_is_antialiased_and_tiny_images_are_enlarged(tmp_path):

@@ -1,5 +1,6 @@
 """What is visible of photos that a box or a mask hides in part."""
 
+import math
 import re
 from functools import partial
 from pathlib import Path
@@ -18,16 +19,14 @@ HIDDEN = (0.25, 0.5, 0.75, 1.0)
 
 @pytest.fixture
 def photos(tmp_path):
-    """Two photographs (width, height) that differ in a box of their central square, and a mask of that box."""
+    """Two photographs (width, height) that differ in a box, and a mask of that box."""
 
     def write(width: int, height: int) -> tuple[Path, Path, Path]:
         rng = np.random.default_rng(0)
         first, second = (rng.integers(0, 256, (height, width, 3), dtype=np.uint8) for _ in range(2))
-        side = min(width, height)
-        left, top = (width - side) // 2, (height - side) // 2
         inside = np.zeros((height, width), dtype=bool)
-        x0, y0, x1, y1 = (round(edge * side) for edge in HIDDEN)
-        inside[top + y0 : top + y1, left + x0 : left + x1] = True
+        x0, y0, x1, y1 = HIDDEN
+        inside[int(y0 * height) : math.ceil(y1 * height), int(x0 * width) : math.ceil(x1 * width)] = True
         second[~inside] = first[~inside]
         paths = tuple(tmp_path / f"{name}.png" for name in ("first", "second", "mask"))
         for path, pixels in zip(paths, (first, second, np.uint8(255) * inside), strict=True):
@@ -37,11 +36,13 @@ def photos(tmp_path):
     return write
 
 
+@pytest.mark.parametrize("crop", ["whole", "center", [0.2, 0.2, 0.6]])
 @pytest.mark.parametrize("form", ["box", "mask"])
 @pytest.mark.parametrize("size", [(32, 32), (100, 80), (61, 97), (20, 24)])
-def test_no_visible_pixel_holds_anything_hidden(photos, size, form):
+def test_no_visible_pixel_holds_anything_hidden(photos, size, form, crop):
+    """Also not the border that continues it."""
     first, second, mask = photos(*size)
-    photos_read = [read_square(path, Framing(32)) for path in (first, second)]
+    photos_read = [read_square(path, Framing(32), crop=crop) for path in (first, second)]
     visible = outside_of_box(photos_read[0], HIDDEN) if form == "box" else outside_of_mask(photos_read[0], mask)
     assert torch.equal(photos_read[0].image * visible, photos_read[1].image * visible)
     assert not torch.equal(photos_read[0].image, photos_read[1].image)
@@ -75,6 +76,9 @@ def test_boxes_and_masks_that_are_none_are_refused(photos, tmp_path):
     for hide in (partial(outside_of_mask, mask=tmp_path / "white.png"), partial(outside_of_box, box=(0, 0, 1, 1))):
         with pytest.raises(CompleteSplatError, match="the whole photo is hidden"):
             hide(photograph)
+    corner = read_square(photos(32, 32)[0], Framing(32), crop=[0, 0, 0.25])
+    with pytest.raises(CompleteSplatError, match="hides nothing of what crop= takes"):
+        outside_of_box(corner, HIDDEN)
     with pytest.raises(CompleteSplatError, match=r"tall.png: 32 x 64 pixels, another shape than the photo's"):
         outside_of_mask(photograph, tmp_path / "tall.png")
     with pytest.raises(CompleteSplatError, match=r"black.png: hides nothing"):

@@ -69,7 +69,7 @@ def test_hidden_parts_are_warned_of_unless_they_were_trained_with():
     ],
 )
 def test_a_field_of_view_far_from_trainings_is_told_with_what_it_does(own, trained, message):
-    warning = unusual_field_of_view(
-        Photograph(torch.zeros(3, 8, 8), own, "exif", (8, 8), Image.new("RGB", (8, 8))), trained
-    )
+    square = Image.new("RGB", (8, 8))
+    photograph = Photograph(torch.zeros(3, 8, 8), own, "exif", (8, 8), square, (0, 0, 8, 8))
+    warning = unusual_field_of_view(photograph, trained)
     assert (warning is None) if message is None else (message in warning)

@@ -449,7 +449,7 @@ def test_files_have_the_screen_space_dilation_once_and_videos_none(page, monkeyp
     sample = replace(balls_sample(), exact=exact)
     drawn = []
     drawing = lambda rasterizer, gaussians, *_: drawn.append(gaussians) or (torch.rand(1, 3, 8, 8), None)  # noqa: E731
-    monkeypatch.setattr(page_module, "orbit_views", drawing)
+    monkeypatch.setattr(page_module, "render_views", drawing)
     (ply,), _ = page.saver.save("ply", [sample]), page.saver.save("video", [sample])
     wide = with_screen_space_dilation(sample.gaussians, sample.reference) if exact else sample.gaussians
     assert torch.allclose(read_ply(ply).scales, wide.scales, rtol=1e-5)

@@ -28,7 +28,7 @@ from completesplat.files import atomic_path, make_folder, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.photo.reading import Framing, ImageLike, Photograph
-from completesplat.quantities import Entries, Few, Natural, Range, Width
+from completesplat.quantities import Crop, Entries, Few, Natural, Range, Width
 from completesplat.scene_model import SceneModel
 from completesplat.settings.schema import violations
 from completesplat.splatter_image import Parameterization, SplatterImage
@@ -245,6 +245,7 @@ class PublishedModel(SceneModel):
         remove_background: bool = False,
         mask: ImageLike | None = None,
         box: Sequence[float] | None = None,
+        crop: Crop = "whole",
     ) -> Photograph:
         """Read an image at the model's size; see `SceneModel.read`.
 
@@ -254,7 +255,7 @@ class PublishedModel(SceneModel):
         known = self.network.fov_degrees
         if known is not None and fov_degrees is not None:
             raise CompleteSplatError(f"fov={fov_degrees:g}: these weights take every image as of {known:.0f} degrees")
-        return super().read(image, fov_degrees, remove_background, mask, box)
+        return super().read(image, fov_degrees, remove_background, mask, box, crop)
 
     def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
         """Return near and far; for weights trained on captures, around the object's estimated distance."""
