@@ -1,8 +1,6 @@
-"""Images of a capture that COLMAP can read, from photos or from a video."""
+"""Images of a capture that COLMAP can read, from photos."""
 
 import logging
-import re
-import subprocess
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -11,7 +9,7 @@ from PIL import ImageOps
 from rich.progress import track
 
 from completesplat.data.sequences import first_names
-from completesplat.errors import DataError, refused_to
+from completesplat.errors import refused_to
 from completesplat.photo import files, saving
 from completesplat.wording import counted, folder_names
 
@@ -57,19 +55,3 @@ def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
     if unread:
         logger.warning("left out: %s of other formats: %s", counted(len(unread), "file"), first_names(unread))
     return photos
-
-
-def split_video(video: Path, images: Path, frames: int) -> None:
-    """Write the first frame of each of equal parts of a video, or all frames if there are fewer."""
-    from imageio_ffmpeg import get_ffmpeg_exe
-
-    limit = "-max_pixels", str(files.MOST_PIXELS)  # else a small file could take gigabytes
-    start = [get_ffmpeg_exe(), "-nostdin", *limit, "-i", str(video.absolute())]
-    output = subprocess.run([*start, "-map", "0:v:0", "-f", "null", "-"], capture_output=True).stderr
-    count = int((re.findall(rb"frame= *(\d+)", output) or [b"0"])[-1])
-    if not count:
-        raise DataError(f"ffmpeg finds no video of at most {files.MOST_PIXELS:,} pixels there", str(video))
-    part = f"{min(frames, count)}/{count}"
-    options = ["-vf", f"select=gt(floor(n*{part})\\,floor((n-1)*{part}))", "-fps_mode", "passthrough", "-q:v", "2"]
-    if subprocess.run([*start, "-v", "error", *options, "%05d.jpg"], cwd=images).returncode:
-        raise DataError("ffmpeg cannot split it; the reason is above", str(video))

@@ -11,8 +11,9 @@ from typing import Literal, Unpack
 
 from rich.progress import Progress, track
 
-from completesplat.data.captures.capture_images import copy_photos, split_video
+from completesplat.data.captures.capture_images import copy_photos
 from completesplat.data.captures.captured_frames import FEWEST_FRAMES, import_pycolmap
+from completesplat.data.captures.films import split_video
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.turntable import TurntableSettings, import_turntables
 from completesplat.data.validation.processes import usable_cores
