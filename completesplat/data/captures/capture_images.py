@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 
 def copy_photos(folder: Path, images: Path) -> None:
-    """Write upright photos, with the rest of their EXIF records, which has the focal length.
+    """Write upright photos in sRGB, with the rest of their EXIF records, which has the focal length.
 
     Photos of folders below are written into folders, each the photos of one camera.
     """
@@ -35,8 +35,9 @@ def copy_photos(folder: Path, images: Path) -> None:
             options = {"quality": 95, "subsampling": 0, "exif": upright.info.get("exif", b"")}
             place = images if photo.parent == folder else images / names[photo.parent]
             place.mkdir(exist_ok=True)
-            if upright.mode in ("CMYK", "YCbCr"):
-                upright = upright.convert("RGB")
+            profiled = "icc_profile" in upright.info and upright.mode in files.EIGHT_BIT_MODES
+            if profiled or upright.mode in ("CMYK", "YCbCr"):
+                upright = files.in_srgb(upright)
             lossy = image.format in ("JPEG", "MPO", "HEIF", "WEBP") and upright.mode in ("L", "RGB")
             suffix = ".jpg" if lossy else ".png"
             saving.save_image(upright, place / f"{stem}{suffix}", **options)

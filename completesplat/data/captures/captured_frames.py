@@ -107,11 +107,11 @@ class CapturedFrame:
                     files.check_sums(stored, self.image)
                     stored.load()
                     turned = files.turn_upright(stored, orientation)
-                    image = files.over_grey(turned, 1.0)
+                    image = files.over_grey(files.in_srgb(turned), 1.0)
                     mask = turned.convert("RGBA").getchannel("A")
             if mask is None:
                 turn = orientation is not None
-                image = files.decode_image(self.image, str(self.image), "RGB", self.lens.image_size, turn)
+                image = files.decode_image(self.image, str(self.image), "RGB", self.lens.image_size, turn, True)
             if self.mask is not None:
                 mask = files.decode_image(self.mask, str(self.mask), "L")
                 mask = mask.resize(image.size, Image.Resampling.BILINEAR)
