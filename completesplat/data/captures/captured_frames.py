@@ -32,6 +32,7 @@ FEWEST_FRAMES = 6
 SIDEWAYS = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 # Limits for an undistorted image's area and sides, relative to the distorted image's. Wrong coefficients exceed them.
 SMALLEST_AREA = 0.5
+LEAST_SIDE = 0.5  # of the largest square around the principal point, as a share of the image's shorter side
 LARGEST_SIDE = 2.0
 
 
@@ -53,6 +54,9 @@ class Lens:
             raise BadCamera(f"sizes and focal lengths must be positive, not {width} x {height} and {self.focal}")
         if not (0 < x < width and 0 < y < height):
             raise BadCamera(f"principal point ({x:g}, {y:g}) lies outside of the {width} x {height} image")
+        if 2 * min(x, y, width - x, height - y) < LEAST_SIDE * min(height, width):
+            place = f"principal point ({x:g}, {y:g}) lies near the edge of the {width} x {height} image"
+            raise BadCamera(f"{place}: the intrinsics are of another size; give w and h of that size beside them")
 
     def resized(self, image_size: tuple[int, int]) -> "Lens":
         """Return the lens of images that are resized to (height, width)."""
@@ -119,6 +123,13 @@ class CapturedFrame:
             if mask is None:
                 return image, Image.new("L", image.size, 255)
             return image, undistort(mask, self.lens)
+
+    def is_hidden(self) -> bool:
+        """Return whether the frame has a mask file that is black everywhere."""
+        if self.mask is None:
+            return False
+        with errors_at(self.image, frame=self.number):
+            return files.decode_image(self.mask, str(self.mask), "L").getbbox() is None
 
     def check(self) -> object:
         """Check the headers of image and mask. (`read` also finds damaged contents.)

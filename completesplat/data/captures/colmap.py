@@ -139,12 +139,18 @@ def _find_mask(masks: Path, name: str) -> Path:
 def _text_rows(path: Path) -> Iterator[Row]:
     """Yield the entries of a text file. Those of images have a second line for their features, which may be empty."""
     lines = map(str.strip, read_text(path).split("\n"))
+    of_images = path.stem == "images"
     for line in lines:
-        if line and not line.startswith("#"):
-            yield line.split(maxsplit=9 if path.stem == "images" else -1)
-            # Features are triples; another number of values is that of an image, and this one's line is missing.
-            if path.stem == "images" and len(next(lines, "").split()) % 3:
-                raise ValueError
+        while line and not line.startswith("#"):
+            yield line.split(maxsplit=9 if of_images else -1)
+            following = next(lines, "") if of_images else ""
+            # Another line than one of features is that of the next image.
+            line = "" if _are_features(following.split()) else following
+
+
+def _are_features(words: Sequence[str]) -> bool:
+    """Return whether the words of a line are triples of two coordinates and the whole number of a point."""
+    return len(words) % 3 == 0 and all(word.lstrip("-").isdecimal() for word in words[2::3])
 
 
 def _binary_rows(path: Path) -> Iterator[Row]:

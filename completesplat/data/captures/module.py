@@ -14,13 +14,14 @@ import torch
 
 from completesplat.data.captures.captured_frames import Capture, CapturedFrame
 from completesplat.data.captures.colmap import image_count, is_model, read_colmap
+from completesplat.data.captures.conventions import require_sight
 from completesplat.data.captures.transforms_json import read_polycam, read_transforms
 from completesplat.data.loading.object_data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.placement import ObjectFraming, from_cameras, from_points, placed_sequence, upright_axes
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.data.splits import SPLITS
-from completesplat.errors import DataError, MissingFile, errors_at, refused_to
+from completesplat.errors import BadImage, DataError, MissingFile, errors_at, refused_to
 from completesplat.quantities import Range
 
 logger = logging.getLogger(__name__)
@@ -135,10 +136,13 @@ class CaptureSource(SequenceSource):
         return self._sequences[name]
 
     def check(self, name: str) -> None:
-        """Check the headers of all images of a capture, or raise a DataError."""
+        """Check the headers of all images of a capture, and that a mask shows something, or raise a DataError."""
         with errors_at(sequence=name):
-            for frame in self._captures[name].frames:
+            frames = self._captures[name].frames
+            for frame in frames:
                 frame.check()
+            if all(frame.is_hidden() for frame in frames):
+                raise BadImage("its masks are black everywhere; a mask is white where the object is", str(frames[0].mask))
 
     def _make(self, name: str) -> PosedSequence:
         """Place the object by all frames, so that all splits have the same scale, and move it to the origin.
@@ -148,6 +152,8 @@ class CaptureSource(SequenceSource):
         capture = self._captures[name]
         cameras = [frame.camera() for frame in capture.frames]
         points = capture.points
+        if capture.files[0].suffix == ".json":  # COLMAP's convention is known
+            require_sight(cameras, points)
         if points is None:
             placement = from_cameras(cameras)
         else:
