@@ -116,7 +116,7 @@ def test_a_fit_far_from_the_origin_is_as_good_as_at_the_origin(command, tmp_path
     assert far == pytest.approx(near, abs=0.1)
 
 
-def frames_of(case: str, suffix: str = ".jpg", name: str = "{}") -> Callable[[Path], list[str]]:
+def frames_of(case: str, suffix: str = ".jpg", name: str = "{1}") -> Callable[[Path], list[str]]:
     """Read a capture whose photos have other names, and return the photos that have cameras."""
 
     def read(folder: Path) -> list[str]:
@@ -234,7 +234,8 @@ def linear_mean(name: str) -> list[float]:
 
 
 BRIGHT = [(220, 30, 30), (30, 180, 40), (30, 50, 200), (230, 200, 40)]
-MESHES = ("gso", "mtl_backslash")
+FUSED = splat_values("mip_filter3d/mip_fused.ply")(CASES)
+MUG = "gso/gso_Mug/materials/textures/texture.png"
 RIGHT: dict[str, tuple[Callable[[Path], object], object, float]] = {
     "v1_bt709": (patches_of("v1_bt709/patch_bt709.mp4"), BRIGHT, 3),
     "v3_coverfirst": (lambda folder: len(film("v3_coverfirst/coverfirst.mp4", 8)(folder)), 8, 0),
@@ -243,9 +244,9 @@ RIGHT: dict[str, tuple[Callable[[Path], object], object, float]] = {
     "p3_copied": (copied_in_p3, 0, 1.5),
     "two_spaces": (lambda folder: len(frames_of("two_spaces", name="IMG 2024 ({0})")(folder)), 16, 0),
     "upper_JPG": (lambda folder: len(frames_of("upper_JPG", ".JPG")(folder)), 16, 0),
-    "mip_filter3d": (splat_values("mip_filter3d/mip_filter3d.ply"), splat_values("mip_filter3d/mip_fused.ply")(CASES), 1e-5),
+    "mip_filter3d": (splat_values("mip_filter3d/mip_filter3d.ply"), FUSED, 1e-5),
     "negative_splat": (lambda folder: splat_values("negative_splat/negscale.splat")(folder)[:9], [0.1] * 9, 1e-6),
-    "gso": (texture_color("gso/gso_Mug/meshes/model.obj"), linear_mean("gso/gso_Mug/materials/textures/texture.png"), 1e-4),
+    "gso": (texture_color("gso/gso_Mug/meshes/model.obj"), linear_mean(MUG), 1e-4),
     "mtl_backslash": (texture_color("mtl_backslash/back.obj"), linear_mean("mtl_backslash/tex/back.png"), 1e-4),
 }
 
@@ -262,7 +263,7 @@ def without_masks(folder: Path) -> object:
     (root / "masks").mkdir()
     for path in (root / "images").iterdir():
         Image.new("L", Image.open(path).size).save(root / "masks" / f"{path.name}.png")
-    return import_capture(str(root), None, 100, 1000, folder / "out", "opengl", "camera_to_world")
+    return import_capture(str(root), None, 100, 1000, folder / "out")
 
 
 def opened(name: str) -> Callable[[Path], object]:
@@ -270,7 +271,7 @@ def opened(name: str) -> Callable[[Path], object]:
 
     def read(folder: Path) -> object:
         root = capture(name, folder / name)
-        return import_capture(str(root), None, 100, 1000, folder / "out", "opengl", "camera_to_world")
+        return import_capture(str(root), None, 100, 1000, folder / "out")
 
     return read
 
@@ -326,7 +327,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     "t5_opencv_points": (opened("t5_opencv_points"), "axes=opencv"),
     "masks_empty": (without_masks, "its masks are black everywhere"),
     "fisheye_bin": (opened("fisheye_bin"), "OPENCV_FISHEYE"),
-    "splits_null": (lambda folder: read_splits(CASES / "splits_null/splits.json", ["a"]), "must be an object"),
+    "splits_null": (lambda folder: read_splits(CASES / "splits_null/splits.json", ["a"]), "not None"),
     "image_size_33": (broken_config, "image_size"),
     "wild_pose": (
         lambda folder: CaptureDataModule(str(CASES / "wild_pose"), image_size=SIZE).source("train").read("wild_pose"),

@@ -27,7 +27,7 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 FILTER = "filter_3D"  # of Mip-Splatting
 QUATERNIONS = ("rot_0", "rot_1", "rot_2", "rot_3")
 WRITTEN = (*MEANS, *NORMALS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
-REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
+REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES[:2], *QUATERNIONS)  # and the third scale, which 2DGS has not
 
 log = logging.getLogger(__name__)
 
@@ -82,11 +82,9 @@ def read_ply(path: str | Path) -> Gaussians:
         PlyError: `read_vertices` fails, the Gaussians are flat (2DGS), or no Gaussian is finite. A warning counts those that are not.
     """
     try:
-        vertices = read_vertices(path, REQUIRED[:-5])
-        names = vertices.dtype.names or ()
-        if SCALES[2] not in names and {*SCALES[:2], *QUATERNIONS} <= {*names}:
-            raise PlyError("discs of 2D Gaussian Splatting (two scales), which are no 3D Gaussians; train 3DGS instead")
         vertices = read_vertices(path, REQUIRED)
+        if SCALES[2] not in (vertices.dtype.names or ()):
+            raise PlyError(f"no property {SCALES[2]}: flat Gaussians of 2DGS, which other programs render; give 3DGS")
     except PlyError as error:
         raise PlyError(f"{path}: {error}") from error.__cause__
 

@@ -142,7 +142,9 @@ class CaptureSource(SequenceSource):
             for frame in frames:
                 frame.check()
             if all(frame.is_hidden() for frame in frames):
-                raise BadImage("its masks are black everywhere; a mask is white where the object is", str(frames[0].mask))
+                raise BadImage(
+                    "its masks are black everywhere; a mask is white where the object is", str(frames[0].mask)
+                )
 
     def _make(self, name: str) -> PosedSequence:
         """Place the object by all frames, so that all splits have the same scale, and move it to the origin.
