@@ -79,7 +79,8 @@ def read_ply(path: str | Path) -> Gaussians:
     Mip-Splatting's filter, which is applied. Colours below 0 become 0, as in other 3DGS renderers.
 
     Raises:
-        PlyError: `read_vertices` fails, the Gaussians are flat (2DGS), or no Gaussian is finite. A warning counts those that are not.
+        PlyError: `read_vertices` fails, the Gaussians are flat (2DGS), or none is finite. A warning counts those that
+            are not.
     """
     try:
         vertices = read_vertices(path, REQUIRED)

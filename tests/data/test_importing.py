@@ -221,6 +221,20 @@ def test_pycolmap_leaves_the_signal_that_ends_a_program_to_the_program():
     assert subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True).returncode == 9
 
 
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("reconstruction.json", "opensfm export_colmap"),
+        ("a.r3d", "ns-process-data record3d"),
+        ("cameras.xml", "ns-process-data metashape"),
+    ],
+)
+def test_captures_of_other_programs_are_named_with_what_converts_them(tmp_path, name, command):
+    (tmp_path / name).touch()
+    with pytest.raises(DataError, match=command):
+        import_capture(str(tmp_path), None, 100, 1000, tmp_path / "out")
+
+
 def write_photos(folder: Path, names: list[str]) -> None:
     folder.mkdir(parents=True)
     for name in names:

@@ -31,6 +31,12 @@ logger = logging.getLogger(__name__)
 FARTHEST = 5.0
 FARTHEST_USED = 100_000
 FEWEST_HELD_OUT = 3
+# Files and folders of captures of other programs, and what converts them to one that is read.
+OTHERS = {
+    "reconstruction.json": "OpenSfM: `opensfm export_colmap FOLDER` writes a model of COLMAP",
+    "*.r3d": "Record3D: unpack it, and `ns-process-data record3d --data FOLDER --output-dir OUT` writes transforms.json",
+    "*.xml": "Metashape: `ns-process-data metashape --data IMAGES --xml FILE --output-dir OUT` writes transforms.json",
+}
 TRANSFORMS = ("transforms.json", "transforms_train.json")  # the second is NeRF's (synthetic)
 # Of COLMAP, nerfstudio, and COLMAP's undistorter.
 MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "dense/*/sparse", "dense/sparse")
@@ -230,6 +236,9 @@ class CaptureDataModule(ObjectDataModule):
         if refused and not captures:
             raise refused[0]
         if not captures:
+            for pattern, name in OTHERS.items():
+                for path in sorted(self.root.glob(pattern)):
+                    raise MissingFile(f"a capture of {name}", str(path))
             command = shlex.join(["completesplat", "data", "import", str(self.root), "cameras=colmap"])
             absent = "no cameras there: neither transforms.json nor sparse/0, nor folders that have one"
             raise MissingFile(f"{absent}; photos or a video get cameras by: {command}", str(self.root))
