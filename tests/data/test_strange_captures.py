@@ -18,7 +18,7 @@ from completesplat.data.captures.importing import import_capture
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_photographs, read_transforms
 from completesplat.data.sequences import PosedSequence
-from completesplat.errors import BadCamera, BadImage, BadPlacement, MissingFile, UnreadableFile
+from completesplat.errors import BadCamera, BadImage, BadPlacement, MissingFile
 from completesplat.geometry.cameras import Cameras, look_at
 from completesplat.scene import Views
 

@@ -34,7 +34,7 @@ FEWEST_HELD_OUT = 3
 # Files and folders of captures of other programs, and what converts them to one that is read.
 OTHERS = {
     "reconstruction.json": "OpenSfM: `opensfm export_colmap FOLDER` writes a model of COLMAP",
-    "*.r3d": "Record3D: unpack it, and `ns-process-data record3d --data FOLDER --output-dir OUT` writes transforms.json",
+    "*.r3d": "Record3D: unpacked, `ns-process-data record3d --data FOLDER --output-dir OUT` writes transforms.json",
     "*.xml": "Metashape: `ns-process-data metashape --data IMAGES --xml FILE --output-dir OUT` writes transforms.json",
 }
 TRANSFORMS = ("transforms.json", "transforms_train.json")  # the second is NeRF's (synthetic)
