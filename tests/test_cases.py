@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.lib.recfunctions import repack_fields
 from PIL import Image, ImageCms, ImageFilter
-from plyfile import PlyData
+from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 from support import exif_turned, some_gaussians, strict_json
 
@@ -276,6 +277,20 @@ def opened(name: str) -> Callable[[Path], object]:
     return read
 
 
+def unknown_splits(folder: Path) -> object:
+    """Read splits of other names, which give no captures."""
+    (folder / "splits.json").write_text('{"training": ["a"], "Test": ["b"]}')
+    return read_splits(folder / "splits.json", ["a", "b"])
+
+
+def flat_gaussians(folder: Path) -> object:
+    """Read a file of 2DGS, which has two scales."""
+    vertices = PlyData.read(CASES / "splats/ref.ply")["vertex"].data
+    names = [name for name in vertices.dtype.names if name != "scale_2"]
+    PlyData([PlyElement.describe(repack_fields(vertices[names]), "vertex")]).write(folder / "flat.ply")
+    return read_gaussians(folder / "flat.ply")
+
+
 def broken_config(folder: Path) -> object:
     """Open weights whose image size no network has."""
     shutil.copytree(shipped()["toy_objects"], folder / "weights")
@@ -328,6 +343,8 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     "masks_empty": (without_masks, "its masks are black everywhere"),
     "fisheye_bin": (opened("fisheye_bin"), "OPENCV_FISHEYE"),
     "splits_null": (lambda folder: read_splits(CASES / "splits_null/splits.json", ["a"]), "not None"),
+    "splits_unknown": (unknown_splits, "must be an object with train, val, test alone, not training, Test"),
+    "2dgs": (flat_gaussians, "flat Gaussians of 2DGS"),
     "image_size_33": (broken_config, "image_size"),
     "wild_pose": (
         lambda folder: CaptureDataModule(str(CASES / "wild_pose"), image_size=SIZE).source("train").read("wild_pose"),
