@@ -14,6 +14,8 @@ from completesplat.wording import printable
 SUFFIXES = (
     ".jpg",
     ".jpeg",
+    ".jpe",
+    ".jfif",
     ".png",
     ".webp",
     ".tif",

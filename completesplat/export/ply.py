@@ -24,9 +24,10 @@ MEANS = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
 COLORS = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALES = ("scale_0", "scale_1", "scale_2")
+FILTER = "filter_3D"  # of Mip-Splatting
 QUATERNIONS = ("rot_0", "rot_1", "rot_2", "rot_3")
 WRITTEN = (*MEANS, *NORMALS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
-REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
+REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES[:2], *QUATERNIONS)  # and the third scale, which 2DGS has not
 
 log = logging.getLogger(__name__)
 
@@ -74,33 +75,48 @@ def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian property"]:
 def read_ply(path: str | Path) -> Gaussians:
     """Read a 3DGS `.ply`, binary or ASCII, of this project or another.
 
-    Colours' harmonics above degree 3 are left out, with a warning, and other properties are ignored. Colours below 0
-    become 0, as in other 3DGS renderers.
+    Colours' harmonics above degree 3 are left out, with a warning, and other properties are ignored, but for
+    Mip-Splatting's filter, which is applied. Colours below 0 become 0, as in other 3DGS renderers.
 
     Raises:
-        PlyError: `read_vertices` fails, or no Gaussian is finite. A warning counts those that are not.
+        PlyError: `read_vertices` fails, the Gaussians are flat (2DGS), or none is finite. A warning counts those that
+            are not.
     """
     try:
         vertices = read_vertices(path, REQUIRED)
+        if SCALES[2] not in (vertices.dtype.names or ()):
+            raise PlyError(f"no property {SCALES[2]}: flat Gaussians of 2DGS, which other programs render; give 3DGS")
     except PlyError as error:
         raise PlyError(f"{path}: {error}") from error.__cause__
 
     def gather(names: Sequence[str]) -> Float[Tensor, "gaussian channel"]:
         return torch.from_numpy(np.stack([vertices[name].astype(np.float64) for name in names], axis=-1))
 
+    scales = gather(SCALES).exp()
+    opacities = gather(["opacity"])[:, 0].sigmoid()
+    if FILTER in (vertices.dtype.names or ()):
+        scales, opacities = _smoothed(scales, opacities, gather([FILTER]))
     further = _further_harmonics(vertices, path)
     colors = 0.5 + SH_C0 * gather(COLORS)
     gaussians = Gaussians(
         means=gather(MEANS).float(),
         quaternions=gather(QUATERNIONS).float(),
-        scales=gather(SCALES).exp().float(),
-        opacities=gather(["opacity"])[:, 0].sigmoid().float(),
+        scales=scales.float(),
+        opacities=opacities.float(),
         colors=(colors if further else colors.clamp(min=0)).float(),
     )
     if further:
         values = rearrange(gather(further), "gaussian (rgb coefficient) -> gaussian coefficient rgb", rgb=3)
         gaussians = DirectionalGaussians(**vars(gaussians), harmonics=values.float())
     return cleaned(gaussians, path, bounded)
+
+
+def _smoothed(
+    scales: Float[Tensor, "gaussian 3"], opacities: Float[Tensor, " gaussian"], filters: Float[Tensor, "gaussian 1"]
+) -> tuple[Float[Tensor, "gaussian 3"], Float[Tensor, " gaussian"]]:
+    """Return scales and opacities after Mip-Splatting's 3D filter, which keeps the integral of a Gaussian (eq. 9)."""
+    larger = (scales.square() + filters.square()).sqrt()
+    return larger, opacities * (scales / larger).prod(dim=-1)
 
 
 def _further_harmonics(vertices: np.ndarray, path: str | Path) -> list[str]:

@@ -85,7 +85,8 @@ def _read_splat(content: bytes) -> list[np.ndarray]:
     records = np.frombuffer(content, RECORD)
     colors = records["colors"] / 255
     rotations = records["quaternions"] / 128 - 1
-    return [records["means"], rotations, records["scales"], colors[:, 3], colors[:, :3]]
+    # A Gaussian is the same along both directions of an axis, so the sign of an extent means nothing.
+    return [records["means"], rotations, np.abs(records["scales"]), colors[:, 3], colors[:, :3]]
 
 
 def _read_spz(content: bytes) -> list[np.ndarray]:

@@ -4,13 +4,13 @@ import io
 import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pi_heif
-from PIL import Image, ImageFile, UnidentifiedImageError
+from PIL import Image, ImageCms, ImageFile, UnidentifiedImageError
 
 from completesplat.errors import BadImage, ImageError, MissingFile
 from completesplat.photo.exif import ORIENTATION, TRANSPOSITIONS, Tags, read_exif
@@ -32,12 +32,13 @@ def decode_image(
     mode: Literal["RGB", "L"],
     image_size: tuple[int, int] | None = None,
     turn: bool = True,
+    converts_profile: bool = False,
 ) -> Image.Image:
     """Decode one image of a data set to 8 bits, and turn it upright by its EXIF orientation, unless `turn` is false.
 
     Grey of 16 bits is scaled to 8. Transparent pixels are refused, because metrics depend on the background, which only
     the data set's maker can choose. Colour is refused for `mode` "L" (a mask), because its brightness is no
-    probability. Colour profiles are ignored, as by the loaders behind all published numbers on these data sets. Of an
+    probability. Of an
     MPO (a JPEG followed by previews) the first image is used; other files with several frames are refused. PNG's
     checksums are checked; flipped bits in a JPEG remain unnoticed.
 
@@ -45,6 +46,8 @@ def decode_image(
         source: the file, or its content.
         file: name for error messages.
         image_size: (height, width) that the upright image must have, if known.
+        converts_profile: convert colours from an embedded profile to sRGB. By default it is ignored, as by the loaders
+            behind all published numbers on CO3D, RealEstate10K and ShapeNet.
 
     Raises:
         MissingFile: the file does not exist.
@@ -56,6 +59,8 @@ def decode_image(
         if image_size is not None and image.size != image_size[::-1]:
             expected = f"its annotation says {image_size[0]} x {image_size[1]}"
             raise ImageError(f"has {image.height} x {image.width} pixels when upright, {expected}")
+        if converts_profile and mode == "RGB" and image.mode in EIGHT_BIT_MODES:
+            image = in_srgb(image)
         return _eight_bits(image, getattr(stored, "tag_v2", {}), mode)
 
 
@@ -159,6 +164,25 @@ def over_grey(image: Image.Image, value: float) -> Image.Image:
     """Composite an image over a grey value from 0 to 1 and return it in RGB."""
     grey = Image.new("RGBA", image.size, (round(255 * value),) * 3)
     return Image.alpha_composite(grey, image.convert("RGBA")).convert("RGB")
+
+
+def in_srgb(image: Image.Image) -> Image.Image:
+    """Return an image of 8 bits in RGB, or RGBA if it is transparent, converted from its embedded colour profile."""
+    profile = image.info.get("icc_profile")
+    transparent = image.has_transparency_data
+    plain = image.convert("RGBA" if transparent else "RGB")
+    converted = plain.convert("RGB")
+    if profile:
+        native = image if image.mode in ("L", "RGB", "CMYK") and not transparent else converted
+        # Like image viewers, ignore a damaged profile, or one whose colour model differs from the pixels'.
+        with suppress(ImageCms.PyCMSError, OSError):
+            embedded = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+            result = ImageCms.profileToProfile(native, embedded, ImageCms.createProfile("sRGB"), outputMode="RGB")
+            converted = native if result is None else result
+    if transparent:
+        converted.putalpha(plain.getchannel("A"))
+    converted.info.pop("icc_profile", None)
+    return converted
 
 
 def turn_upright(image: Image.Image, orientation: object) -> Image.Image:

@@ -1,10 +1,9 @@
 """Conversion of any photo to a model's square input image, with its field of view."""
 
-import io
 import math
 import os
 from collections.abc import Mapping
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -12,7 +11,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, ImageCms
+from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
@@ -329,16 +328,7 @@ def _resized(square: Image.Image, size: int) -> Float[Tensor, "3 _ _"]:
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous().float() / 255
 
 
-def _to_srgb(square: Image.Image, background: float) -> Image.Image:
-    """Composite an image over the background, and convert it from its embedded colour profile, if any, to RGB."""
-    profile = square.info.get("icc_profile")
-    if square.has_transparency_data:
-        square = files.over_grey(square, background)
-    if profile:
-        # Like image viewers, ignore a damaged profile, or one whose colour model differs from the pixels'.
-        with suppress(ImageCms.PyCMSError, OSError):
-            embedded = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-            native = square if square.mode in ("L", "RGB", "CMYK") else square.convert("RGB")
-            converted = ImageCms.profileToProfile(native, embedded, ImageCms.createProfile("sRGB"), outputMode="RGB")
-            return converted if converted is not None else native
-    return square.convert("RGB")
+def _to_srgb(image: Image.Image, background: float) -> Image.Image:
+    """Convert an image from its embedded colour profile to RGB, over the background where it is transparent."""
+    converted = files.in_srgb(image)
+    return files.over_grey(converted, background) if converted.mode == "RGBA" else converted

@@ -126,12 +126,19 @@ def _origin(config: Container, name: Any, place: str) -> str:
 
 def check_image_size(config: DictConfig) -> None:
     """Raise CompleteSplatError if training images cannot be halved as often as the networks halve them."""
-    multiple = 2 ** _halvings("model", config.get("model"))
     size = config.data.get("image_size")
-    if size is not None and size % multiple:
-        near = max(multiple, round(size / multiple) * multiple)
-        message = f"must be a multiple of {multiple} for the levels of these networks, such as {near}"
-        raise CompleteSplatError(f"data.image_size={size}: {message}")
+    reason = None if size is None else unfit_image_size(size, config.get("model"))
+    if reason is not None:
+        raise CompleteSplatError(f"data.image_size={size}: {reason}")
+
+
+def unfit_image_size(size: int, model: object) -> str | None:
+    """Return why images of this size do not fit the networks in a model's config, or None."""
+    multiple = 2 ** _halvings("model", model)
+    if size % multiple == 0:
+        return None
+    near = max(multiple, round(size / multiple) * multiple)
+    return f"must be a multiple of {multiple} for the levels of these networks, such as {near}"
 
 
 def _halvings(setting: str, config: object) -> int:

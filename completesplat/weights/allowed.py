@@ -23,10 +23,11 @@ from typing import Annotated, Any, Literal, NamedTuple, TypedDict, is_typeddict
 
 from huggingface_hub import constants
 from hydra.utils import get_object
+from omegaconf import OmegaConf
 
 from completesplat.errors import WeightsError
 from completesplat.quantities import Entries, Range, Share
-from completesplat.settings.checks import HYDRA_KEYS, START_WEIGHTS
+from completesplat.settings.checks import HYDRA_KEYS, START_WEIGHTS, unfit_image_size
 from completesplat.settings.options import LOADER, conf_folder
 from completesplat.settings.schema import hints_of, violations
 from completesplat.wording import SHORT, printable
@@ -287,6 +288,9 @@ def check_architecture(architecture: object, file: Path | None = None) -> None:
         if not hints.keys() - {"training"} <= settings.keys() <= hints.keys():
             raise WeightsError(f"a model's settings are {', '.join(hints)}")
         _check_settings("", hints, settings)
+        reason = unfit_image_size(settings["image_size"], OmegaConf.create({**settings}))
+        if reason is not None:
+            raise WeightsError(f"image_size={settings['image_size']}: {reason}")
     except WeightsError as error:
         raise (error if file is None else WeightsError(f"{file}: {error}")) from None
 

@@ -17,7 +17,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from support import write_capture
 
-from completesplat.data.captures import capture_images, importing
+from completesplat.data.captures import capture_images, films, importing
 from completesplat.data.captures.captured_frames import CapturedFrame
 from completesplat.data.captures.importing import image_pairs, import_capture
 from completesplat.data.captures.module import read_capture
@@ -164,12 +164,12 @@ def test_a_video_is_split_into_evenly_spread_frames_unless_they_are_too_large(tm
     grey = np.arange(40, dtype=np.uint8) * 6
     imageio.imwrite(tmp_path / "a.mp4", np.broadcast_to(grey[:, None, None, None], (40, 64, 64, 3)), fps=10)
     (images := tmp_path / "100%d images").mkdir()
-    capture_images.split_video(tmp_path / "a.mp4", images, asked)
+    films.split_video(tmp_path / "a.mp4", images, asked)
     means = [np.asarray(Image.open(path)).mean() for path in sorted(images.iterdir())]
     np.testing.assert_allclose(means, 6 * np.array(expected), atol=2)
-    monkeypatch.setattr(capture_images.files, "MOST_PIXELS", 64 * 64 - 1)
+    monkeypatch.setattr(films.files, "MOST_PIXELS", 64 * 64 - 1)
     with pytest.raises(DataError, match=r"a\.mp4: ffmpeg finds no video of at most 4,095 pixels there"):
-        capture_images.split_video(tmp_path / "a.mp4", images, asked)
+        films.split_video(tmp_path / "a.mp4", images, asked)
 
 
 def test_what_makes_no_capture_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):
@@ -220,6 +220,20 @@ def test_pycolmap_leaves_the_signal_that_ends_a_program_to_the_program():
         "os.kill(os.getpid(), signal.SIGTERM)",
     ]
     assert subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True).returncode == 9
+
+
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("reconstruction.json", "opensfm export_colmap"),
+        ("a.r3d", "ns-process-data record3d"),
+        ("cameras.xml", "ns-process-data metashape"),
+    ],
+)
+def test_captures_of_other_programs_are_named_with_what_converts_them(tmp_path, name, command):
+    (tmp_path / name).touch()
+    with pytest.raises(DataError, match=command):
+        import_capture(str(tmp_path), None, 100, 1000, tmp_path / "out")
 
 
 def write_photos(folder: Path, names: list[str]) -> None:

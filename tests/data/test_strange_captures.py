@@ -13,11 +13,12 @@ from realestate10k_trees import make_clip, module, write_tree
 from support import change_json, exif_turned
 
 from completesplat.baselines.fitting import gaussians_at_points
+from completesplat.data.captures.colmap import read_colmap
 from completesplat.data.captures.importing import import_capture
 from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.captures.transforms_json import read_photographs, read_transforms
 from completesplat.data.sequences import PosedSequence
-from completesplat.errors import BadImage, MissingFile, UnreadableFile
+from completesplat.errors import BadCamera, BadImage, BadPlacement, MissingFile
 from completesplat.geometry.cameras import Cameras, look_at
 from completesplat.scene import Views
 
@@ -169,10 +170,86 @@ COLMAP: dict[str, Change] = {
 }
 
 
-def test_images_without_lines_for_their_features_are_refused_because_every_second_would_be_lost(tmp_path):
+def test_images_without_lines_for_their_features_are_all_read(tmp_path):
+    write_colmap(tmp_path / "all")
+    write_colmap(tmp_path / "none")
+    lines_of_images(lambda lines: [line for line in lines if not line.startswith("1.5")])(tmp_path / "none")
+    must_agree(sequence(tmp_path / "none"), sequence(tmp_path / "all"))
+
+
+def test_a_full_lens_of_opencv_keeps_all_its_coefficients(tmp_path):
     write_colmap(tmp_path)
-    lines_of_images(lambda lines: [line for line in lines if not line.startswith("1.5")])(tmp_path)
-    with pytest.raises(UnreadableFile, match=r"images\.txt"):
+    lens = f"1 FULL_OPENCV {WIDTH} {HEIGHT} 19 19.5 8 6 0.1 0.2 0.3 0.4 0.5 0.6 0.7 0.8\n"
+    (tmp_path / "sparse/0/cameras.txt").write_text(lens)
+    capture = read_colmap(tmp_path / "sparse/0", tmp_path / "images")
+    assert capture.frames[0].lens.distortion == (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+
+
+@pytest.mark.parametrize(("listed", "suffix"), [("", ".png"), (".PNG", ".png"), (".png", ".PNG"), ("", ".PNG")])
+@pytest.mark.parametrize("write", [write_colmap, write_transforms])
+def test_photos_are_found_whatever_the_case_of_their_suffix_and_without_one(tmp_path, write, listed, suffix):
+    write(tmp_path / "a")
+    expected = sequence(tmp_path / "a")
+    for path in sorted((tmp_path / "a/images").iterdir()):
+        path.rename(path.with_suffix(suffix))
+    for path in (tmp_path / "a/sparse/0/images.txt", tmp_path / "a/transforms.json"):
+        if path.is_file():
+            path.write_text(path.read_text().replace(".png", listed))
+    must_agree(sequence(tmp_path / "a"), expected)
+
+
+def poses_changed(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    def edit(content) -> None:
+        for frame in content["frames"]:
+            frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+
+    change_json(folder / "transforms.json", edit)
+
+
+OTHERS = {
+    "axes=opencv matrices=camera_to_world": lambda pose: pose * [1, -1, -1, 1],
+    "axes=opengl matrices=world_to_camera": np.linalg.inv,
+    "axes=opencv matrices=world_to_camera": lambda pose: np.linalg.inv(pose * [1, -1, -1, 1]),
+}
+
+
+@pytest.mark.parametrize("settings", OTHERS)
+@pytest.mark.parametrize("with_points", [False, True])
+def test_cameras_that_look_away_are_refused_with_the_settings_that_turn_them(tmp_path, settings, with_points):
+    write_transforms(tmp_path / "a")
+    if with_points:
+        write_cloud(tmp_path / "a/points.ply", POINTS)
+        change_json(tmp_path / "a/transforms.json", lambda content: content | {"ply_file_path": "points.ply"})
+    expected = sequence(tmp_path / "a")
+    poses_changed(tmp_path / "a", OTHERS[settings])
+    with pytest.raises(BadPlacement, match=settings):
+        sequence(tmp_path / "a")
+    axes, matrices = (part.partition("=")[2] for part in settings.split())
+    import_capture(str(tmp_path / "a"), None, 100, 1000, tmp_path / "out", axes, matrices)
+    must_agree(sequence(tmp_path / "out/a"), expected, 1e-6)
+
+
+def write_cloud(path: Path, points: np.ndarray) -> None:
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
+    rows = "\n".join(" ".join(map(repr, row)) for row in points.tolist())
+    path.write_text(header + "".join(f"property double {axis}\n" for axis in "xyz") + f"end_header\n{rows}\n")
+
+
+def test_rotations_that_are_nearly_right_are_made_right_with_a_word(tmp_path, caplog):
+    write_transforms(tmp_path)
+    expected = sequence(tmp_path)
+    poses_changed(tmp_path, lambda pose: pose * [0.99, 0.99, 0.99, 1])
+    must_agree(sequence(tmp_path), expected)
+    assert "rotations are not orthonormal (R R^T - I up to 0.02) and are made so" in caplog.text
+    poses_changed(tmp_path, lambda pose: pose * [0.9, 0.9, 0.9, 1])
+    with pytest.raises(BadCamera, match="is not orthonormal"):
+        sequence(tmp_path)
+
+
+def test_intrinsics_of_another_size_than_the_photos_are_refused(tmp_path):
+    write_transforms(tmp_path)
+    change_json(tmp_path / "transforms.json", lambda content: content | {"cx": 0.13 * WIDTH, "cy": 0.13 * HEIGHT})
+    with pytest.raises(BadCamera, match=r"principal point .* the intrinsics are of another size"):
         sequence(tmp_path)
 
 

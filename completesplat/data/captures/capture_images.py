@@ -1,8 +1,6 @@
-"""Images of a capture that COLMAP can read, from photos or from a video."""
+"""Images of a capture that COLMAP can read, from photos."""
 
 import logging
-import re
-import subprocess
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -11,7 +9,7 @@ from PIL import ImageOps
 from rich.progress import track
 
 from completesplat.data.sequences import first_names
-from completesplat.errors import DataError, refused_to
+from completesplat.errors import refused_to
 from completesplat.photo import files, saving
 from completesplat.wording import counted, folder_names
 
@@ -19,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 
 def copy_photos(folder: Path, images: Path) -> None:
-    """Write upright photos, with the rest of their EXIF records, which has the focal length.
+    """Write upright photos in sRGB, with the rest of their EXIF records, which has the focal length.
 
     Photos of folders below are written into folders, each the photos of one camera.
     """
@@ -37,8 +35,9 @@ def copy_photos(folder: Path, images: Path) -> None:
             options = {"quality": 95, "subsampling": 0, "exif": upright.info.get("exif", b"")}
             place = images if photo.parent == folder else images / names[photo.parent]
             place.mkdir(exist_ok=True)
-            if upright.mode in ("CMYK", "YCbCr"):
-                upright = upright.convert("RGB")
+            profiled = "icc_profile" in upright.info and upright.mode in files.EIGHT_BIT_MODES
+            if profiled or upright.mode in ("CMYK", "YCbCr"):
+                upright = files.in_srgb(upright)
             lossy = image.format in ("JPEG", "MPO", "HEIF", "WEBP") and upright.mode in ("L", "RGB")
             suffix = ".jpg" if lossy else ".png"
             saving.save_image(upright, place / f"{stem}{suffix}", **options)
@@ -57,19 +56,3 @@ def _photos_in(folder: Path, formats: Sequence[str]) -> list[Path]:
     if unread:
         logger.warning("left out: %s of other formats: %s", counted(len(unread), "file"), first_names(unread))
     return photos
-
-
-def split_video(video: Path, images: Path, frames: int) -> None:
-    """Write the first frame of each of equal parts of a video, or all frames if there are fewer."""
-    from imageio_ffmpeg import get_ffmpeg_exe
-
-    limit = "-max_pixels", str(files.MOST_PIXELS)  # else a small file could take gigabytes
-    start = [get_ffmpeg_exe(), "-nostdin", *limit, "-i", str(video.absolute())]
-    output = subprocess.run([*start, "-map", "0:v:0", "-f", "null", "-"], capture_output=True).stderr
-    count = int((re.findall(rb"frame= *(\d+)", output) or [b"0"])[-1])
-    if not count:
-        raise DataError(f"ffmpeg finds no video of at most {files.MOST_PIXELS:,} pixels there", str(video))
-    part = f"{min(frames, count)}/{count}"
-    options = ["-vf", f"select=gt(floor(n*{part})\\,floor((n-1)*{part}))", "-fps_mode", "passthrough", "-q:v", "2"]
-    if subprocess.run([*start, "-v", "error", *options, "%05d.jpg"], cwd=images).returncode:
-        raise DataError("ffmpeg cannot split it; the reason is above", str(video))

@@ -12,6 +12,7 @@ from completesplat.data.splits import SPLITS, SeededSplit, split_by_seed
 from completesplat.data.validation import field, read_json, require_file
 from completesplat.errors import BadAnnotation, MissingFile, SharedSequences, errors_at
 from completesplat.quantities import Natural, Share
+from completesplat.wording import SHORT, printable
 
 SPLITS_FILE = "splits.json"
 MARKS = {"keyframes"}.union(TRANSFORMS, (model.split("/")[0] for model in MODELS))  # a folder with one is a capture
@@ -31,13 +32,16 @@ def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
         The captures of each split, in the order of `names`.
 
     Raises:
-        BadAnnotation: an entry is neither a capture nor a folder of captures.
+        BadAnnotation: the file holds anything else, or an entry is neither a capture nor a folder of captures.
         SharedSequences: two splits have captures of one object.
     """
     content = read_json(path)
     splits = dict[str, list[str]]()
     owners: dict[str, str] = {}
     with errors_at(path):
+        if type(content) is not dict or not content.keys() <= {*SPLITS} or not content:
+            keys = printable(", ".join(content), SHORT) if type(content) is dict else printable(repr(content), SHORT)
+            raise BadAnnotation(f"must be an object with {', '.join(SPLITS)} alone, not {keys or 'empty'}")
         for split in SPLITS:
             entries = field(content, split, list) if split in content else []
             members = set[str]()

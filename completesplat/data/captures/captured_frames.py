@@ -6,6 +6,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from os.path import isfile, splitext
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Literal
@@ -16,7 +17,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from completesplat.data.sequences import first_names
-from completesplat.data.validation import LARGEST, require_file
+from completesplat.data.validation import LARGEST, path_below, require_file
 from completesplat.errors import BadAnnotation, BadCamera, BadImage, ImageError, TooFewFrames, errors_at, needing
 from completesplat.geometry.cameras import Cameras
 from completesplat.photo import files
@@ -29,10 +30,16 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FEWEST_FRAMES = 6
+SUFFIXES = (".png", ".jpg", ".jpeg")  # NeRF (synthetic) leaves the suffix out
 SIDEWAYS = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 # Limits for an undistorted image's area and sides, relative to the distorted image's. Wrong coefficients exceed them.
 SMALLEST_AREA = 0.5
+LEAST_SIDE = 0.5  # of the largest square around the principal point, as a share of the image's shorter side
 LARGEST_SIDE = 2.0
+
+
+Listings = dict[Path, dict[str, str]]
+"""Names of the files in folders by their names in small letters."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,7 @@ class Lens:
     focal: tuple[float, float]  # along x and y
     center: tuple[float, float]  # the principal point (x, y)
     image_size: tuple[int, int]  # (height, width)
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
+    distortion: tuple[float, ...] = ()  # k1, k2, p1, p2, k3, k4, k5, k6 of OpenCV; those that are missing are 0
 
     def __post_init__(self) -> None:
         height, width = self.image_size
@@ -53,6 +60,9 @@ class Lens:
             raise BadCamera(f"sizes and focal lengths must be positive, not {width} x {height} and {self.focal}")
         if not (0 < x < width and 0 < y < height):
             raise BadCamera(f"principal point ({x:g}, {y:g}) lies outside of the {width} x {height} image")
+        if 2 * min(x, y, width - x, height - y) < LEAST_SIDE * min(height, width):
+            place = f"principal point ({x:g}, {y:g}) lies near the edge of the {width} x {height} image"
+            raise BadCamera(f"{place}: the intrinsics are of another size; give w and h of that size beside them")
 
     def resized(self, image_size: tuple[int, int]) -> "Lens":
         """Return the lens of images that are resized to (height, width)."""
@@ -107,11 +117,11 @@ class CapturedFrame:
                     files.check_sums(stored, self.image)
                     stored.load()
                     turned = files.turn_upright(stored, orientation)
-                    image = files.over_grey(turned, 1.0)
+                    image = files.over_grey(files.in_srgb(turned), 1.0)
                     mask = turned.convert("RGBA").getchannel("A")
             if mask is None:
                 turn = orientation is not None
-                image = files.decode_image(self.image, str(self.image), "RGB", self.lens.image_size, turn)
+                image = files.decode_image(self.image, str(self.image), "RGB", self.lens.image_size, turn, True)
             if self.mask is not None:
                 mask = files.decode_image(self.mask, str(self.mask), "L")
                 mask = mask.resize(image.size, Image.Resampling.BILINEAR)
@@ -119,6 +129,13 @@ class CapturedFrame:
             if mask is None:
                 return image, Image.new("L", image.size, 255)
             return image, undistort(mask, self.lens)
+
+    def is_hidden(self) -> bool:
+        """Return whether the frame has a mask file that is black everywhere."""
+        if self.mask is None:
+            return False
+        with errors_at(self.image, frame=self.number):
+            return files.decode_image(self.mask, str(self.mask), "L").getbbox() is None
 
     def check(self) -> object:
         """Check the headers of image and mask. (`read` also finds damaged contents.)
@@ -172,6 +189,40 @@ def in_order(frames: Sequence[CapturedFrame]) -> tuple[CapturedFrame, ...]:
         if first != frame.number:
             raise BadAnnotation(f"the same image as frame {first}: {frame.image}", frame=frame.number)
     return tuple(sorted(frames, key=lambda frame: by_numbers(frame.image)))
+
+
+def present_image(root: Path, name: str, listings: Listings) -> Path:
+    """Return the path of an image below `root`, whose name may lack its suffix or have another case.
+
+    Args:
+        listings: folders that were listed already; it is added to.
+
+    Returns:
+        The path, also if there is no such image.
+
+    Raises:
+        OutsidePath: as in `path_below`.
+    """
+    name = name.replace("\\", "/")
+    for suffix in ("", *SUFFIXES):
+        # `path_below` resolves links, which takes long for many missing images.
+        if isfile(root / (name + suffix)):
+            return path_below(root, name + suffix)
+    image = path_below(root, name)
+    if image.parent not in listings:
+        paths = sorted(image.parent.iterdir()) if image.parent.is_dir() else []
+        listings[image.parent] = {_plain(path.name): path.name for path in paths}
+    for suffix in ("", *SUFFIXES):
+        other = listings[image.parent].get(_plain(image.name + suffix))
+        if other is not None:
+            return image.with_name(other)
+    return image
+
+
+def _plain(name: str) -> str:
+    """Return a file name in small letters, with `.jpg` for JPEG's other suffixes."""
+    stem, suffix = splitext(name.lower())
+    return f"{stem}.jpg" if suffix in (".jpeg", ".jpe", ".jfif") else stem + suffix
 
 
 def warn_of_missing(path: Path, missing: Sequence[str], frames: int) -> None:
@@ -246,5 +297,6 @@ def import_pycolmap() -> ModuleType:
 
 def _distorted(lens: Lens) -> "Camera":
     height, width = lens.image_size
-    params = [*lens.focal, *lens.center, *lens.distortion, 0.0, 0.0, 0.0]
+    coefficients = [*lens.distortion, *[0.0] * 8][:8]
+    params = [*lens.focal, *lens.center, *coefficients]
     return import_pycolmap().Camera(model="FULL_OPENCV", width=width, height=height, params=params)

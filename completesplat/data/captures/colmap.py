@@ -15,16 +15,32 @@ from completesplat.data.captures.captured_frames import (
     Capture,
     CapturedFrame,
     Lens,
+    Listings,
     fit_lens,
     in_order,
+    present_image,
     warn_of_missing,
 )
 from completesplat.data.validation import finite_array, path_below, read_text, require_file
 from completesplat.errors import BadAnnotation, BadCamera, DataError, MissingFile, UnreadableFile, errors_at
 from completesplat.geometry.rotations import quaternion_to_matrix
 
-# Names and numbers of parameters by model id (colmap, `src/colmap/sensor/models.h`); other models are refused.
-MODELS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+# Names and numbers of parameters by model id (colmap, `src/colmap/sensor/models.h`).
+MODELS = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+}
+READ = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 PARTS = ("cameras", "images", "points3D")
 
 Row = Sequence[float | str]
@@ -53,7 +69,7 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
     files = tuple(require_file(model / f"{name}.{suffix}") for name in PARTS)
     lenses = dict(_parsed(_camera_of, read, files[0]))
     with errors_at(files[1]):
-        posed = _parsed(partial(_frame_of, lenses=lenses, images=images, masks=masks), read, files[1])
+        posed = _parsed(partial(_frame_of, lenses=lenses, images=images, masks=masks, listings={}), read, files[1])
         missing = sorted(frame.image.relative_to(images).as_posix() for frame in posed if not isfile(frame.image))
         warn_of_missing(files[1], missing, len(posed))
         frames = in_order([fit_lens(frame) for frame in posed if isfile(frame.image)])
@@ -101,14 +117,16 @@ def _camera_of(row: Row) -> tuple[int, Lens]:
     match kind, parameters:
         case ["SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL", (f, cx, cy, *radial)]:
             k1, k2 = [*radial, 0.0, 0.0][:2]
-            return int(number), Lens((f, f), (cx, cy), size, (k1, k2, 0.0, 0.0, 0.0))
-        case ["PINHOLE" | "OPENCV", (fx, fy, cx, cy, *distortion)]:
-            k1, k2, p1, p2 = distortion or (0.0,) * 4
-            return int(number), Lens((fx, fy), (cx, cy), size, (k1, k2, p1, p2, 0.0))
-    raise BadCamera(f"camera model {kind} is not supported; undistort the images with COLMAP's image_undistorter")
+            return int(number), Lens((f, f), (cx, cy), size, (k1, k2))
+        case ["PINHOLE" | "OPENCV" | "FULL_OPENCV", (fx, fy, cx, cy, *distortion)]:
+            return int(number), Lens((fx, fy), (cx, cy), size, tuple(distortion))
+    advice = "undistort the images with COLMAP's image_undistorter"
+    raise BadCamera(f"camera model {kind} is not supported (there are: {', '.join(READ)}); {advice}")
 
 
-def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | None) -> CapturedFrame:
+def _frame_of(
+    row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | None, listings: Listings
+) -> CapturedFrame:
     """Return an image with its camera. A row has number, pose (qw, qx, qy, qz, tx, ty, tz), camera and name."""
     number = int(row[0])
     camera = int(row[8])
@@ -122,7 +140,7 @@ def _frame_of(row: Row, lenses: Mapping[int, Lens], images: Path, masks: Path | 
         world_to_camera = np.eye(4)
         world_to_camera[:3, :3] = quaternion_to_matrix(torch.from_numpy(pose[:4])).numpy()
         world_to_camera[:3, 3] = pose[4:]
-        image = path_below(images, name)
+        image = present_image(images, name, listings)
         mask = None if masks is None or not isfile(image) else _find_mask(masks, name)
         return CapturedFrame(number, image, mask, lenses[camera], world_to_camera, "ignored")
 
@@ -139,12 +157,18 @@ def _find_mask(masks: Path, name: str) -> Path:
 def _text_rows(path: Path) -> Iterator[Row]:
     """Yield the entries of a text file. Those of images have a second line for their features, which may be empty."""
     lines = map(str.strip, read_text(path).split("\n"))
+    of_images = path.stem == "images"
     for line in lines:
-        if line and not line.startswith("#"):
-            yield line.split(maxsplit=9 if path.stem == "images" else -1)
-            # Features are triples; another number of values is that of an image, and this one's line is missing.
-            if path.stem == "images" and len(next(lines, "").split()) % 3:
-                raise ValueError
+        while line and not line.startswith("#"):
+            yield line.split(maxsplit=9 if of_images else -1)
+            following = next(lines, "") if of_images else ""
+            # Another line than one of features is that of the next image.
+            line = "" if _are_features(following.split()) else following
+
+
+def _are_features(words: Sequence[str]) -> bool:
+    """Return whether the words of a line are triples of two coordinates and the whole number of a point."""
+    return len(words) % 3 == 0 and all(word.lstrip("-").isdecimal() for word in words[2::3])
 
 
 def _binary_rows(path: Path) -> Iterator[Row]:
@@ -161,10 +185,9 @@ def _binary_rows(path: Path) -> Iterator[Row]:
     for _ in range(take("Q")[0]):
         if path.stem == "cameras":
             number, model, width, height = take("IiQQ")
-            kind = model
-            count = 0
-            if 0 <= model < len(MODELS):
-                kind, count = list(MODELS.items())[model]
+            if not 0 <= model < len(MODELS):
+                raise BadCamera(f"camera model number {model} is not supported; there are: {', '.join(READ)}")
+            kind, count = list(MODELS.items())[model]
             yield number, kind, width, height, *take(f"{count}d")
         elif path.stem == "images":
             numbers = take("I7dI")

@@ -3,20 +3,25 @@
 Photos and videos without cameras get them first: COLMAP finds them, and those of a turntable are known.
 """
 
+import json
 import logging
 import shlex
+import shutil
 from itertools import combinations
 from pathlib import Path
 from typing import Literal, Unpack
 
 from rich.progress import Progress, track
 
-from completesplat.data.captures.capture_images import copy_photos, split_video
+from completesplat.data.captures.capture_images import copy_photos
 from completesplat.data.captures.captured_frames import FEWEST_FRAMES, import_pycolmap
-from completesplat.data.captures.module import CaptureDataModule
+from completesplat.data.captures.conventions import AXES, MATRICES, to_camera_to_world
+from completesplat.data.captures.films import split_video
+from completesplat.data.captures.module import TRANSFORMS, CaptureDataModule
 from completesplat.data.captures.turntable import TurntableSettings, import_turntables
+from completesplat.data.validation import field, finite_array, read_json
 from completesplat.data.validation.processes import usable_cores
-from completesplat.errors import DataError
+from completesplat.errors import CompleteSplatError, DataError, errors_at
 from completesplat.files import atomic_folder
 from completesplat.photo import files
 from completesplat.quantities import Positive
@@ -35,13 +40,21 @@ def import_capture(
     frames: Positive,
     max_image_size: Positive,
     out: Path,
+    axes: Literal["opengl", "opencv"] = "opengl",
+    matrices: Literal["camera_to_world", "world_to_camera"] = "camera_to_world",
     **turntable: Unpack[TurntableSettings],
 ) -> str:
     """Check the cameras of captures, or find the cameras of photos or a video first, and return the next command."""
     if cameras == "turntable":
         import_turntables(Path(folder), out, turntable)
         return f"go on with: completesplat data show data=turntable {shlex.quote(f'data.root={out}')}"
-    root = Path(folder) if cameras is None else _make_capture(Path(folder), frames, max_image_size, out)
+    other_convention = (axes, matrices) != (AXES[0], MATRICES[0])
+    if cameras is not None and other_convention:
+        raise CompleteSplatError("axes and matrices are of captures that have cameras: leave out cameras=colmap")
+    if other_convention:
+        root = _converted_capture(Path(folder), axes, matrices, out)
+    else:
+        root = Path(folder) if cameras is None else _make_capture(Path(folder), frames, max_image_size, out)
     sources = CaptureDataModule(str(root)).open("train")
     for error in sources["train"].refused:
         logger.warning("left out: %s", error)
@@ -52,6 +65,23 @@ def import_capture(
     names = sources["train"].names
     first = root if len(names) == 1 else root / names[0]  # of several captures
     return f"go on with: completesplat fit experiment=capture {shlex.quote(f'data.root={first}')}"
+
+
+def _converted_capture(source: Path, axes: str, matrices: str, out: Path) -> Path:
+    """Write and return `out`/NAME, a copy of a capture with `transform_matrix` as camera-to-world, OpenGL's axes."""
+    name = TRANSFORMS[0]
+    content = read_json(source / name, allow_nan=True)
+    for number, frame in enumerate(field(content, "frames", list)):
+        with errors_at(source / name, frame=number):
+            matrix = finite_array(field(frame, "transform_matrix", list), (4, 4), "transform_matrix")
+            frame["transform_matrix"] = to_camera_to_world(matrix, axes, matrices).tolist()
+    capture = out / source.resolve().name
+    if capture.exists():
+        raise DataError("exists already: choose another out=DIR", str(capture))
+    with atomic_folder(capture) as unfinished:
+        shutil.copytree(source, unfinished, dirs_exist_ok=True)
+        (unfinished / name).write_text(json.dumps(content, indent=1) + "\n")
+    return capture
 
 
 def _make_capture(source: Path, frames: int, max_image_size: int, out: Path) -> Path:

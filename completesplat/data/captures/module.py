@@ -14,13 +14,14 @@ import torch
 
 from completesplat.data.captures.captured_frames import Capture, CapturedFrame
 from completesplat.data.captures.colmap import image_count, is_model, read_colmap
+from completesplat.data.captures.conventions import require_sight
 from completesplat.data.captures.transforms_json import read_polycam, read_transforms
 from completesplat.data.loading.object_data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.placement import ObjectFraming, from_cameras, from_points, placed_sequence, upright_axes
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.data.splits import SPLITS
-from completesplat.errors import DataError, MissingFile, errors_at, refused_to
+from completesplat.errors import BadImage, DataError, MissingFile, errors_at, refused_to
 from completesplat.quantities import Range
 
 logger = logging.getLogger(__name__)
@@ -30,6 +31,12 @@ logger = logging.getLogger(__name__)
 FARTHEST = 5.0
 FARTHEST_USED = 100_000
 FEWEST_HELD_OUT = 3
+# Files and folders of captures of other programs, and what converts them to one that is read.
+OTHERS = {
+    "reconstruction.json": "OpenSfM: `opensfm export_colmap FOLDER` writes a model of COLMAP",
+    "*.r3d": "Record3D: unpacked, `ns-process-data record3d --data FOLDER --output-dir OUT` writes transforms.json",
+    "*.xml": "Metashape: `ns-process-data metashape --data IMAGES --xml FILE --output-dir OUT` writes transforms.json",
+}
 TRANSFORMS = ("transforms.json", "transforms_train.json")  # the second is NeRF's (synthetic)
 # Of COLMAP, nerfstudio, and COLMAP's undistorter.
 MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "dense/*/sparse", "dense/sparse")
@@ -135,10 +142,15 @@ class CaptureSource(SequenceSource):
         return self._sequences[name]
 
     def check(self, name: str) -> None:
-        """Check the headers of all images of a capture, or raise a DataError."""
+        """Check the headers of all images of a capture, and that a mask shows something, or raise a DataError."""
         with errors_at(sequence=name):
-            for frame in self._captures[name].frames:
+            frames = self._captures[name].frames
+            for frame in frames:
                 frame.check()
+            if all(frame.is_hidden() for frame in frames):
+                raise BadImage(
+                    "its masks are black everywhere; a mask is white where the object is", str(frames[0].mask)
+                )
 
     def _make(self, name: str) -> PosedSequence:
         """Place the object by all frames, so that all splits have the same scale, and move it to the origin.
@@ -148,6 +160,8 @@ class CaptureSource(SequenceSource):
         capture = self._captures[name]
         cameras = [frame.camera() for frame in capture.frames]
         points = capture.points
+        if capture.files[0].suffix == ".json":  # COLMAP's convention is known
+            require_sight(cameras, points)
         if points is None:
             placement = from_cameras(cameras)
         else:
@@ -222,6 +236,9 @@ class CaptureDataModule(ObjectDataModule):
         if refused and not captures:
             raise refused[0]
         if not captures:
+            for pattern, name in OTHERS.items():
+                for path in sorted(self.root.glob(pattern)):
+                    raise MissingFile(f"a capture of {name}", str(path))
             command = shlex.join(["completesplat", "data", "import", str(self.root), "cameras=colmap"])
             absent = "no cameras there: neither transforms.json nor sparse/0, nor folders that have one"
             raise MissingFile(f"{absent}; photos or a video get cameras by: {command}", str(self.root))

@@ -1,5 +1,6 @@
 """Reader of captures that consist of a `transforms.json` and images, the format of NeRF, instant-ngp and nerfstudio."""
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,11 +17,14 @@ from completesplat.data.captures.captured_frames import (
     Capture,
     CapturedFrame,
     Lens,
+    Listings,
     fit_lens,
     in_order,
+    present_image,
     warn_of_missing,
 )
 from completesplat.data.validation import (
+    ROTATION_TOLERANCE,
     field,
     finite_array,
     path_below,
@@ -37,6 +41,8 @@ from completesplat.photo.reading import Framing, read_square
 from completesplat.scene import Views
 from completesplat.tensors import stack
 
+logger = logging.getLogger(__name__)
+
 # OpenCV's distortion coefficients, and those of each camera model. There is no `k4`, on which programs disagree.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 USED: dict[str, tuple[str, ...]] = {
@@ -47,6 +53,7 @@ USED: dict[str, tuple[str, ...]] = {
     "OPENCV": COEFFICIENTS,
 }
 OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+MOST_SKEW = 0.1  # of rotations that are made orthonormal, as entries of R R^T - I
 FEWEST_CAMERAS = 2
 SAME_FOCAL = 1e-3
 POLYCAM = {
@@ -57,7 +64,6 @@ POLYCAM = {
     "w": "width",
     "h": "height",
 }
-SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # NeRF (synthetic) leaves the suffix out.
 
 
 def read_transforms(path: Path) -> Capture:
@@ -162,7 +168,7 @@ def read_cameras(path: Path, size: int) -> list[Cameras]:
                     values["w"] = size
                     values["h"] = size
                 lens = _read_lens(values, path)
-                pose = torch.from_numpy(_read_pose(entry.get("transform_matrix")))
+                pose = torch.from_numpy(_read_pose(entry.get("transform_matrix"))[0])
                 if any(lens.distortion) or not math.isclose(*lens.focal, rel_tol=SAME_FOCAL):
                     raise BadCamera(f"only pinhole cameras are rendered, not {lens.focal}, {lens.distortion}")
                 height, width = lens.image_size
@@ -180,41 +186,44 @@ def _read_frames(path: Path, content: Any) -> list[CapturedFrame]:
     root = path.parent
     frames = []
     missing = []
+    skew = 0.0
+    listings: Listings = {}
     with errors_at(path):
         entries = field(content, "frames", list)
         for number, entry in enumerate(entries):
             with errors_at(frame=number):
-                name = field(entry, "file_path", str).replace("\\", "/")
-                # `path_below` resolves links, which takes long for many missing images.
-                suffix = next((suffix for suffix in SUFFIXES if isfile(root / (name + suffix))), None)
-                image = path_below(root, name + (suffix or ""))
-                if suffix is None:
+                name = field(entry, "file_path", str)
+                image = present_image(root, name, listings)
+                if not isfile(image):
                     missing.append(name)
                     continue
                 mask = None
                 if entry.get("mask_path") is not None:
                     mask = require_file(path_below(root, field(entry, "mask_path", str)))
                 values = {**content, **entry}
-                pose = _read_pose(entry.get("transform_matrix"))
+                pose, error = _read_pose(entry.get("transform_matrix"))
+                skew = max(skew, error)
                 frame = CapturedFrame(number, image, mask, _read_lens(values, image), pose)
                 sized = {"w", "h"} <= values.keys()
                 frames.append(fit_lens(frame) if sized else replace(frame, orientation="unknown"))
     warn_of_missing(path, missing, len(entries))
+    if skew > ROTATION_TOLERANCE:
+        logger.warning("%s: rotations are not orthonormal (R R^T - I up to %.2g) and are made so", path, skew)
     return frames
 
 
-def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
-    """Convert `transform_matrix` to world-to-camera with OpenCV's axes."""
+def _read_pose(matrix: object) -> tuple[Float[np.ndarray, "4 4"], float]:
+    """Convert `transform_matrix` to world-to-camera with OpenCV's axes, and return also its entry of R R^T - I."""
     pose = finite_array(matrix, (4, 4), "transform_matrix")
     if not np.allclose(pose[3], [0, 0, 0, 1]):
         raise BadCamera(f"transform_matrix ends in the row {pose[3].tolist()}, not in 0, 0, 0, 1")
-    require_rotation(pose[:3, :3], "the rotation of transform_matrix")
-    # The nearest rotation: an error of rounding would be multiplied by the distance from the origin.
+    skew = require_rotation(pose[:3, :3], "the rotation of transform_matrix", MOST_SKEW)
+    # The nearest rotation: even an error of rounding would be multiplied by the distance from the origin.
     u, _, vt = np.linalg.svd(pose[:3, :3] * [1, -1, -1])
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3] = (u @ vt).T
     world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ pose[:3, 3]
-    return world_to_camera
+    return world_to_camera, skew
 
 
 def _read_lens(values: Mapping[str, object], image: Path) -> Lens:

@@ -205,7 +205,7 @@ def _read_photo(path: Path, background: str | None) -> Photo:
             if stored.mode not in files.EIGHT_BIT_MODES:
                 raise ImageError(f"colour mode {stored.mode} is not supported")
             files.check_sums(stored, path)
-            image = ImageOps.exif_transpose(stored).convert("RGBA")
+            image = files.in_srgb(ImageOps.exif_transpose(stored)).convert("RGBA")
         image.thumbnail((MOST_SIDE, MOST_SIDE), Image.Resampling.LANCZOS)
         if background is not None:
             image = files.over_grey(image, 1.0)

@@ -13,6 +13,7 @@ from completesplat.data.rendered._placement import stray_faces
 from completesplat.data.rendered.assets import BrokenMesh, gltf_description
 from completesplat.errors import CompleteSplatError
 from completesplat.installation import install_command
+from completesplat.ply_files import LONGEST_HEADER
 
 READABLE = (".glb", ".gltf", ".obj", ".ply")
 """Suffixes that trimesh reads with their textures; Blender reads the others."""
@@ -153,6 +154,8 @@ def read_mesh(path: Path, root: Path, up: str | None = None) -> TexturedMesh:
         BrokenMesh: trimesh cannot read it, a texture is missing or cannot be read, or its faces cannot be drawn.
     """
     trimesh = import_trimesh()
+    if path.suffix.lower() == ".ply":
+        _require_one_texture(path)
     files: Any = TextureFiles(path, root)
     with path.open("rb") as file:
         try:
@@ -177,6 +180,14 @@ def read_mesh(path: Path, root: Path, up: str | None = None) -> TexturedMesh:
         raise BrokenMesh("it has no faces")
     axis = up if up is not None and kind in WITHOUT_STANDARD else UP_AXES[kind]
     return _joined(parts, TURNS[axis], _beyond(description))
+
+
+def _require_one_texture(path: Path) -> None:
+    """Refuse a PLY file with several textures, of which trimesh takes the last one for all faces."""
+    with path.open("rb") as file:
+        header = file.read(LONGEST_HEADER).partition(b"end_header")[0]
+    if header.count(b"comment TextureFile") > 1:
+        raise BrokenMesh("a PLY file with several textures; save it as .obj or .glb")
 
 
 def _require_texture(geometry: Any, description: dict[str, Any]) -> None:

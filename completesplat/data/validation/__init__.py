@@ -151,13 +151,14 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
     return array
 
 
-def require_rotation(matrix: np.ndarray, what: str) -> None:
-    """Refuse a 3 x 3 matrix that is no rotation, with a tolerance of 1e-3 for each entry of R R^T."""
-    error = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    if error > ROTATION_TOLERANCE:
-        raise BadCamera(f"{what} is not orthonormal (R R^T - I up to {error:.2g}, at most {ROTATION_TOLERANCE:g})")
+def require_rotation(matrix: np.ndarray, what: str, tolerance: float = ROTATION_TOLERANCE) -> float:
+    """Refuse a 3 x 3 matrix that is no rotation, and return the largest entry of R R^T - I, which is tolerated."""
+    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    if error > tolerance:
+        raise BadCamera(f"{what} is not orthonormal (R R^T - I up to {error:.2g}, at most {tolerance:g})")
     if np.linalg.det(matrix) < 0:
         raise BadCamera(f"{what} is a reflection, not a rotation")
+    return error
 
 
 @contextmanager

@@ -146,3 +146,37 @@ def test_a_material_that_says_nothing_is_of_metal_by_the_standard_unless_a_textu
     surface = '"metallicRoughnessTexture": {"index": 0}, "baseColorTexture"'
     triangle.write_text(triangle.read_text().replace('"baseColorTexture"', surface))
     assert read_mesh(triangle, tmp_path).beyond == ""
+
+
+PER_FACE = "", "property list uchar float texcoord\n", "", " 6 0 0 1 0 0 1"
+PER_VERTEX = "property float s\nproperty float t\n", "", " .5 .5", ""
+
+
+def write_textured_ply(folder: Path, stored: tuple[str, str, str, str], textures: int) -> Path:
+    """Write a tetrahedron with red textures, whose coordinates are those of faces or of vertices."""
+    vertex, face, of_vertex, of_face = stored
+    names = "".join(f"comment TextureFile {number}.png\n" for number in range(textures))
+    for number in range(textures):
+        Image.new("RGB", (8, 8), (200, 30, 30)).save(folder / f"{number}.png")
+    axes = "property float x\nproperty float y\nproperty float z\n"
+    faces = f"element face 4\nproperty list uchar int vertex_indices\n{face}end_header\n"
+    rows = [f"{corner}{of_vertex}\n" for corner in ("0 0 0", "1 0 0", "0 1 0", "0 0 1")]
+    rows += [f"3 {corners}{of_face}\n" for corners in ("0 2 1", "0 1 3", "1 2 3", "0 3 2")]
+    header = f"ply\nformat ascii 1.0\n{names}element vertex 4\n{axes}{vertex}{faces}"
+    (folder / "a.ply").write_text(header + "".join(rows))
+    return folder / "a.ply"
+
+
+@pytest.mark.parametrize("stored", [PER_FACE, PER_VERTEX])
+def test_a_ply_file_has_its_texture(tmp_path, stored):
+    mesh = read_mesh(write_textured_ply(tmp_path, stored, 1), tmp_path.resolve())
+    start = mesh.textures.levels[0, 0, 0]
+    values = np.array([200, 30, 30]) / 255
+    linear = ((values + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(mesh.textures.texels[start : start + 3] / 65535, linear, atol=1e-4)
+    np.testing.assert_allclose(mesh.colors, 1)
+
+
+def test_a_ply_file_with_several_textures_is_refused(tmp_path):
+    with pytest.raises(BrokenMesh, match="several textures"):
+        read_mesh(write_textured_ply(tmp_path, PER_FACE, 2), tmp_path.resolve())
