@@ -24,6 +24,7 @@ from completesplat.files import file_refusal
 from completesplat.settings import composition, help
 from completesplat.settings.arguments import SWEEP, for_hydra
 from completesplat.settings.options import conf_folder
+from completesplat.settings.sweeps import check_sweep
 from completesplat.signals import end_with, ended_by_signals
 
 CALLED = re.compile(r"Error in call to target '(?:torch|lightning|diffusers|torchmetrics)\.")
@@ -56,6 +57,7 @@ def launch(verb: str, arguments: list[str]) -> None:
     overrides = for_hydra(verb, arguments)
     _check_start(overrides)
     if is_sweep(overrides):
+        check_sweep(overrides)
         overrides += composition.sweep_arguments(verb, overrides)
     sys.argv = [f"completesplat {verb}", *overrides]
     failures: list[Exception] = []
@@ -107,6 +109,7 @@ def _join_job(verb: str, argument: str) -> None:
     with ended_by_signals():
         config = OmegaConf.load(Path(out, CONFIG))
         assert isinstance(config, DictConfig)
+        jobs.resolve_start_weights(config)
         jobs.start(verb, config, Path(out))
 
 

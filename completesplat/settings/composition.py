@@ -22,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.arguments import for_hydra
 from completesplat.settings.options import conf_folder, did_you_mean, groups, options
+from completesplat.settings.sweeps import swept_overrides
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 UNKNOWN_KEY = re.compile(r"Could not override '([^']+)'\.\s*(?:To append to your config use .*)?")
@@ -126,9 +127,7 @@ def sweep_arguments(verb: str, arguments: Sequence[str]) -> list[str]:
 
 def swept_keys(arguments: Sequence[str]) -> list[str]:
     """Return the keys to which a command line gives several values (`seed=0,1`, `ablation=glob(*)`), in its order."""
-    overrides = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
-    parsed = OverridesParser.create().parse_overrides(overrides)
-    return [override.key_or_group for override in parsed if override.is_sweep_override()]
+    return [override.key_or_group for override in swept_overrides(arguments)]
 
 
 def typed_keys(overrides: Sequence[str]) -> list[str]:
