@@ -27,7 +27,7 @@ from completesplat.settings.options import conf_folder
 from completesplat.settings.sweeps import check_sweep
 from completesplat.signals import end_with, ended_by_signals
 
-CALLED = re.compile(r"Error in call to target '(?:torch|lightning|diffusers|torchmetrics)\.")
+CALLED = re.compile(r"Error in call to target '(torch|lightning|diffusers|torchmetrics)\.")
 UNHELPFUL_WARNINGS = (
     ".*does not have many workers.*",
     ".*but have no `val_dataloader`.*",
@@ -156,8 +156,12 @@ def _of_a_part(error: InstantiationException) -> str | None:
     cause = error.__cause__
     if cause is not None and isinstance(cause.__cause__, ModuleNotFoundError):
         return str(cause)
-    refused = isinstance(cause, ValueError | TypeError) or type(cause).__name__ == "MisconfigurationException"
-    if CALLED.match(str(error)) is None or not refused:
+    called = CALLED.match(str(error))
+    if called is None:
+        return None
+    # Lightning looks at the machine and at environment variables, and raises errors of many types.
+    of_lightning = called[1] == "lightning" and isinstance(cause, Exception)
+    if not of_lightning and not isinstance(cause, ValueError | TypeError):
         return None
     return f"{str(error).rpartition('full_key: ')[2].strip()}: {cause}"
 

@@ -13,7 +13,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.weights import RUN_CHECKPOINT
 
 START = ("model.autoreconstructor_checkpoint", "model.checkpoint", "ckpt_path")
-"""Settings of stage 2 that name a checkpoint with stage 1's weights; `ckpt_path=last` is a run with the same settings."""
+"""Settings of stage 2 that name a checkpoint with stage 1's weights; that of `ckpt_path=last` has the same settings."""
 PLACES = ("autoreconstructor", "model.completesplat.autoreconstructor")
 KIND = "VariationalAutoReconstructor"
 

@@ -17,7 +17,7 @@ from completesplat.commands.earlier_stage import take_architecture
 from completesplat.commands.evaluate import built_parts
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
-from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError
+from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError, own_errors
 from completesplat.evaluation.protocol import describe_test, scored_data, set_metrics
 from completesplat.evaluation.provenance import checkpoint_facts
 from completesplat.evaluation.records import SCORES, read_record
@@ -54,10 +54,11 @@ def instantiate(config: DictConfig) -> tuple[SceneDataModule, Scorer]:
     checks.check_parts(config)
     checks.check_image_size(config)
     checks.check_optimizer(config.optimizer)
-    data = hydra.utils.instantiate(config.data, _convert_="all")
-    module = hydra.utils.instantiate(config.model, _convert_="all")
-    if config.test:
-        set_metrics(module, config.evaluation)
+    with own_errors():
+        data = hydra.utils.instantiate(config.data, _convert_="all")
+        module = hydra.utils.instantiate(config.model, _convert_="all")
+        if config.test:
+            set_metrics(module, config.evaluation)
     if isinstance(module, Stage):
         module.keep_config(config.model)
     return data, module

@@ -41,6 +41,7 @@ class LogFile(logging.FileHandler):
     def __init__(self, filename: str, mode: str = "a") -> None:
         if os.path.islink(filename):
             os.unlink(filename)
+        os.makedirs(os.path.dirname(os.path.abspath(filename)), exist_ok=True)  # a job's name may have folders
         super().__init__(filename, mode)
 
 

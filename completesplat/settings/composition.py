@@ -13,6 +13,7 @@ from typing import Any
 from hydra import compose as compose_by_hydra
 from hydra import initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
@@ -72,6 +73,8 @@ def compose(verb: str, *overrides: str) -> DictConfig:
 
 
 def _composed(verb: str, overrides: Sequence[str] = ()) -> DictConfig:
+    if GlobalHydra.instance().is_initialized():  # in a job, with the folders that the command was given
+        return compose_by_hydra(verb, overrides=list(overrides))
     use_working_folder()
     with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         return compose_by_hydra(verb, overrides=list(overrides))

@@ -10,7 +10,7 @@ from completesplat.settings.options import options
 
 
 def swept_overrides(arguments: Sequence[str]) -> list[Override]:
-    """Return the settings to which a command line gives several values (`seed=0,1`, `ablation=glob(*)`), in its order."""
+    """Return the settings to which a command line gives several values (`seed=0,1`, `ablation=glob(*)`), in order."""
     overrides = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
     parsed = OverridesParser.create().parse_overrides(overrides)
     return [override for override in parsed if override.is_sweep_override()]

@@ -59,8 +59,8 @@ class BadSteps(Callback):
     Fused optimizers skip steps on the device. On a GPU, whether a step was bad is then read in the next one.
 
     Args:
-        most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row. At the end it also does so,
-            before a checkpoint is written, if half of all steps or the last ones were skipped, or if weights are not
+        most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row. At the end, before a
+            checkpoint is written, it does so if most steps or the last ones were skipped, or if weights are not
             finite.
     """
 
@@ -122,10 +122,10 @@ class BadSteps(Callback):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Raise DivergenceError if the weights cannot be trusted, before a checkpoint of them is written."""
         self._count_last()
-        last_were_bad = self.in_a_row > 1 or 2 * self.total >= trainer.global_step
-        if self.total and last_were_bad:
-            bad = f"{self.total} of {trainer.global_step} steps, and the last {self.in_a_row}, were bad"
-            raise DivergenceError(f"{bad}: {self.divergence}")
+        if self.in_a_row > 1 or self.total == trainer.global_step > 0:
+            raise DivergenceError(self.divergence)
+        if 2 * self.total > trainer.global_step:
+            raise DivergenceError(f"{self.total} of {trainer.global_step} steps were bad; the last: {self.divergence}")
         name = not_finite(pl_module.state_dict())
         if name is not None:
             raise DivergenceError(f"after {trainer.global_step} steps, {name} is not finite; lower optimizer.lr")

@@ -12,7 +12,7 @@ from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 QUICK = [*SMALL, "trainer.max_steps=1", "callbacks.images=null", "test=false"]
 PAPER = ["experiment=paper_var_stage2", "data.root=/nowhere", "model.checkpoint=/nowhere"]
 TERMS = {"mse", "ssim", "kl", "lpips"}
-OF_A_LAYER = 12 * (9 * 128 + 1)  # the last convolution's weights and biases: 12 values of a Gaussian from 128 channels
+OF_A_LAYER = 15 * (9 * 128 + 1)  # the last convolution's weights and biases: 15 values of a Gaussian from 128 channels
 FIRST_SKIP = 128 * 256 + 256  # a convolution of 1 x 1 from the first level's channels to the input of its block
 SECOND_SKIP = 256 * 512 + 512
 CHANGES: dict[str, tuple[int, set[str], dict[str, object]]] = {

@@ -38,7 +38,7 @@ def test_latents_of_a_stage_that_was_not_variational_are_modes_also_when_they_ar
 
 @pytest.fixture(scope="module")
 def ablated(toy_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Both stages: the first without variational sampling, with one layer and two skips, which the second is not told."""
+    """Both stages: the first without variational sampling, with one layer and two skips. The second is not told so."""
     root = tmp_path_factory.mktemp("ablated")
     first = ["experiment=toy_var", "ablation=no_variational"]
     first += ["autoreconstructor.reconstructor.parameterization.layers=1"]
