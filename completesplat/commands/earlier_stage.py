@@ -25,19 +25,22 @@ def start_checkpoint(path: str | Path) -> Path:
     return Path(path, RUN_CHECKPOINT) if Path(path).is_dir() else Path(path)
 
 
-def take_architecture(config: DictConfig) -> None:
-    """Replace the autoreconstructor's settings of stage 2 by those that its weights were trained with, and say so.
+def take_architecture(config: DictConfig) -> str | None:
+    """Replace the autoreconstructor's settings of stage 2 by those that its weights were trained with.
 
     An ablation of stage 1 is so given once. Files without a config, and those of the user's own classes, leave the
     settings as they are; the weights' own check then compares the shapes.
+
+    Returns:
+        The settings that have changed, in one line, or None if none has.
     """
     if OmegaConf.is_missing(config, "model") or "completesplat" not in (config.get("model") or {}):
-        return
+        return None
     given = [OmegaConf.select(config, key) for key in START]
     paths = [start_checkpoint(path) for path in given if path and path != "last"]
     trained = _trained(paths[0]) if paths and paths[0].is_file() else None
     if trained is None:
-        return
+        return None
     before = OmegaConf.to_container(config.model.completesplat.autoreconstructor, resolve=True)
     changed = sorted(differences(before, trained))
     for place in PLACES:
@@ -46,8 +49,7 @@ def take_architecture(config: DictConfig) -> None:
         if isinstance(parent, DictConfig) and name in parent and not OmegaConf.is_interpolation(parent, name):
             parent[name] = trained
     settings = [f"autoreconstructor.{key}" for key in changed if not key.endswith("pretrained")]
-    if settings:
-        logger.info("as stage 1 was trained (%s): %s", paths[0], _described(config, settings))
+    return f"as stage 1 was trained ({paths[0]}): {_described(config, settings)}" if settings else None
 
 
 def _described(config: DictConfig, settings: list[str]) -> str:

@@ -64,7 +64,9 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     config.out = str(out)
     if "typed" in config:
         config.typed = typed_keys(hydra_config.overrides.task)
-    take_architecture(config)
+    taken = take_architecture(config)
+    if taken is not None:
+        log.info(taken)
     idle = idle_ablation(config) if verb == "fit" else None
     if idle is not None:
         same = f"ablation={idle}: changes nothing here, its settings are those without it"

@@ -248,7 +248,8 @@ def _entry(run: ResultsFile, predictor: str, scores: FlatScores) -> Entry:
     if entry.upper_bound:
         label += " (upper bound)"
     # Any program may have written the scenes that are read from files.
-    return replace(entry, label=label if protocol.get("frame") else f"{OURS}{label}")
+    label = label if protocol.get("frame") else f"{OURS}{label}"
+    return replace(entry, label=label, bad_steps=run.bad_steps, unchanged=run.unchanged)
 
 
 def _kind(predictor: str, protocol: Protocol) -> str:

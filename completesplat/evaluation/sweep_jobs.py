@@ -20,6 +20,7 @@ from completesplat.evaluation.records import (
     FlatScores,
     Protocol,
     Record,
+    bad_steps_of,
     read_mapping,
     read_record,
     sweep_folder,
@@ -30,8 +31,6 @@ from completesplat.settings.sweeps import swept_values
 SEED = "seed"
 MULTIRUN = "multirun.yaml"
 MOST_JOBS = 10_000
-BAD_STEPS = "train/bad_steps"
-"""Figure in a job's results: steps that were skipped (`completesplat.training.callbacks.BadSteps`)."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,7 @@ def _job(folder: Path, sweep: Path) -> Job:
         record=record,
         finished=bool(metrics),
         steps=cast(int, metrics.get("steps", 0)),
-        bad_steps=int(cast(float, metrics.get(BAD_STEPS, 0))),
+        bad_steps=bad_steps_of(metrics),
         test=test,
         protocol=protocol,
     )

@@ -19,7 +19,7 @@ from torch.optim import Optimizer
 
 from completesplat.data.loading.distributed import gather_values, mean_of_processes
 from completesplat.errors import DivergenceError
-from completesplat.evaluation.sweep_jobs import BAD_STEPS
+from completesplat.evaluation.records import BAD_STEPS
 from completesplat.quantities import Positive, Share
 from completesplat.scene import Batch
 from completesplat.training.stage import Stage
