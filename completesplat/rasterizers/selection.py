@@ -49,7 +49,7 @@ def auto(constants: RenderingConstants | None = None) -> Rasterizer:
             return make(constants)
         expected = name == "cuda" and not gpu
         logger.log(logging.DEBUG if expected else logging.WARNING, "rasterizer: not %s: %s", name, reason)
-    logger.warning("rasterizer: reference, which takes about two minutes for a frame of 128 x 128 pixels")
+    logger.warning("rasterizer: reference, which takes minutes for an image and hours for a training")
     return ReferenceRasterizer(constants)
 
 

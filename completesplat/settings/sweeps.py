@@ -31,11 +31,17 @@ def swept_values(arguments: Sequence[str]) -> dict[str, list[str]] | None:
 
 
 def check_sweep(arguments: Sequence[str]) -> None:
-    """Raise CompleteSplatError if a swept setting has no value at all, so that a sweep would have no job."""
+    """Raise CompleteSplatError if a swept setting has no value at all, so that a sweep would have no job.
+
+    Options in Hydra's own groups and in `--config-dir` are not known here.
+    """
+    further_options = any(argument.startswith("--config-dir") for argument in arguments)
     for override in swept_overrides(arguments):
         values = swept_values([str(override.input_line)])
         if values is None or values[override.key_or_group]:
             continue
         known = options(override.key_or_group)
+        if isinstance(override.value(), Glob) and (further_options or not known):
+            continue
         advice = f"; there are {', '.join(known)}" if known else ""
         raise CompleteSplatError(f"{override.input_line}: stands for no value, so there is no job{advice}")
