@@ -41,7 +41,7 @@ def trainer_refusal(*settings: str, group: str = "trainer") -> str:
 
 
 def test_what_lightning_refuses_while_it_is_set_up_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "'tpu'" in trainer_refusal("trainer.accelerator=tpu") or "TPU" in trainer_refusal("trainer.accelerator=tpu")
+    assert trainer_refusal("trainer.accelerator=tpu").startswith("trainer: Requirement 'torch_xla")
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     monkeypatch.setattr("lightning.fabric.loggers.tensorboard._TENSORBOARD_AVAILABLE", False)
     monkeypatch.setattr("lightning.fabric.loggers.tensorboard._TENSORBOARDX_AVAILABLE", False)
@@ -122,7 +122,6 @@ def test_workers_without_memory_or_files_are_told_of_in_one_line(error: Exceptio
             raise error
 
     loader._loader = Failing()
-    loader.sampler_of_epochs = None
     with pytest.raises(CompleteSplatError, match=f"^data.workers: .*{advice}.* data.workers=0$"):
         next(iter(loader))
     assert workers_refusal(RuntimeError("another")) is None

@@ -37,6 +37,7 @@ REASONS = {
     "training/loggers.py _check_log_dir_exists": "Lightning's logger would delete the rows of the run that goes on",
     "training/loggers.py _wandb_init": "W&B's run begins with Lightning's options and ours",
     "training/optimization.py _orthogonalize": "Muon's own way is slow on CPUs and less exact",
+    "training/stage.py _compiler_ctx": "Lightning marks modules of torch.compile with it, and has no public name",
     "training/stage.py _foreach_mul_": "one kernel instead of one for each gradient",
     "training/stage.py _trainer": "Lightning's `trainer` raises an error where there is none",
     "training/stopping.py _launch_process_observer": "kills the first process; without it, Lightning's own way",

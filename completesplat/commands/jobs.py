@@ -17,7 +17,6 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from completesplat.commands.ablations import idle_ablation
 from completesplat.commands.continuing import is_finished, recorded
 from completesplat.commands.earlier_stage import start_checkpoint, take_architecture
 from completesplat.commands.inputs import check_inputs
@@ -67,7 +66,11 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     taken = take_architecture(config)
     if taken is not None:
         log.info(taken)
-    idle = idle_ablation(config) if verb == "fit" else None
+    idle = None
+    if verb == "fit":
+        from completesplat.commands.ablations import idle_ablation  # imports what `predict` does not need
+
+        idle = idle_ablation(config)
     if idle is not None:
         same = f"ablation={idle}: changes nothing here, its settings are those without it"
         if config.skip_unchanged:

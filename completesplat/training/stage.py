@@ -112,14 +112,15 @@ class Stage(Scorer):
         module.config = config
         return module if map_location is None else module.to(map_location)
 
-    def configure_model(self) -> None:
+    def setup(self, stage: str) -> None:
         """Raise CompleteSplatError for a trainer or a compiled module with which training would fail or be wrong.
 
-        Lightning calls this first. Positions of Gaussians and the statistics of images need weights in float32.
+        Positions of Gaussians and the statistics of images need weights in float32.
         """
-        if self._trainer is not None and self._trainer.precision not in get_args(schema.Precision):
+        precision = self.trainer.precision  # type: ignore[attr-defined]
+        if precision not in get_args(schema.Precision):
             allowed = ", ".join(name for name in get_args(schema.Precision) if "-" in str(name))
-            raise CompleteSplatError(f"Trainer(precision={self._trainer.precision!r}): choose one of {allowed}")
+            raise CompleteSplatError(f"Trainer(precision={precision!r}): choose one of {allowed}")
         if getattr(self, "_compiler_ctx", None) is not None:
             advice = "compile its network alone, by model.compile=true in its config"
             raise CompleteSplatError(f"torch.compile({type(self).__name__}) cannot be trained: {advice}")

@@ -9,6 +9,7 @@ from scenes_for_training import scene_batch
 from support import SMALL, call, compose_config, tiny_generator
 
 import completesplat
+from completesplat.evaluation.mode_predictors import LatentDecoding
 from completesplat.generator import CompleteSplat
 from completesplat.training.encoding import FrameEncoder, fingerprints, moment_sums
 
@@ -30,6 +31,10 @@ def test_latents_of_a_stage_that_was_not_variational_are_modes_also_when_they_ar
     count, total, squares = moment_sums(rows["mean"], rows["log_variance"])
     assert squares / count == pytest.approx(first.double().square().mean((0, 2, 3)).numpy(), rel=1e-5)
     assert total / count == pytest.approx(first.double().mean((0, 2, 3)).numpy(), rel=1e-4, abs=1e-6)
+    decoding = LatentDecoding(model.autoreconstructor, samples=2, batch=2)
+    scene = scenes[:1]
+    samples, mean = (method(scene, scene, 0) for method in (decoding.posterior_samples, decoding.posterior_mean))
+    torch.testing.assert_close(samples.means[1:], mean.means)
     modes, _ = fingerprints(model.autoreconstructor, None)
     model.autoreconstructor.variational = True
     assert modes != fingerprints(model.autoreconstructor, None)[0]
