@@ -26,6 +26,7 @@ CAPTION = (
     "Mean ± sample standard deviation over seeds; PSNR in dB. "
     f"The best of our rows is in bold, the second best underlined. {tables.SSIM_NOTE}"
 )
+MOST_NAMED = 20  # jobs in a remark
 PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
 IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND, "unchanged", "bad_steps"]
 
@@ -154,7 +155,8 @@ def _progress_remarks(jobs: Sequence[Job], waiting: Sequence[str]) -> list[str]:
     remarks = [f"{finished} of {len(jobs) + len(waiting)} jobs have finished."]
     for what, names in (("Diverged", diverged), ("Not finished", unfinished), ("Not started", waiting)):
         if names:
-            remarks.append(f"{what}: {'; '.join(names)}.")
+            more = f"; and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+            remarks.append(f"{what}: {'; '.join(names[:MOST_NAMED])}{more}.")
     return remarks
 
 

@@ -90,7 +90,7 @@ def _run(command: Sequence[str]) -> str:
         raise
     finally:
         guard.kill()
-        guard.wait()
+        guard.communicate()
     if process.returncode != 0:
         raise CompleteSplatError(f"{name} failed with status {process.returncode}: {_reason(complaint)}")
     return output
