@@ -14,10 +14,11 @@ import torch
 from hydra.utils import instantiate
 from packed_sequences import ListedSource, pack
 from scenes_for_training import opened, quiet_trainer
-from support import compose_config, python, refused, waited_for, write_program
+from support import compose_config, python, refused, tiny_generator, waited_for, write_program
 
 import completesplat
 from completesplat import files
+from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.commands import refusal
 from completesplat.commands.jobs import LogFile
 from completesplat.data.loading.loader import workers_refusal
@@ -276,3 +277,12 @@ def test_what_npm_says_is_short(tmp_path: Path) -> None:
         convert(str(program), tmp_path / "a.ply", tmp_path / "a.sog")
     assert len(str(caught.value)) < 200
     assert "A complete log" not in str(caught.value)
+
+
+def test_torch_exports_a_model_with_what_it_returns() -> None:
+    model = tiny_generator().autoreconstructor
+    images = torch.rand(2, 3, 32, 32)
+    exported = torch.export.export(model, (images,)).module()(images)
+    assert isinstance(exported, Reconstruction)
+    assert torch.equal(exported.splatter_image.raw, model(images).splatter_image.raw)
+    assert exported.splatter_image.parameterization == model.parameterization
