@@ -29,7 +29,7 @@ REASONS = {
     "settings/checks.py _get_node _get_root _value": NO_ORIGIN,
     "settings/composition.py _is_avx512_bf16_supported": "torch does not tell publicly whether a CPU has bfloat16",
     "tensors.py _C _nn _parse_to": ONE_OF_TORCH,
-    "tensors.py torch.utils._pytree": "the public registration takes dataclasses of tensors alone, without static values",
+    "tensors.py torch.utils._pytree": "the public registration takes no static values beside tensors",
     "weights/checkpoint_reading.py _Unpickler": "Python's unpickler in Python, whose calls a dry run replaces",
     "training/callbacks.py _get_train_description _update": "the progress bar covers the run, not an epoch",
     "training/callbacks.py _average_model _foreach_lerp_": "Lightning's average lies on the CPU; torch's update waits",

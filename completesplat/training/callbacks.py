@@ -60,8 +60,8 @@ class BadSteps(Callback):
 
     Args:
         most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row. At the end, before a
-            checkpoint is written, it does so if most steps or the last ones were skipped, or if weights are not
-            finite.
+            checkpoint is written, it does so if all steps or the last ones (two or more) were skipped, or if weights
+            are not finite.
     """
 
     def __init__(self, most_bad_steps: Positive = 10) -> None:
@@ -124,8 +124,6 @@ class BadSteps(Callback):
         self._count_last()
         if self.in_a_row > 1 or self.total == trainer.global_step > 0:
             raise DivergenceError(self.divergence)
-        if 2 * self.total > trainer.global_step:
-            raise DivergenceError(f"{self.total} of {trainer.global_step} steps were bad; the last: {self.divergence}")
         name = not_finite(pl_module.state_dict())
         if name is not None:
             raise DivergenceError(f"after {trainer.global_step} steps, {name} is not finite; lower optimizer.lr")
