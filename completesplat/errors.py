@@ -131,6 +131,22 @@ def needing(extra: str, what: str) -> Iterator[None]:
 
 
 @contextmanager
+def own_errors() -> Iterator[None]:
+    """Raise this package's own error in place of another one whose cause it is, such as Hydra's."""
+    try:
+        yield
+    except CompleteSplatError:
+        raise
+    except Exception as error:
+        cause = error.__cause__
+        while cause is not None and not isinstance(cause, CompleteSplatError):
+            cause = cause.__cause__
+        if cause is None:
+            raise
+        raise cause from cause.__cause__
+
+
+@contextmanager
 def errors_at(file: Path | str | None = None, sequence: str | None = None, frame: int | None = None) -> Iterator[None]:
     """Add file, sequence and frame to a DataError raised within the context, unless it already has them."""
     try:

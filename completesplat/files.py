@@ -6,6 +6,8 @@ import math
 import os
 import re
 import shutil
+import stat
+import tempfile
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -120,6 +122,51 @@ def _finite(value: object, place: str, not_finite: list[str]) -> object:
         not_finite.append(f"{place}: {value}")
         return None
     return value
+
+
+def home_path(name: Path | str) -> Path:
+    """Return a path with `~` as the user's home folder, or as it is where the system knows none.
+
+    In a container that is started with a user of its own, there may be neither HOME nor an entry of the user.
+    """
+    path = Path(name)
+    try:
+        return path.expanduser()
+    except RuntimeError:
+        return path
+
+
+def user_cache() -> Path:
+    """Return the folder for this user's caches of this package: in XDG_CACHE_HOME, the home folder or `private_folder`.
+
+    Raises:
+        CompleteSplatError: there is none of them.
+    """
+    base = os.environ.get("XDG_CACHE_HOME")
+    if base:
+        return Path(base) / "completesplat"
+    home = home_path("~")
+    if home != Path("~"):
+        return home / ".cache" / "completesplat"
+    folder = private_folder()
+    if folder is None:
+        raise CompleteSplatError("there is no home folder to keep files in: set XDG_CACHE_HOME=DIR")
+    return folder
+
+
+def private_folder() -> Path | None:
+    """Make and return this user's own folder among the temporary files, or None if it may be another user's.
+
+    Programs load code from caches, so nobody else may write there.
+    """
+    folder = Path(tempfile.gettempdir()) / f"completesplat-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        state = folder.lstat()
+    except OSError:
+        return None
+    private = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o022
+    return folder if private else None
 
 
 def make_folder(folder: Path) -> None:

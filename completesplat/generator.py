@@ -105,9 +105,11 @@ class CompleteSplat(SceneModel):
     ) -> Float[Tensor, "batch channel _ _"]:
         """Draw each scene's standardised latent from the frozen posterior ("we also sample latent codes", supplement).
 
-        The arguments are those of `VariationalAutoReconstructor.posterior`.
+        If stage 1 was not variational, the latent is the posterior's mode. The arguments are those of
+        `VariationalAutoReconstructor.posterior`.
         """
-        return self.standardised(self.autoreconstructor.posterior(images, views, depth_range)[0].sample())
+        posterior, _ = self.autoreconstructor.posterior(images, views, depth_range)
+        return self.standardised(self.autoreconstructor.training_latent(posterior))
 
     def set_latent_moments(self, mean: Sequence[float], std: Sequence[float]) -> None:
         """Set the mean and standard deviation of each channel over the training set (`standardised`)."""

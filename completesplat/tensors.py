@@ -1,12 +1,14 @@
 """Frozen dataclasses of tensors, which are moved between devices, batched and indexed together."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree
 from torch.utils.data import default_collate
 
 T = TypeVar("T", bound="TensorDataclass")
@@ -42,6 +44,11 @@ class TensorDataclass:
     Static values (image sizes, names, None) are carried along unchanged. A TypeVar stands for `typing.Self`, which
     beartype's import hook does not accept here.
     """
+
+    def __init_subclass__(cls) -> None:
+        """Let torch look into a subclass where it takes nested values, as the outputs of `torch.export`."""
+        super().__init_subclass__()
+        _pytree.register_pytree_node(cls, _parts, partial(_rebuilt, cls))
 
     def map(self: T, function: Callable[[Tensor], Tensor]) -> T:
         """Return the same dataclass with `function` applied to every tensor, including nested ones."""
@@ -83,6 +90,25 @@ class TensorDataclass:
             return value[index] if texts or isinstance(value, Tensor | TensorDataclass) else value
 
         return replace(self, **{field.name: select(getattr(self, field.name)) for field in fields(self)})
+
+
+Statics = tuple[tuple[str, object], ...]
+
+
+def _parts(value: TensorDataclass) -> tuple[list[object], tuple[tuple[str, ...], Statics]]:
+    """Return the tensors and nested dataclasses, and their names with the static values."""
+    values = {field.name: getattr(value, field.name) for field in fields(value)}
+    names = tuple(name for name, part in values.items() if isinstance(part, Tensor | TensorDataclass))
+    return [values[name] for name in names], (names, tuple((n, part) for n, part in values.items() if n not in names))
+
+
+def _rebuilt(kind: type[T], parts: Iterable[object], context: tuple[tuple[str, ...], Statics]) -> T:
+    """Return a dataclass of parts that need not be tensors: torch also puts placeholders in their place."""
+    names, statics = context
+    made = object.__new__(kind)
+    for name, part in (*zip(names, parts, strict=True), *statics):
+        object.__setattr__(made, name, part)
+    return made
 
 
 def stack(items: Sequence[T]) -> T:

@@ -33,6 +33,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.export.reading import read_gaussians
 from completesplat.generator import CompleteSplat
+from completesplat.settings.sweeps import check_sweep
 from completesplat.viewer.sample import read_scene
 from completesplat.weights import shipped
 
@@ -356,6 +357,14 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     "badtex": (rendered("badtex.glb", "bad.png"), f"its texture bad.png {UNREADABLE}"),
     "cuttex": (rendered("cuttex.glb", "cut.png"), f"its texture cut.png {UNREADABLE}"),
     "lfstex": (rendered("lfstex.glb", "lfs.png"), f"its texture lfs.png {UNREADABLE}"),
+    "lfs_weights": (
+        lambda folder: CompleteSplat.from_pretrained(CASES / "lfs_weights"),
+        "model.safetensors: a pointer of Git LFS in place of the file; run `git lfs pull`",
+    ),
+    "glob_none": (
+        lambda folder: check_sweep(["experiment=toy_var", "ablation=glob(zzz*)"]),
+        "ablation=glob(zzz*): stands for no value, so there is no job; there are full, m1",
+    ),
     "ktx2only": (rendered("ktx2only.glb", "t.ktx2"), "a texture in a format that Blender does not read, such as KTX2"),
 }
 

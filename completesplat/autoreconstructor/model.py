@@ -44,8 +44,8 @@ class VariationalAutoReconstructor(ReconstructionModel):
     uses the posterior's mode, with full skips.
 
     Args:
-        variational: draw latents in training; False uses the posterior's mode there too (ablation "no variational
-            sampling", which also drops the KL from the loss).
+        variational: draw latents in training, in both stages; False uses the posterior's mode there too (ablation "no
+            variational sampling", which also drops the KL from the loss), because its variance is then not trained.
         gradient_checkpointing: in training, recompute the blocks' activations in the backward pass, which saves
             memory and costs one more forward pass.
         pretrained: folder or hub id of a VAE in diffusers' layout to start from (`load_pretrained`); random if None.
@@ -95,6 +95,10 @@ class VariationalAutoReconstructor(ReconstructionModel):
         mean, log_variance = self.view_encoder(views, depth_range).chunk(2, 1)
         return from_moments(torch.cat([base.mean + mean, base.log_variance + log_variance], 1)), features
 
+    def training_latent(self, posterior: Posterior) -> Float[Tensor, "batch channel height width"]:
+        """Return the latent of a training step: a draw, or the mode of a posterior whose variance is not trained."""
+        return posterior.sample() if self.variational else posterior.mode()
+
     def forward(
         self, images: Images, views: Views | None = None, depth_range: DepthRange | None = None
     ) -> Reconstruction:
@@ -103,5 +107,4 @@ class VariationalAutoReconstructor(ReconstructionModel):
         if not self.training:
             return Reconstruction(self.reconstructor(posterior.mode(), features), posterior)
         skip_mask = (torch.rand(len(images), device=images.device) >= self.skip_dropout).float()
-        latent = posterior.sample() if self.variational else posterior.mode()
-        return Reconstruction(self.reconstructor(latent, features, skip_mask), posterior)
+        return Reconstruction(self.reconstructor(self.training_latent(posterior), features, skip_mask), posterior)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.errors import WeightsError
+from completesplat.files import home_path
 from completesplat.weights import CONFIG_FILE, first_line, from_hub
 from completesplat.weights.checkpoint_reading import mismatch, not_finite
 
@@ -107,7 +108,7 @@ def _needed_settings(config: Mapping[str, object], part: str) -> str:
 
 def _vae_file(source: str, part: str) -> Path:
     """Return the file of the VAE's tensors, downloaded from the hub if `source` is not a file or folder."""
-    local = Path(source).expanduser()
+    local = home_path(source)
     is_id = MODEL_ID.fullmatch(source) is not None
     hub_id = source if is_id and not local.exists() else "CompVis/stable-diffusion-v1-4"
     advice = (

@@ -24,9 +24,10 @@ from completesplat.files import file_refusal
 from completesplat.settings import composition, help
 from completesplat.settings.arguments import SWEEP, for_hydra
 from completesplat.settings.options import conf_folder
+from completesplat.settings.sweeps import check_sweep
 from completesplat.signals import end_with, ended_by_signals
 
-CALLED = re.compile(r"Error in call to target '(?:torch|lightning|diffusers|torchmetrics)\.")
+CALLED = re.compile(r"Error in call to target '(torch|lightning|diffusers|torchmetrics)\.")
 UNHELPFUL_WARNINGS = (
     ".*does not have many workers.*",
     ".*but have no `val_dataloader`.*",
@@ -56,6 +57,7 @@ def launch(verb: str, arguments: list[str]) -> None:
     overrides = for_hydra(verb, arguments)
     _check_start(overrides)
     if is_sweep(overrides):
+        check_sweep(overrides)
         overrides += composition.sweep_arguments(verb, overrides)
     sys.argv = [f"completesplat {verb}", *overrides]
     failures: list[Exception] = []
@@ -107,6 +109,7 @@ def _join_job(verb: str, argument: str) -> None:
     with ended_by_signals():
         config = OmegaConf.load(Path(out, CONFIG))
         assert isinstance(config, DictConfig)
+        jobs.resolve_start_weights(config)
         jobs.start(verb, config, Path(out))
 
 
@@ -153,8 +156,12 @@ def _of_a_part(error: InstantiationException) -> str | None:
     cause = error.__cause__
     if cause is not None and isinstance(cause.__cause__, ModuleNotFoundError):
         return str(cause)
-    refused = isinstance(cause, ValueError | TypeError) or type(cause).__name__ == "MisconfigurationException"
-    if CALLED.match(str(error)) is None or not refused:
+    called = CALLED.match(str(error))
+    if called is None:
+        return None
+    # Lightning looks at the machine and at environment variables, and raises errors of many types.
+    of_lightning = called[1] == "lightning" and isinstance(cause, Exception)
+    if not of_lightning and not isinstance(cause, ValueError | TypeError):
         return None
     return f"{str(error).rpartition('full_key: ')[2].strip()}: {cause}"
 

@@ -11,9 +11,9 @@ from typing import Any, cast
 from omegaconf import OmegaConf
 
 from completesplat.commands.locks import LOCK
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, DivergenceError
 from completesplat.evaluation.provenance import git_commit
-from completesplat.evaluation.records import CONFIG, RECORD, SCORES
+from completesplat.evaluation.records import CONFIG, RECORD, SCORES, read_record
 from completesplat.files import atomic_path, write_bytes, write_json
 from completesplat.version import __version__
 from completesplat.weights import RUN_CHECKPOINT
@@ -21,7 +21,15 @@ from completesplat.weights import RUN_CHECKPOINT
 OF_MACHINES = ("trainer.devices", "trainer.num_nodes", "trainer.strategy")
 # This class scores the trained model, so a run may continue although an earlier version recorded another name of it.
 SCORES_CLASS = "evaluation.scoring._target_"
-MAY_CHANGE = ("ckpt_path", "data.allow_changed", "optimized_metric", "test", SCORES_CLASS, *OF_MACHINES)
+MAY_CHANGE = (
+    "ckpt_path",
+    "data.allow_changed",
+    "optimized_metric",
+    "skip_unchanged",
+    "test",
+    SCORES_CLASS,
+    *OF_MACHINES,
+)
 ENDS = ("trainer.max_steps", "trainer.max_epochs", "trainer.max_time")
 """`MAY_CHANGE` and `ENDS` are the settings, with all below them, that may differ when a run continues."""
 
@@ -54,7 +62,7 @@ def _refuse_another_run(out: Path, config: Mapping[str, object], earlier: object
     """Raise CompleteSplatError if a directory's run had settings that a run cannot continue with."""
     before = cast(dict[str, object], OmegaConf.to_container(earlier))
     moved = str(before.get("out") or "/nowhere"), str(config.get("out"))
-    different = _differences(before, config, moved)
+    different = differences(before, config, moved)
     others = {key for key in different if not _may_differ(key)}
     if not others:
         return
@@ -96,10 +104,10 @@ def _refuse_earlier_end(out: Path, ends: Mapping[str, Any], earlier: Mapping[str
         raise CompleteSplatError(f"trainer.max_epochs={epochs} may end before the run in {out}: choose another out=DIR")
 
 
-def _differences(earlier: object, config: object, moved: tuple[str, str], key: str = "") -> set[str]:
+def differences(earlier: object, config: object, moved: tuple[str, str] = ("/", "/"), key: str = "") -> set[str]:
     """Return the keys of settings that differ by more than the folder's move.
 
-    A setting that is off, and that the earlier run's version did not have, makes no difference.
+    A setting that is off, and that the earlier config did not have, makes no difference.
     """
     if isinstance(earlier, dict) and isinstance(config, dict):
         names: set[str] = set()
@@ -107,7 +115,7 @@ def _differences(earlier: object, config: object, moved: tuple[str, str], key: s
             place = f"{key}.{part}" if key else part
             if part not in earlier and not config[part]:
                 continue
-            names |= _differences(earlier.get(part), config.get(part), moved, place)
+            names |= differences(earlier.get(part), config.get(part), moved, place)
         return names
     if isinstance(earlier, str) and f"{earlier}/".startswith(f"{moved[0]}/"):
         earlier = moved[1] + earlier.removeprefix(moved[0])
@@ -118,7 +126,8 @@ def _differences(earlier: object, config: object, moved: tuple[str, str], key: s
 def recorded(out: Path, job: Mapping[str, object], config: Mapping[str, object]) -> Iterator[None]:
     """Record a job and its config.
 
-    Those of an earlier job are restored if this one ends before it has written a file.
+    Those of an earlier job are restored if this one ends before it has written a file. The record of a training that
+    diverged says so.
     """
     earlier = {path: path.read_bytes() for path in (out / RECORD, out / CONFIG) if path.is_file()}
     before = _written(out)
@@ -127,8 +136,11 @@ def recorded(out: Path, job: Mapping[str, object], config: Mapping[str, object])
         OmegaConf.save(config, temporary)
     try:
         yield
-    except BaseException:
-        if _written(out) == before:
+    except BaseException as error:
+        nothing_written = _written(out) == before
+        if isinstance(error, DivergenceError) and not (nothing_written and earlier):
+            write_json(out / RECORD, {**read_record(out), "diverged": str(error)})
+        elif nothing_written:
             for path, content in earlier.items():
                 write_bytes(path, content)
             if renamed is not None:

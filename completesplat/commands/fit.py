@@ -13,10 +13,11 @@ from lightning.pytorch.utilities.model_summary.model_summary import ModelSummary
 from omegaconf import DictConfig, OmegaConf
 
 from completesplat.commands import quieten
+from completesplat.commands.earlier_stage import take_architecture
 from completesplat.commands.evaluate import built_parts
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
-from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError, own_errors
 from completesplat.evaluation.protocol import describe_test, scored_data, set_metrics
 from completesplat.evaluation.provenance import checkpoint_facts
 from completesplat.evaluation.records import SCORES, read_record
@@ -30,7 +31,7 @@ from completesplat.training.loggers import wandb_runs
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
 from completesplat.weights import RUN_CHECKPOINT, RUN_WEIGHTS
-from completesplat.weights.checkpoint_reading import check_whole
+from completesplat.weights.checkpoint_reading import check_whole, not_finite
 from completesplat.wording import counted
 
 logger = logging.getLogger(__name__)
@@ -40,21 +41,24 @@ def instantiate(config: DictConfig) -> tuple[SceneDataModule, Scorer]:
     """Return the LightningDataModule and the LightningModule of a config that `completesplat.compose` returned.
 
     They are what `completesplat fit` trains. Checkpoints of the model hold its config, which `load_from_checkpoint`
-    reads.
+    reads. Stage 2 takes the architecture of its stage 1 (`take_architecture`); the config itself stays as it is.
 
     Raises:
         CompleteSplatError: a setting is missing, or does not fit.
         WeightsError: weights to start from cannot be used.
     """
+    config = copy.deepcopy(config)
     refuse_missing(config)
+    take_architecture(config)
     checks.check_values("fit", config)
     checks.check_parts(config)
     checks.check_image_size(config)
     checks.check_optimizer(config.optimizer)
-    data = hydra.utils.instantiate(config.data, _convert_="all")
-    module = hydra.utils.instantiate(config.model, _convert_="all")
-    if config.test:
-        set_metrics(module, config.evaluation)
+    with own_errors():
+        data = hydra.utils.instantiate(config.data, _convert_="all")
+        module = hydra.utils.instantiate(config.model, _convert_="all")
+        if config.test:
+            set_metrics(module, config.evaluation)
     if isinstance(module, Stage):
         module.keep_config(config.model)
     return data, module
@@ -120,6 +124,7 @@ def _train(trainer: Trainer, module: Stage, data: SceneDataModule, resumed: str 
     Raises:
         WeightsError: the checkpoint to continue from is of another model.
         CompleteSplatError: Lightning refuses a setting of its trainer.
+        DivergenceError: the weights are not finite.
     """
     try:
         trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
@@ -130,6 +135,9 @@ def _train(trainer: Trainer, module: Stage, data: SceneDataModule, resumed: str 
             raise
         raise WeightsError(f"{resumed}: of another model; give the settings of its run") from error
     metrics = _logged(trainer)
+    name = not_finite(module.state_dict())
+    if name is not None:  # of the average, or where `callbacks.bad_steps` is off
+        raise DivergenceError(f"{name} is not finite, so no weights are written; lower optimizer.lr")
     if trainer.is_global_zero:
         module.save_weights(out / RUN_WEIGHTS)
     return metrics

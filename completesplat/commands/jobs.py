@@ -18,6 +18,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from completesplat.commands.continuing import is_finished, recorded
+from completesplat.commands.earlier_stage import start_checkpoint, take_architecture
 from completesplat.commands.inputs import check_inputs
 from completesplat.commands.locks import is_first_process
 from completesplat.errors import CompleteSplatError
@@ -29,6 +30,7 @@ from completesplat.signals import Interrupted, ended_by_signals
 from completesplat.weights import RUN_CHECKPOINT
 
 PROCESS_OF_JOB = "--process-of"
+log = logging.getLogger(__name__)
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
 
 
@@ -38,6 +40,7 @@ class LogFile(logging.FileHandler):
     def __init__(self, filename: str, mode: str = "a") -> None:
         if os.path.islink(filename):
             os.unlink(filename)
+        os.makedirs(os.path.dirname(os.path.abspath(filename)), exist_ok=True)  # a job's name may have folders
         super().__init__(filename, mode)
 
 
@@ -60,16 +63,31 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     config.out = str(out)
     if "typed" in config:
         config.typed = typed_keys(hydra_config.overrides.task)
+    taken = take_architecture(config)
+    if taken is not None:
+        log.info(taken)
+    idle = None
+    if verb == "fit":
+        from completesplat.commands.ablations import idle_ablation  # imports what `predict` does not need
+
+        idle = idle_ablation(config)
+    if idle is not None:
+        same = f"ablation={idle}: changes nothing here, its settings are those without it"
+        if config.skip_unchanged:
+            print(f"{out}: left out; {same}")
+            return None
+        log.warning("%s; skip_unchanged=true leaves such jobs out", same)
     resolved = cast(dict[str, object], OmegaConf.to_container(config, resolve=True))
     if is_finished(out, resolved, hydra_config.overrides.task):
         print(f"{out}: finished before, not repeated")
         return optimized(config.get("optimized_metric"), out)
     keeps_record = is_first_process()
-    record = recorded(folder, job_entries(verb, given, folder), resolved) if keeps_record else nullcontext()
+    entries = job_entries(verb, given, folder) | {"unchanged": idle is not None}
+    record = recorded(folder, entries, resolved) if keeps_record else nullcontext()
     others = _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{folder}"])
     try:
         with ended_by_signals(), record:
-            _resolve_start_weights(config)
+            resolve_start_weights(config)
             with others:
                 result = start(verb, config, out)
     except Interrupted as stop:
@@ -82,7 +100,7 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     return optimized(config.get("optimized_metric"), out)
 
 
-def _resolve_start_weights(config: DictConfig) -> None:
+def resolve_start_weights(config: DictConfig) -> None:
     """Replace the folders of runs that a training starts from by their checkpoints.
 
     Their paths may refer to the job's choices (`hydra:runtime.choices`), which other processes cannot resolve.
@@ -90,7 +108,7 @@ def _resolve_start_weights(config: DictConfig) -> None:
     for key in ("checkpoint", "autoreconstructor_checkpoint"):
         path = OmegaConf.select(config, f"model.{key}")
         if path:
-            config.model[key] = str(Path(path, RUN_CHECKPOINT)) if Path(path).is_dir() else path
+            config.model[key] = str(start_checkpoint(path))
 
 
 def optimized(metric: str | None, out: Path) -> float | None:

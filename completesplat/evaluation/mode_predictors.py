@@ -98,7 +98,9 @@ class LatentDecoding:
         # On the CPU, so that a seed means the same on every device.
         generator = torch.Generator().manual_seed(seed)
         noise = torch.randn(self.samples, *posterior.mean.shape[1:], generator=generator)
-        return self._decode(posterior.mean + noise.to(posterior.mean) * posterior.std, scene)
+        # The variance of a posterior that was not variational is not trained; all its samples are the mode.
+        std = posterior.std if self.model.variational else torch.zeros_like(posterior.mean)
+        return self._decode(posterior.mean + noise.to(posterior.mean) * std, scene)
 
 
 def predictors(module: Scorer, samples: int, batch: int) -> dict[str, Predictor]:

@@ -1,6 +1,7 @@
 """Records in the folders of jobs: what each job was (`run.json`), and the results of its test."""
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,6 +29,8 @@ MEAN_OF_K = "mean_of_k"
 """Names of its best samples (`scene_scores.BEST_RULES`), and of the mean of all samples' scores."""
 UPPER_BOUND = "upper_bound"
 """Key that marks a predictor that saw the views of its scores."""
+BAD_STEPS = "train/bad_steps"
+"""Figure in the results of a training: steps that were skipped (`completesplat.training.callbacks.BadSteps`)."""
 HOW = "make them with `completesplat test ckpt=RUN/checkpoints/last.ckpt out=DIR`"
 
 FlatScores = dict[str, float]
@@ -44,7 +47,8 @@ class SweepPlace(TypedDict):
 class Record(TypedDict, total=False):
     """Entries of `run.json` that are read here. Records of earlier versions have no `verb`, `groups` and `sweep`.
 
-    `groups` are the chosen options of config groups. `sweep` is None for a job that is none of a sweep.
+    `groups` are the chosen options of config groups. `sweep` is None for a job that is none of a sweep. `unchanged`
+    says that the job's ablation changes nothing, and `diverged` why a training has no weights.
     """
 
     command: list[str]
@@ -53,6 +57,8 @@ class Record(TypedDict, total=False):
     verb: str
     groups: dict[str, str | None]
     sweep: SweepPlace | None
+    unchanged: bool
+    diverged: str
 
 
 class Protocol(TypedDict, total=False):
@@ -112,6 +118,12 @@ def job_entries(verb: str, given: Sequence[str], folder: Path) -> dict[str, obje
     }
 
 
+def bad_steps_of(metrics: Mapping[str, object]) -> int:
+    """Return how many steps of a training were skipped, which its results state."""
+    count = metrics.get(BAD_STEPS, 0)
+    return int(count) if isinstance(count, int | float) and math.isfinite(count) else 0
+
+
 def sweep_folder(record: Record, folder: Path) -> Path | None:
     """Return the folder of the sweep that a job's record names, one of those above the job's `folder`, or None."""
     place = record.get("sweep")
@@ -149,12 +161,17 @@ def tested_predictors(content: Mapping[str, object]) -> PredictorScores:
 
 
 class ResultsFile(NamedTuple):
-    """File of results: its folder, the folder's name, how it was measured, and its scores by predictor."""
+    """File of results: its folder, the folder's name, how it was measured, and its scores by predictor.
+
+    `bad_steps` counts the skipped steps of the training, and `unchanged` says that its ablation changes nothing.
+    """
 
     folder: Path
     name: str
     protocol: Protocol
     entries: dict[str, FlatScores]
+    bad_steps: int = 0
+    unchanged: bool = False
 
 
 @dataclass(frozen=True)
@@ -225,7 +242,8 @@ def _result(path: Path, root: Path) -> ResultsFile:
     except (AttributeError, TypeError):
         raise ValueError("a metric's style in it is not one of this version") from None
     name = printable(path.parent.relative_to(root).as_posix())
-    return ResultsFile(path.parent, name, protocol, entries)
+    unchanged = bool(read_record(path.parent).get("unchanged", False))
+    return ResultsFile(path.parent, name, protocol, entries, bad_steps_of(content), unchanged)
 
 
 def _mapping(value: object) -> Mapping[str, object]:

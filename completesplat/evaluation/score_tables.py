@@ -125,7 +125,8 @@ class Entry:
     """Scores of one predictor in one run, or their means over the seeds of a sweep's setting.
 
     `deviations` are sample standard deviations over seeds. An upper bound has seen the views that it is scored on.
-    `note` says how the scores were measured, and `lacking` why others are missing.
+    `note` says how the scores were measured, and `lacking` why others are missing. `unchanged` marks an ablation that
+    changes nothing, and `bad_steps` counts the skipped steps of all seeds.
     """
 
     label: str
@@ -139,6 +140,8 @@ class Entry:
     protocol: Protocol = field(default_factory=Protocol)
     note: str = ""
     lacking: str = ""
+    unchanged: bool = False
+    bad_steps: int = 0
 
     @property
     def ours(self) -> bool:
@@ -156,7 +159,13 @@ class Entry:
 
     def leading(self, notes: Notes) -> dict[str, Cell]:
         """Return the cells before the scores, by the keys of `LEADING`."""
-        method = f"{self.label} [{notes.number(self.note)}]" if self.note else self.label
+        method = self.label
+        if self.unchanged:
+            method += " (changes nothing)"
+        if self.bad_steps:
+            method += f" ({counted(self.bad_steps, 'bad step')})"
+        if self.note:
+            method += f" [{notes.number(self.note)}]"
         return {
             "method": Cell(method),
             "inference": time_cell(self.scores.get("seconds_inference")),
@@ -239,7 +248,8 @@ def _entry(run: ResultsFile, predictor: str, scores: FlatScores) -> Entry:
     if entry.upper_bound:
         label += " (upper bound)"
     # Any program may have written the scenes that are read from files.
-    return replace(entry, label=label if protocol.get("frame") else f"{OURS}{label}")
+    label = label if protocol.get("frame") else f"{OURS}{label}"
+    return replace(entry, label=label, bad_steps=run.bad_steps, unchanged=run.unchanged)
 
 
 def _kind(predictor: str, protocol: Protocol) -> str:

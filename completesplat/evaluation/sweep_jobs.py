@@ -1,11 +1,14 @@
 """Jobs of a sweep, read from the records and results in their folders."""
 
+import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import cast
 
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -17,13 +20,17 @@ from completesplat.evaluation.records import (
     FlatScores,
     Protocol,
     Record,
+    bad_steps_of,
     read_mapping,
     read_record,
     sweep_folder,
     tested_predictors,
 )
+from completesplat.settings.sweeps import swept_values
 
 SEED = "seed"
+MULTIRUN = "multirun.yaml"
+MOST_JOBS = 10_000
 
 
 @dataclass(frozen=True)
@@ -39,6 +46,7 @@ class Job:
     record: Record = field(default_factory=Record)
     finished: bool = False
     steps: int = 0
+    bad_steps: int = 0
     test: dict[str, FlatScores] = field(default_factory=dict)
     protocol: Protocol = field(default_factory=Protocol)
     label: str = ""
@@ -52,6 +60,30 @@ def collect(*folders: Path) -> list[Job]:
     """
     parts = [[_job(path, folder) for path in _job_folders(folder)] for folder in folders]
     return _labelled(parts[0] if len(parts) == 1 else _joined(parts))
+
+
+def not_started(sweep: Path, jobs: Sequence[Job]) -> list[str]:
+    """Return the settings of the jobs that Hydra's file in a sweep's folder names, and that have not started.
+
+    They are not known of sweepers that choose the settings as they go.
+    """
+    try:
+        config = OmegaConf.load(sweep / MULTIRUN)
+        overrides = [str(text) for text in OmegaConf.select(config, "hydra.overrides.task")]
+        sweeper = str(OmegaConf.select(config, "hydra.sweeper._target_"))
+        lists = swept_values(overrides)
+    except (OmegaConfBaseException, HydraException, YAMLError, OSError, ValueError, TypeError):
+        return []
+    if lists is None or not sweeper.endswith(".BasicSweeper") or math.prod(map(len, lists.values())) > MOST_JOBS:
+        return []
+    started = {frozenset(job.overrides.items()) for job in jobs}
+    fixed = _pairs(text for text in overrides if text.lstrip("+").partition("=")[0] not in lists)
+    waiting = []
+    for values in product(*lists.values()):
+        swept = dict(zip(lists, values, strict=True))
+        if frozenset((fixed | swept).items()) not in started:
+            waiting.append(", ".join(f"{key}={value}" for key, value in swept.items()))
+    return waiting
 
 
 def _job_folders(sweep: Path) -> Iterator[Path]:
@@ -84,6 +116,7 @@ def _job(folder: Path, sweep: Path) -> Job:
         record=record,
         finished=bool(metrics),
         steps=cast(int, metrics.get("steps", 0)),
+        bad_steps=bad_steps_of(metrics),
         test=test,
         protocol=protocol,
     )
@@ -98,7 +131,7 @@ def _read_config(folder: Path) -> Mapping[str, object]:
     return cast(Mapping[str, object], config) if isinstance(config, dict) else {}
 
 
-def _pairs(overrides: Sequence[str]) -> dict[str, str]:
+def _pairs(overrides: Iterable[str]) -> dict[str, str]:
     """Convert `["ablation=full", "+a.b=1"]` to `{"ablation": "full", "a.b": "1"}`.
 
     Leave out `out=DIR` and `ckpt_path=last`, which only say where a job writes and that it may resume there.

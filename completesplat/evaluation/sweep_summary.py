@@ -16,7 +16,7 @@ from completesplat.evaluation import table_writers, tables
 from completesplat.evaluation.provenance import machine, shell_command
 from completesplat.evaluation.records import MODEL, UPPER_BOUND, Record
 from completesplat.evaluation.score_tables import Entry, formats_of, group_by_protocol, score_rows
-from completesplat.evaluation.sweep_jobs import SEED, Job, collect
+from completesplat.evaluation.sweep_jobs import SEED, Job, collect, not_started
 from completesplat.wording import printable
 
 # Hydra imports this file for every run, even to print the help. So torch and rich are imported when a job has ended.
@@ -26,8 +26,9 @@ CAPTION = (
     "Mean ± sample standard deviation over seeds; PSNR in dB. "
     f"The best of our rows is in bold, the second best underlined. {tables.SSIM_NOTE}"
 )
+MOST_NAMED = 20  # jobs in a remark
 PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
-IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
+IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND, "unchanged", "bad_steps"]
 
 
 class SweepSummary(Callback):
@@ -99,7 +100,14 @@ def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> Entry:
     if predictor != MODEL:
         return row
     deviations = {name: _deviation(values) for name, values in scores.items()} if len(jobs) > 1 else {}
-    return replace(row, seeds=len(jobs), steps=_common(job.steps for job in jobs), deviations=deviations)
+    return replace(
+        row,
+        seeds=len(jobs),
+        steps=_common(job.steps for job in jobs),
+        deviations=deviations,
+        unchanged=all(job.record.get("unchanged", False) for job in jobs),
+        bad_steps=sum(job.bad_steps for job in jobs),
+    )
 
 
 def _deviation(values: Sequence[float]) -> float:
@@ -129,7 +137,8 @@ def summarize(*folders: Path) -> tuple[list[Entry], tables.Table]:
     headings = [tables.Heading("ablation", figures=False), tables.Heading("seeds"), tables.Heading("scenes")]
     for name in names:
         headings.append(tables.score_heading(name, formats[tables.metric_of(name)]))
-    remarks = [CAPTION if rows else "No job of this sweep has finished.", *_progress_remarks(jobs)]
+    waiting = [job for folder in folders for job in not_started(folder, jobs)]
+    remarks = [CAPTION if rows else "No job of this sweep has finished.", *_progress_remarks(jobs, waiting)]
     if not alike:
         remarks.append("Jobs were tested differently (data, resolution, scenes), so their scores cannot be compared.")
     for row in rows:
@@ -139,11 +148,15 @@ def summarize(*folders: Path) -> tuple[list[Entry], tables.Table]:
     return rows, tables.Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
 
 
-def _progress_remarks(jobs: Sequence[Job]) -> list[str]:
-    unfinished = [printable(job.name) for job in jobs if not job.finished]
-    remarks = [f"{len(jobs) - len(unfinished)} of {len(jobs)} started jobs have finished."]
-    if unfinished:
-        remarks.append(f"Not finished: {'; '.join(unfinished)}.")
+def _progress_remarks(jobs: Sequence[Job], waiting: Sequence[str]) -> list[str]:
+    diverged = [printable(job.name) for job in jobs if job.record.get("diverged") and not job.finished]
+    unfinished = [printable(job.name) for job in jobs if not job.finished and not job.record.get("diverged")]
+    finished = sum(job.finished for job in jobs)
+    remarks = [f"{finished} of {len(jobs) + len(waiting)} jobs have finished."]
+    for what, names in (("Diverged", diverged), ("Not finished", unfinished), ("Not started", waiting)):
+        if names:
+            more = f"; and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+            remarks.append(f"{what}: {'; '.join(names[:MOST_NAMED])}{more}.")
     return remarks
 
 
@@ -174,7 +187,15 @@ def write_summary(folder: Path, *parts: Path) -> tables.Table:
         header += [f"{name}_mean", f"{name}_deviation"]
     lines = []
     for row in rows:
-        line: list[object] = [row.label, row.seeds, row.scenes, row.steps, row.upper_bound]
+        line: list[object] = [
+            row.label,
+            row.seeds,
+            row.scenes,
+            row.steps,
+            row.upper_bound,
+            row.unchanged,
+            row.bad_steps,
+        ]
         for name in names:
             line += [row.scores.get(name), row.deviations.get(name)]
         lines.append(line)

@@ -34,6 +34,8 @@ LATEX: dict[str, str | int | None] = {
     "★": r"$\star$",
 }
 """LaTeX of characters that it does not print literally."""
+MARKUP = re.compile(r"[\\|<`*]|(?<!\w)_|_(?!\w)|(?<=\])\(")
+"""What Markdown may read as markup. Underscores within words are none."""
 LINE = re.compile(r".+")
 WORD = re.compile(r"\S+(?: [↑↓])?")
 """Words, which do not break: a column is at least as wide as its longest."""
@@ -102,15 +104,20 @@ def escape(text: str) -> str:
     return text.translate(str.maketrans(LATEX))
 
 
+def markdown(text: str) -> str:
+    """Escape text, such as the name of a folder, so that Markdown prints it literally."""
+    return MARKUP.sub(r"\\\g<0>", text)
+
+
 def as_markdown(table: Table) -> str:
     """Return a heading, the table, and a list of remarks and notes."""
-    lines = [[heading.joined().replace("|", r"\|") for heading in table.headings]]
+    lines = [[markdown(heading.joined()) for heading in table.headings]]
     lines.append(["---:" if heading.figures else "---" for heading in table.headings])
     for row in table.rows:
-        lines.append([MARKED_MARKDOWN[cell.mark].format(cell.text.replace("|", r"\|")) for cell in row.cells])
+        lines.append([MARKED_MARKDOWN[cell.mark].format(markdown(cell.text)) for cell in row.cells])
     body = [f"| {' | '.join(line)} |" for line in lines]
-    below = [f"- {line}" for line in table.below()]
-    return "\n".join([f"## {table.title}", "", *body, "", *below, ""])
+    below = [f"- {markdown(line)}" for line in table.below()]
+    return "\n".join([f"## {markdown(table.title)}", "", *body, "", *below, ""])
 
 
 def as_latex(table: Table) -> str:

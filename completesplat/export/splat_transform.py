@@ -19,13 +19,14 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
-from completesplat.files import atomic_path
+from completesplat.files import atomic_path, home_path, private_folder
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 
 PROGRAM = "splat-transform"
 PACKAGE = "@playcanvas/splat-transform@2.7.1"
 LIMIT_SECONDS = 600
+MOST_LINES = 3  # of what a program says about its failure
 WIDEST_WINDOW = 20 / 9
 LARGEST_FOV = 120.0  # phones' windows
 
@@ -74,10 +75,11 @@ def _run(command: Sequence[str]) -> str:
     try:
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            errors="replace", start_new_session=True,
+            errors="replace", start_new_session=True, env=_npm_settings(),
         )  # fmt: skip
     except OSError as error:
         raise CompleteSplatError(f"{name} does not start: {error.strerror}") from error
+    guard = _end_group_with_this_process(process.pid)
     try:
         output, complaint = process.communicate(timeout=LIMIT_SECONDS)
     except BaseException as error:
@@ -86,12 +88,53 @@ def _run(command: Sequence[str]) -> str:
         if isinstance(error, subprocess.TimeoutExpired):
             raise CompleteSplatError(f"{name} has not finished within {LIMIT_SECONDS} seconds") from error
         raise
+    finally:
+        guard.kill()
+        guard.communicate()
     if process.returncode != 0:
-        # Without npm's hints and Node's stack trace.
-        lines = [line for line in complaint.splitlines() if not line.startswith(("npm warn", "    at "))]
-        reason = " ".join(" ".join(lines).split())[:500] or "it does not say why"
-        raise CompleteSplatError(f"{name} failed with status {process.returncode}: {reason}")
+        raise CompleteSplatError(f"{name} failed with status {process.returncode}: {_reason(complaint)}")
     return output
+
+
+def _end_group_with_this_process(group: int) -> "subprocess.Popen[bytes]":
+    """Start a shell that kills a group of processes when this process has ended in whatever way, also by SIGKILL.
+
+    The shell waits for a pipe to close, whose other end this process holds alone. It is to be killed when the group's
+    work is done.
+    """
+    command = ["/bin/sh", "-c", f"read -r _; kill -9 -{group}"]
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+
+def _reason(complaint: str) -> str:
+    """Return what a program says about its failure, without npm's hints and labels and Node's stack trace."""
+    lines = []
+    for line in complaint.splitlines():
+        label, _, text = line.partition(" ")
+        kind, _, said = text.partition(" ")
+        if label == "npm" and kind in ("error", "ERR!"):
+            line = said
+        unhelpful = line.startswith(("npm warn", "    at ", "code E", "errno ", "syscall ", "path ", "A complete log"))
+        if not unhelpful and line.strip():
+            lines.append(line)
+    return " ".join(" ".join(lines[:MOST_LINES]).split())[:500] or "it does not say why"
+
+
+def _npm_settings() -> dict[str, str]:
+    """Return the environment of npx, with another cache if npm's own cannot be written, for which npx would wait."""
+    environment = dict(os.environ)
+    own = Path(environment.get("npm_config_cache") or home_path("~/.npm"))
+    existing = next((folder for folder in (own, *own.parents) if folder.is_dir()), own)
+    temporary = private_folder()
+    if not os.access(existing, os.W_OK) and temporary is not None:
+        environment["npm_config_cache"] = str(temporary / "npm")
+    return environment
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,13 @@
 import logging
 import os
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from completesplat.errors import CompleteSplatError, ImageError
+from completesplat.files import home_path
 from completesplat.installation import install_command
 
 # Networks of rembg under Apache 2.0, the best first (DIS, U2-Net, its small form); its default forbids commercial use.
@@ -102,7 +102,7 @@ def _largest_piece(labels: UInt8[np.ndarray, "height width"]) -> Bool[np.ndarray
 
 def _network() -> str:
     home = os.environ.get("U2NET_HOME", os.path.join(os.environ.get("XDG_DATA_HOME", "~"), ".u2net"))
-    folder = Path(home).expanduser()
+    folder = home_path(home)
     return next((name for name in NETWORKS if (folder / f"{name}.onnx").is_file()), DOWNLOADED)
 
 

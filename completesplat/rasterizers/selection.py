@@ -49,7 +49,7 @@ def auto(constants: RenderingConstants | None = None) -> Rasterizer:
             return make(constants)
         expected = name == "cuda" and not gpu
         logger.log(logging.DEBUG if expected else logging.WARNING, "rasterizer: not %s: %s", name, reason)
-    logger.warning("rasterizer: reference, which is very slow")
+    logger.warning("rasterizer: reference, which takes minutes for an image and hours for a training")
     return ReferenceRasterizer(constants)
 
 

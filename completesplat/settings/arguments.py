@@ -3,7 +3,9 @@
 import os
 from collections.abc import Sequence
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.errors import HydraException
 
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.options import TASKS
@@ -11,6 +13,25 @@ from completesplat.wording import SHORT, printable
 
 WORDS = {"predict": ("image",), "view": ("path",), "new": ("kind", "name"), "data import": ("folder",)}
 """By verb, or verb and task, the settings whose values are given as words without `=`."""
+PATHS = (
+    "out",
+    "root",
+    "folder",
+    "image",
+    "mask",
+    "path",
+    "cameras",
+    "weights",
+    "ckpt",
+    "ckpt_path",
+    "checkpoint",
+    "autoreconstructor_checkpoint",
+    "pretrained",
+    "latent_cache",
+    "runs",
+    "export",
+)
+"""Last parts of the names of settings for files and folders, whose names may look like numbers."""
 SWEEP = ("-m", "--multirun")
 HYDRA_FLAGS = (*SWEEP, "--resolve")
 FLAGS_WITH_VALUE = ("--cfg", "--config-dir")
@@ -45,7 +66,19 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
         others = others[1:]
     if command in WORDS:
         others = with_words(command, others)
-    return [*flags, *task, *others]
+    return [*flags, *task, *map(_path_as_text, others)]
+
+
+def _path_as_text(argument: str) -> str:
+    """Quote the value of a setting for a path that Hydra would read as a number or as true (`out=1e3`, `out=NAN`)."""
+    key, equals, value = argument.partition("=")
+    if not equals or key.lstrip("+").rpartition(".")[2] not in PATHS:
+        return argument
+    try:
+        read = OverridesParser.create().parse_override(argument).value()
+    except HydraException:  # Hydra reports what it cannot read
+        return argument
+    return f"{key}={quoted(value)}" if isinstance(read, bool | int | float) else argument
 
 
 def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:

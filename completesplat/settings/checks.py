@@ -17,6 +17,8 @@ Container = DictConfig | ListConfig
 
 REFERENCE = re.compile(r"\$\{(\w[\w.]*)\}")
 REMOVE = "remove"
+COPYING = re.compile("ddp_(spawn|fork|notebook)")
+"""Lightning's strategies whose processes work on copies of the model and its callbacks."""
 # Settings of weights that training starts from, in all parts, with examples.
 START_WEIGHTS = {
     "pretrained": "CompVis/stable-diffusion-v1-4, or null for random weights",
@@ -34,6 +36,10 @@ def check_values(verb: str, config: DictConfig) -> None:
         if group in config:
             message = "its file needs `# @package _global_` as its first line, to set anything"
             raise CompleteSplatError(f"{group}: {message}")
+    strategy = str(OmegaConf.select(config, "trainer.strategy", throw_on_missing=False))
+    if COPYING.match(strategy):
+        reason = "its processes do not give back what training keeps, such as the best checkpoint; take ddp"
+        raise CompleteSplatError(f"trainer.strategy={strategy}: {reason}")
     if verb in VERBS:
         check_settings(VERBS[verb], config)
 

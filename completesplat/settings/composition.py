@@ -13,6 +13,7 @@ from typing import Any
 from hydra import compose as compose_by_hydra
 from hydra import initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
@@ -22,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.arguments import for_hydra
 from completesplat.settings.options import conf_folder, did_you_mean, groups, options
+from completesplat.settings.sweeps import swept_overrides
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 UNKNOWN_KEY = re.compile(r"Could not override '([^']+)'\.\s*(?:To append to your config use .*)?")
@@ -71,6 +73,8 @@ def compose(verb: str, *overrides: str) -> DictConfig:
 
 
 def _composed(verb: str, overrides: Sequence[str] = ()) -> DictConfig:
+    if GlobalHydra.instance().is_initialized():  # in a job, with the folders that the command was given
+        return compose_by_hydra(verb, overrides=list(overrides))
     use_working_folder()
     with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         return compose_by_hydra(verb, overrides=list(overrides))
@@ -126,9 +130,7 @@ def sweep_arguments(verb: str, arguments: Sequence[str]) -> list[str]:
 
 def swept_keys(arguments: Sequence[str]) -> list[str]:
     """Return the keys to which a command line gives several values (`seed=0,1`, `ablation=glob(*)`), in its order."""
-    overrides = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
-    parsed = OverridesParser.create().parse_overrides(overrides)
-    return [override.key_or_group for override in parsed if override.is_sweep_override()]
+    return [override.key_or_group for override in swept_overrides(arguments)]
 
 
 def typed_keys(overrides: Sequence[str]) -> list[str]:

@@ -56,6 +56,7 @@ class FitSettings(TypedDict):
     ckpt_path: str | None
     test: bool
     optimized_metric: str | None
+    skip_unchanged: bool
 
 
 class PlanSettings(FitSettings):

@@ -19,11 +19,12 @@ from torch.optim import Optimizer
 
 from completesplat.data.loading.distributed import gather_values, mean_of_processes
 from completesplat.errors import DivergenceError
+from completesplat.evaluation.records import BAD_STEPS
 from completesplat.quantities import Positive, Share
 from completesplat.scene import Batch
 from completesplat.training.stage import Stage
+from completesplat.weights.checkpoint_reading import not_finite
 
-BAD_STEPS = "train/bad_steps"
 IN_PROGRESS_BAR = ("train/loss", "train/psnr", BAD_STEPS)
 STATUS = Path("/proc/self/status")
 
@@ -58,7 +59,9 @@ class BadSteps(Callback):
     Fused optimizers skip steps on the device. On a GPU, whether a step was bad is then read in the next one.
 
     Args:
-        most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row, or if it skips all steps.
+        most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row. At the end, before a
+            checkpoint is written, it does so if all steps or the last ones (two or more) were skipped, or if weights
+            are not finite.
     """
 
     def __init__(self, most_bad_steps: Positive = 10) -> None:
@@ -117,10 +120,13 @@ class BadSteps(Callback):
             self._count(bool(bad))
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Raise DivergenceError if no step changed the weights, before a checkpoint of them is written."""
+        """Raise DivergenceError if the weights cannot be trusted, before a checkpoint of them is written."""
         self._count_last()
-        if 0 < self.total == trainer.global_step:
+        if self.in_a_row > 1 or self.total == trainer.global_step > 0:
             raise DivergenceError(self.divergence)
+        name = not_finite(pl_module.state_dict())
+        if name is not None:
+            raise DivergenceError(f"after {trainer.global_step} steps, {name} is not finite; lower optimizer.lr")
 
 
 def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:

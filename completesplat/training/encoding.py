@@ -17,6 +17,7 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
+from completesplat.autoreconstructor.posterior import LOG_VARIANCE_RANGE
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import gather_values, processes
 from completesplat.data.loading.latent_cache import CachedSequence, LatentCache, Origin, Rows, Sums, write_cache
@@ -46,14 +47,18 @@ def fingerprint(module: nn.Module) -> str:
 
 
 def fingerprints(model: VariationalAutoReconstructor, conditioning: nn.Module | None) -> tuple[str, str | None]:
-    """Return the fingerprint of all weights that latents depend on, and that of a frozen conditioning, else None."""
+    """Return the fingerprint of all weights that latents depend on, and that of a frozen conditioning, else None.
+
+    The first one also says if latents are modes (`variational=false`).
+    """
     encoder: nn.Module = model.encoder
     if model.view_encoder is not None:
         encoder = nn.ModuleList([encoder, model.view_encoder])
     features = None
     if conditioning is not None and conditioning.frozen:
         features = fingerprint(conditioning)
-    return fingerprint(encoder), features
+    latents = fingerprint(encoder)
+    return latents if model.variational else f"{latents} modes", features
 
 
 def check_cache(store: LatentCache, autoreconstructor: VariationalAutoReconstructor, conditioning: nn.Module) -> None:
@@ -109,6 +114,9 @@ class FrameEncoder:
         images = scenes.reference.images
         views = scenes.all_views() if network.sees_views else None
         posterior, _ = network.posterior(images, views, scenes.depth_range)
+        log_variance = posterior.log_variance
+        if not network.variational:  # its variance is not trained: latents are modes
+            log_variance = torch.full_like(log_variance, LOG_VARIANCE_RANGE[0])
         precision = PRECISIONS[self.precision]
         if self.conditioning is None:
             condition = (images * 255).round().to(torch.uint8)
@@ -117,7 +125,7 @@ class FrameEncoder:
         return {
             "condition": condition.cpu().numpy(),
             "mean": posterior.mean.to(precision).cpu().numpy(),
-            "log_variance": posterior.log_variance.to(precision).cpu().numpy(),
+            "log_variance": log_variance.to(precision).cpu().numpy(),
         }
 
     def origin(self, data: SceneDataModule, frames: int | None, views: int) -> Origin:

@@ -213,7 +213,8 @@ class LatentDiffusion(DiffusionScorer, Stage):
             views = batch.all_views() if parts.autoreconstructor.sees_views else None
             latent = parts.encode(batch.reference.images, views, batch.depth_range)
             return latent, parts.conditioning(batch.reference.images * batch.visible)
-        latent = parts.standardised(Posterior(batch.mean, batch.log_variance).sample())
+        posterior = Posterior(batch.mean, batch.log_variance)
+        latent = parts.standardised(parts.autoreconstructor.training_latent(posterior))
         return latent, batch.condition if parts.conditioning.frozen else parts.conditioning(batch.condition)
 
     def training_step(self, batch: Batch, index: int) -> Float[Tensor, ""]:

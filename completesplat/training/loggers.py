@@ -17,6 +17,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from completesplat.errors import CompleteSplatError
 from completesplat.files import write_text, writing
+from completesplat.weights import first_line
 
 START_SECONDS = 6
 """Longest time that W&B's server may take to start a run, which delays training."""
@@ -150,15 +151,17 @@ class WandbRun(WandbLogger):
         stored_id = path.read_text().strip() if path.is_file() else ""
         options = dict(self._wandb_init)
         options["id"] = stored_id or secrets.token_hex(4)
-        options["settings"] = wandb.Settings(init_timeout=START_SECONDS)
-        try:
-            return wandb.init(**options)
-        except wandb.Error as error:
-            reason = str(error).partition("\n")[0]
-            logger.warning("W&B: %s; the run is kept offline, `wandb sync` uploads it later", reason)
-        wandb.teardown()  # its process still holds the run's id
-        options["mode"] = "offline"
-        return wandb.init(**options)
+        with _refused_by_wandb():
+            options["settings"] = wandb.Settings(init_timeout=START_SECONDS)
+            try:
+                return wandb.init(**options)
+            except wandb.Error as error:
+                reason = first_line(error)
+            wandb.teardown()  # its process still holds the run's id
+            options["mode"] = "offline"
+            run = wandb.init(**options)
+        logger.warning("W&B: %s; the run is kept offline, `wandb sync` uploads it later", reason)
+        return run
 
     @rank_zero_only
     def log_hyperparams(self, params: object) -> None:
@@ -197,6 +200,18 @@ class WandbRun(WandbLogger):
             if not self.lost:
                 logger.warning("W&B: its process ended (%s); metrics.csv goes on without it", error)
             self.lost = True
+
+
+@contextmanager
+def _refused_by_wandb() -> Iterator[None]:
+    """Raise CompleteSplatError for a name or a setting that W&B refuses also without its server."""
+    import wandb
+
+    try:
+        yield
+    except (wandb.Error, ValueError, TypeError) as error:
+        advice = "check wandb.project, wandb.group, wandb.name and the WANDB_ variables, or leave logger=wandb out"
+        raise CompleteSplatError(f"logger=wandb: {' '.join(str(error).split())[:300]}; {advice}") from error
 
 
 @contextmanager

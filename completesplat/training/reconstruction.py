@@ -145,7 +145,7 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         `latent/active_channels` counts the active channels (`completesplat.autoreconstructor.posterior`).
         """
         posterior = self(scenes).posterior
-        if posterior is None:
+        if posterior is None or not getattr(self.model, "variational", True):  # its variance is not trained
             return {}
         bits = posterior.channel_bits().tolist()
         channels = {f"latent/bits_{index}": value for index, value in enumerate(bits)}
@@ -226,6 +226,7 @@ class ReconstructorOnly(ReconstructionModule):
 
     def setup(self, stage: str) -> None:
         """Allocate a code for each training image, unless a checkpoint has codes."""
+        super().setup(stage)
         if stage == "fit" and not len(self.model.codes):
             source = self.data.source("train")
             frames = 0

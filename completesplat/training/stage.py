@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 import torch
 from hydra.utils import instantiate
@@ -18,13 +18,14 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from completesplat.data.loading.distributed import mean_of_processes
-from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.errors import CompleteSplatError, WeightsError, own_errors
 from completesplat.evaluation.scorer import Scorer
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
 from completesplat.quantities import Share
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Batch, SceneBatch
+from completesplat.settings import schema
 from completesplat.weights.checkpoint_reading import load_tensors, read_checkpoint
 from completesplat.weights.runs import CONFIG, config_of_checkpoint, without_training
 
@@ -103,12 +104,26 @@ class Stage(Scorer):
         path = Path(checkpoint_path)
         contents = read_checkpoint(path)
         config = config_of_checkpoint(path, contents, trust)
-        module = instantiate(without_training(OmegaConf.create(config)).model, _convert_="all")
+        with own_errors():
+            module = instantiate(without_training(OmegaConf.create(config)).model, _convert_="all")
         if not isinstance(module, cls):
             raise WeightsError(f"{path}: holds a {type(module).__name__}, which is no {cls.__name__}")
         load_tensors(module, contents["state_dict"], path)
         module.config = config
         return module if map_location is None else module.to(map_location)
+
+    def setup(self, stage: str) -> None:
+        """Raise CompleteSplatError for a trainer or a compiled module with which training would fail or be wrong.
+
+        Positions of Gaussians and the statistics of images need weights in float32.
+        """
+        precision = self.trainer.precision  # type: ignore[attr-defined]
+        if precision not in get_args(schema.Precision):
+            allowed = ", ".join(name for name in get_args(schema.Precision) if "-" in str(name))
+            raise CompleteSplatError(f"Trainer(precision={precision!r}): choose one of {allowed}")
+        if getattr(self, "_compiler_ctx", None) is not None:
+            advice = "compile its network alone, by model.compile=true in its config"
+            raise CompleteSplatError(f"torch.compile({type(self).__name__}) cannot be trained: {advice}")
 
     def keep_config(self, config: DictConfig) -> None:
         """Store a config of the model, resolved, for checkpoints and weights."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from urllib.parse import urlparse
 
 from completesplat.errors import WeightsError
-from completesplat.files import write_text
+from completesplat.files import home_path, write_text
 from completesplat.wording import printable
 
 SHIPPED = Path(__file__).parent
@@ -30,7 +30,12 @@ AUTO = "auto"  # in place of a name: the shipped weights whose training images a
 NEWEST = "images/newest"  # in a training run's folder, too: its fixed scenes as they are now, with `scenes.json`
 CAMERA = "camera"  # in stage 1's checkpoints: the typical camera of the training set
 LARGEST_TEXT = 1_000_000
-HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+HUB_ID = re.compile(
+    r"(?:https?://(?:www\.)?huggingface\.co/|hf://|hf:)?"  # an address, or the hub's own short forms
+    r"(?P<repository>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)"
+    r"(?:(?:@|/tree/)(?P<revision>[\w./-]*\w))?/?"
+)
+POINTER = b"version https://git-lfs"
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +54,7 @@ def locate(weights: Path | str) -> Path:
         WeightsError: there is no such folder, a file is missing, or its checksum differs.
     """
     name = str(weights)
-    path = Path(weights).expanduser()
+    path = home_path(weights)
     check_name(name)
     if name in shipped():
         path = shipped()[name]
@@ -70,7 +75,7 @@ def locate(weights: Path | str) -> Path:
 
 def check_name(name: str) -> None:
     """Raise WeightsError unless there is such a folder or file, with the package or here, or it may be a hub id."""
-    exists = os.path.exists(Path(name).expanduser())  # `Path.exists` raises if a name is too long
+    exists = os.path.exists(home_path(name))  # `Path.exists` raises if a name is too long
     if name not in shipped() and not exists and HUB_ID.fullmatch(name) is None:
         included = ", ".join(shipped()) or "no weights"
         raise WeightsError(f"{printable(name)}: no such folder; with the package come {included}")
@@ -79,15 +84,35 @@ def check_name(name: str) -> None:
 def check_folder(folder: Path) -> None:
     """Raise WeightsError if a file of weights is missing, or has another checksum than `SHA256SUMS`, if that exists."""
     sums = folder / SUMS_FILE
-    known = read_small(sums).splitlines() if sums.is_file() else None
+    known = None
+    if sums.is_file():  # `sha256sum --binary` writes an asterisk before the name
+        known = [line.replace(" *", "  ", 1) for line in read_small(sums).splitlines()]
     for name in (CONFIG_FILE, WEIGHTS_FILE):
         if not (folder / name).is_file():
-            raise WeightsError(f"{folder}: no {name} here; give the folder that training wrote as `weights`")
+            raise WeightsError(f"{folder}: no {name} here; {_missing_part(folder)}")
+        if is_pointer(folder / name):
+            advice = "run `git lfs pull` in its clone, or download the file itself"
+            raise WeightsError(f"{folder / name}: a pointer of Git LFS in place of the file; {advice}")
         if known is not None and f"{sha256_of(folder / name)}  {name}" not in known:
             raise WeightsError(
                 f"{folder / name}: damaged or changed, its SHA-256 is not the one in {SUMS_FILE}; "
                 f"if the change is meant, remove {SUMS_FILE}"
             )
+
+
+def _missing_part(folder: Path) -> str:
+    """Return why a file of weights may be missing, and what to do."""
+    if any(folder.glob("*.safetensors.index.json")) or any(folder.glob("*-of-*.safetensors")):
+        return f"these tensors are in several parts: save them as one {WEIGHTS_FILE}"
+    if any((folder / name).is_file() for name in (CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE)):
+        return "the copy or download is not complete: fetch the folder again"
+    return "give the folder that training wrote as `weights`"
+
+
+def is_pointer(file: Path) -> bool:
+    """Return whether a file is a pointer of Git LFS, which a clone without LFS has in place of a large file."""
+    with file.open("rb") as content:
+        return content.read(len(POINTER)) == POINTER
 
 
 def write_sums(folder: Path) -> None:
@@ -119,13 +144,16 @@ def from_hub(
 ) -> Path:
     """Download files of a repository on the Hugging Face hub once, as far as they exist, and return their folder.
 
-    The hub's environment variables set a token, a mirror, or offline use. The error message ends with `advice`.
+    The repository is `OWNER/NAME`, its address, or either with `@REVISION`. The hub's environment variables set a
+    token, a mirror, or offline use. The error message ends with `advice`.
     """
     from huggingface_hub import snapshot_download
 
     log.info("%s: not a folder here; asking the Hugging Face hub", hub_id)
+    place = HUB_ID.fullmatch(hub_id)
+    repository, revision = (hub_id, None) if place is None else place.group("repository", "revision")
     try:
-        return Path(snapshot_download(hub_id, allow_patterns=list(names)))
+        return Path(snapshot_download(repository, revision=revision, allow_patterns=list(names)))
     except Exception as error:  # from the hub, its HTTP library or the file system
         cause = first_line(error).split(". ")[0]
         ending = "" if advice is None else f"; {advice}"
@@ -146,7 +174,7 @@ def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: st
     import torch
 
     expected = None if sha256 is None else sha256.lower()
-    path = Path(weights).expanduser()
+    path = home_path(weights)
     if weights.startswith(("http://", "https://")):
         folder = Path(torch.hub.get_dir()) / "checkpoints"
         try:

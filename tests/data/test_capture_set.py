@@ -1,6 +1,7 @@
 """Data sets of many captures: which captures belong to which split."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,22 @@ def module(root: Path, **settings: Any) -> CaptureSetDataModule:
 
 def split(data: CaptureSetDataModule) -> dict[str, list[str]]:
     return {part: source.names for part, source in data.open("train").items()}
+
+
+def test_one_object_is_split_by_views_which_is_said(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for fruit in OBJECTS[1:]:
+        shutil.rmtree(root / fruit)
+    data = module(root)
+    train, val = data.source("train"), data.source("val")
+    assert train.names == val.names == data.source("test").names == ["apple/r0", "apple/r1"]
+    seen, held_out = (set(source.read("apple/r0").frames) for source in (train, val))
+    assert len(held_out) == 3
+    assert sorted(seen | held_out) == list(range(6))
+    assert not seen & held_out
+    assert "1 object, too few for a validation and a test by other objects" in caplog.text
+    assert data.describe()["split"] == "one of 8 views of each capture is held out for validation and test"
+    (root / "splits.json").write_text(json.dumps({"train": ["apple"]}))
+    assert split(module(root)) == {"train": ["apple/r0", "apple/r1"], "val": [], "test": []}
 
 
 @pytest.mark.parametrize("seed", range(4))

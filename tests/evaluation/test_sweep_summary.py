@@ -110,7 +110,7 @@ def test_a_job_of_another_sweep_or_of_none_in_a_sweeps_folder_is_no_job_of_it(sw
     put("run.json", "sweep.folder", "../..")(sweep.add("ablation=full"))
     rows, table = summarize(sweep.folder)
     assert [row.label for row in rows] == ["small", "mean_image", "copy_reference"]
-    assert "2 of 2 started jobs have finished." in table.remarks
+    assert "2 of 2 jobs have finished." in table.remarks
 
 
 def test_jobs_of_earlier_versions_count_where_they_lie_and_are_named_by_key_and_value(sweep) -> None:
@@ -221,9 +221,11 @@ def test_all_files_have_means_deviations_marks_and_remarks(ablations) -> None:
         assert escape(remark) in tex
     assert any(SSIM_NOTE in remark for remark in table.remarks)
     read = read_back(ablations.folder)
-    assert list(read.columns[:4]) == IDENTITY[1:]
+    assert list(read.columns[: len(IDENTITY) - 1]) == IDENTITY[1:]
     names = (PSNR, "full_novel_ssim", "object_novel_psnr")
-    assert set(read.columns[4:]) == {f"{name}_{kind}" for name in names for kind in ("mean", "deviation")}
+    assert set(read.columns[len(IDENTITY) - 1 :]) == {
+        f"{name}_{kind}" for name in names for kind in ("mean", "deviation")
+    }
     assert list(read.index) == ["m1", "no_skips", "full", "mean_image", "copy_reference"]
     assert list(read.loc["full"][:3]) == [3, 40, 9]
     for ablation, psnr in {"full": 22.0, "no_skips": 18.5, "m1": 20.0}.items():
@@ -250,7 +252,7 @@ def test_a_sweep_without_finished_jobs_says_so(sweep) -> None:
     (sweep.folder / ".submitit").mkdir()
     write_summary(sweep.folder)
     assert "No job of this sweep has finished." in (sweep.folder / "summary.md").read_text()
-    assert remarks(sweep)[:2] == ["0 of 1 started jobs have finished.", "Not finished: job=0."]
+    assert remarks(sweep)[:2] == ["0 of 1 jobs have finished.", "Not finished: job=0."]
     assert list(pd.read_csv(sweep.folder / "summary.csv").columns) == IDENTITY
 
 
@@ -260,7 +262,7 @@ def test_the_terminal_shows_the_headline_and_names_the_jobs_that_have_not_finish
     (broken / "metrics.json").write_text('{"steps": 9, "te')
     ablations.scored("ablation=x[red]", psnr=1.0)
     rows, table = summarize(ablations.folder)
-    assert table.remarks[1] == "10 of 12 started jobs have finished."
+    assert table.remarks[1] == "10 of 12 jobs have finished."
     assert set(re.findall(r"job=\d+", table.remarks[2])) == {"job=9", "job=10"}
     assert [row.seeds for row in rows[:4]] == [3, 3, 1, 3]
     show(table, width=160)
@@ -281,7 +283,7 @@ def test_jobs_in_nested_folders_are_found(sweep) -> None:
     job.rename(sweep.folder / "x/2")
     rows, _ = summarize(sweep.folder)
     assert (rows[0].seeds, rows[0].scores[PSNR]) == (2, 20.5)
-    assert remarks(sweep)[:2] == ["2 of 3 started jobs have finished.", "Not finished: x/2."]
+    assert remarks(sweep)[:2] == ["2 of 3 jobs have finished.", "Not finished: x/2."]
 
 
 @pytest.mark.parametrize("file", ["job=1/config.yaml", "job=1/run.json"])
@@ -355,12 +357,12 @@ def test_a_sweep_ends_with_its_table_and_a_single_run_has_none(launched, tmp_pat
     printed = capsys.readouterr().out
     assert "21.00 ± 1.41" in printed
     assert "swept/summary.md" in printed
-    assert "2 of 2 started jobs have finished." in (folder / "summary.md").read_text()
+    assert "2 of 2 jobs have finished." in (folder / "summary.md").read_text()
 
 
 @pytest.mark.parametrize(
     ("override", "error", "finished"),
-    [("fails=1", ValueError, "2 of 3"), ("killed=1", KeyboardInterrupt, "1 of 2")],
+    [("fails=1", ValueError, "2 of 3"), ("killed=1", KeyboardInterrupt, "1 of 3")],
 )
 def test_a_sweep_that_fails_or_is_killed_has_a_summary(launched, override, error, finished) -> None:
     with pytest.raises(error):
@@ -368,8 +370,21 @@ def test_a_sweep_that_fails_or_is_killed_has_a_summary(launched, override, error
     assert Path("swept/summary.md").is_file()
     write_summary(Path("swept"))
     text = Path("swept/summary.md").read_text()
-    assert f"{finished} started jobs have finished." in text
+    assert f"{finished} jobs have finished." in text
     assert "Not finished: seed=1." in text
+    assert ("Not started: seed=2." in text) == (error is KeyboardInterrupt)
+
+
+def test_rows_say_what_has_bad_steps_or_changes_nothing_and_jobs_that_diverged_are_named(sweep) -> None:
+    put("metrics.json", "train/bad_steps", 12.0)(sweep.scored("ablation=m1", psnr=20.0))
+    put("run.json", "unchanged", True)(sweep.scored("ablation=no_lpips", psnr=22.0))
+    sweep.scored("ablation=full", psnr=22.0)
+    put("run.json", "diverged", "the weights are not finite")(sweep.add("ablation=no_ssim"))
+    table = write_summary(sweep.folder)
+    labels = [row.cells[0].text for row in table.rows]
+    assert labels[:3] == ["m1 (12 bad steps)", "no_lpips (changes nothing)", "full"]
+    assert "Diverged: job=3." in table.remarks
+    assert read_back(sweep.folder).loc["m1", "bad_steps"] == 12
 
 
 def test_a_summary_that_cannot_be_written_is_logged_and_stops_nothing(launched, tmp_path, capsys) -> None:
@@ -403,7 +418,7 @@ def test_jobs_on_several_machines_make_one_summary(sweep, tmp_path, command) -> 
     table = read_back(Path("ALL"))
     assert table.loc[["full", "m1"], "seeds"].tolist() == [3, 4]
     assert table.loc["full", f"{PSNR}_mean"] == 23.0
-    assert "7 of 8 started jobs have finished." in done.out
+    assert "7 of 8 jobs have finished." in done.out
     assert sorted(path.name for path in Path("ALL").glob("summary.*")) == FILES
     refused = command.refuses("report", "summary", f"sweeps=[{sweep.folder},nowhere]", "out=NONE")
     assert refused == "sweeps=nowhere: no such folder"

@@ -168,7 +168,7 @@ def test_constants_that_the_tiled_backend_refuses_go_to_the_reference(caplog: py
     assert isinstance(chosen, ReferenceRasterizer)
     assert chosen.constants.blur == 0
     assert "not tiled: " in warnings_in(caplog)
-    assert "reference, which is very slow" in warnings_in(caplog)
+    assert "reference, which takes minutes for an image" in warnings_in(caplog)
 
 
 @pytest.mark.gpu

@@ -176,6 +176,22 @@ def test_a_shorter_run_also_ends_if_all_its_steps_were_bad(tmp_path, steps):
     assert train(module, steps=6, most=10).total == 5
 
 
+def test_a_run_whose_last_steps_were_bad_or_whose_weights_are_not_finite_has_no_checkpoint(tmp_path):
+    with pytest.raises(DivergenceError, match="^step 5: 2 steps in a row"):
+        train(Faulty(FAULTS["a loss that is NaN"], batches=(4, 5)), Checkpoints(str(tmp_path)), steps=6, most=10)
+    assert not list(tmp_path.iterdir())
+
+    class Broken(Faulty):
+        def optimizer_step(self, *arguments):
+            super().optimizer_step(*arguments)
+            if self.global_step == 5:
+                self.layer.bias.data[0] = INFINITE
+
+    with pytest.raises(DivergenceError, match=r"after 6 steps, layer\.bias is not finite"):
+        train(Broken(), Checkpoints(str(tmp_path)), steps=6, most=10)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_count_goes_on_in_a_continued_run(tmp_path):
     def module() -> Faulty:
         return Faulty(FAULTS["a loss that is NaN"], batches=(3, 4))
@@ -184,7 +200,7 @@ def test_the_count_goes_on_in_a_continued_run(tmp_path):
     first = module()
     second = module()
     assert train(whole, ExponentialMovingAverage(0.9), steps=4, accumulated=2).total == 2
-    train(first, ExponentialMovingAverage(0.9), Checkpoints(str(tmp_path)), steps=3, accumulated=2)
+    train(first, ExponentialMovingAverage(0.9), Checkpoints(str(tmp_path)), steps=2, accumulated=2)
     path = tmp_path / "last.ckpt"
     bad = train(second, ExponentialMovingAverage(0.9), steps=4, accumulated=2, ckpt_path=path)
     assert bad.total == 2

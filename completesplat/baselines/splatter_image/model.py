@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
 from completesplat.baselines.splatter_image.network import SongUNet
 from completesplat.errors import CompleteSplatError, TensorFileError, WeightsError
-from completesplat.files import atomic_path, make_folder, write_text
+from completesplat.files import atomic_path, home_path, make_folder, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.photo.reading import Framing, ImageLike, Photograph
@@ -271,7 +271,7 @@ class PublishedModel(SceneModel):
 
 def is_published(weights: Path | str) -> bool:
     """Return whether `weights` are Splatter Image's: `splatter_image:NAME`, a `.pth` file, or its folder or run."""
-    path = Path(str(weights)).expanduser()
+    path = home_path(weights)
     return str(weights).startswith(PREFIX) or path.suffix == ".pth" or (os.path.isdir(path) and bool(_models_in(path)))
 
 
@@ -282,7 +282,7 @@ def find_published(weights: str) -> PublishedCheckpoint:
         WeightsError: they are missing, cannot be downloaded, or have options that no published weights have.
     """
     published = weights.startswith(PREFIX)
-    model = _download(weights.removeprefix(PREFIX)) if published else _local(Path(weights).expanduser())
+    model = _download(weights.removeprefix(PREFIX)) if published else _local(home_path(weights))
     options = _read_config(_config_beside(model))
     return PublishedCheckpoint(model, options["data"], options["model"])
 

@@ -1,20 +1,26 @@
 """Data module of many captures, each of which is one sequence: turntables, or other photos of many objects."""
 
+import logging
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from completesplat.data.captures.module import MODELS, TRANSFORMS, CaptureSource, read_captures
+from completesplat.data.captures.captured_frames import Capture
+from completesplat.data.captures.module import MODELS, TRANSFORMS, CaptureSource, members, read_captures
 from completesplat.data.loading.object_data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
-from completesplat.data.splits import SPLITS, SeededSplit, split_by_seed
+from completesplat.data.splits import FEWEST_SEQUENCES, SPLITS, SeededSplit, split_by_seed
 from completesplat.data.validation import field, read_json, require_file
-from completesplat.errors import BadAnnotation, MissingFile, SharedSequences, errors_at
+from completesplat.errors import BadAnnotation, DataError, MissingFile, SharedSequences, errors_at
 from completesplat.quantities import Natural, Share
-from completesplat.wording import SHORT, printable
+from completesplat.wording import SHORT, counted, printable
+
+logger = logging.getLogger(__name__)
 
 SPLITS_FILE = "splits.json"
+HOLD_OUT = 8  # one of so many views, where views are held out
 MARKS = {"keyframes"}.union(TRANSFORMS, (model.split("/")[0] for model in MODELS))  # a folder with one is a capture
 
 
@@ -44,13 +50,13 @@ def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
             raise BadAnnotation(f"must be an object with {', '.join(SPLITS)} alone, not {keys or 'empty'}")
         for split in SPLITS:
             entries = field(content, split, list) if split in content else []
-            members = set[str]()
+            found = set[str]()
             for entry in entries:
                 named = [name for name in names if name == entry or name.startswith(f"{entry}/")]
                 if not named:
                     raise BadAnnotation(f"{split} names {repr(entry)[:80]}, which is no capture nor a folder of them")
-                members.update(named)
-            splits[split] = [name for name in names if name in members]
+                found.update(named)
+            splits[split] = [name for name in names if name in found]
             for name in splits[split]:
                 owner = owners.setdefault(object_of(name), split)
                 if owner != split:
@@ -60,6 +66,9 @@ def read_splits(path: Path, names: list[str]) -> dict[str, list[str]]:
 
 class CaptureSetDataModule(ObjectDataModule):
     """Scenes of many captures, where all frames of all captures of an object belong to the same split.
+
+    One or two objects, without a list, cannot be split so. Then every split has all captures, and views of each are
+    held out for validation and test (`members`); a warning says so.
 
     The captures are the folders below `root`, at any depth, that hold one of `MARKS`. A capture's name
     is its path below `root`, and its object is the first folder of that path.
@@ -88,6 +97,8 @@ class CaptureSetDataModule(ObjectDataModule):
     def describe(self) -> dict[str, str | None]:
         val, test, seed = self.seeded
         split = f"of a list, or by seed {seed}: {val:g} of the objects for validation, {test:g} for the test"
+        if self.splits_share_sequences:
+            split = f"one of {HOLD_OUT} views of each capture is held out for validation and test"
         return {"data_set": "captures", "split": split, **self.described_views("a capture's first frame")}
 
     def packed_settings(self) -> dict[str, Scalar]:
@@ -103,21 +114,39 @@ class CaptureSetDataModule(ObjectDataModule):
             raise refused[0]
         if not captures:
             raise MissingFile("no folders with transforms.json or sparse/0", str(self.root))
+        objects = {object_of(name) for name in folders}
+        if len(objects) < FEWEST_SEQUENCES and self.seeded.test_fraction < 1 and not self._list().is_file():
+            return self._by_views(captures, refused, len(objects))
         sources = {}
         for part, names in self._members(list(folders)).items():
-            members = {name: captures[name] for name in names if name in captures}
-            sources[part] = CaptureSource(members, range, self.framing, refused)
+            chosen = {name: captures[name] for name in names if name in captures}
+            sources[part] = CaptureSource(chosen, range, self.framing, refused)
         return sources
 
+    def _by_views(
+        self, captures: Mapping[str, Capture], refused: list[DataError], objects: int
+    ) -> Mapping[str, CaptureSource]:
+        """Return all captures for each split, with other views of them for training than for validation and test."""
+        self.splits_share_sequences = True
+        what = f"{counted(objects, 'object')}, too few for a validation and a test by other objects"
+        logger.warning("%s: %s; one of %d views of each capture is held out for both", self.root, what, HOLD_OUT)
+        sources = {}
+        for part in SPLITS:
+            sources[part] = CaptureSource(captures, partial(members, HOLD_OUT, part != "train"), self.framing, refused)
+        return sources
+
+    def _list(self) -> Path:
+        return self.root / SPLITS_FILE if self.splits is None else require_file(Path(self.splits))
+
     def _members(self, names: list[str]) -> dict[str, list[str]]:
-        listed = self.root / SPLITS_FILE if self.splits is None else require_file(Path(self.splits))
+        listed = self._list()
         if listed.is_file():
             return read_splits(listed, names)
         objects = split_by_seed({object_of(name): [0] for name in names}, self.seeded)
-        members = {}
+        by_split = {}
         for split in SPLITS:
-            members[split] = [name for name in names if (object_of(name), 0) in objects[split]]
-        return members
+            by_split[split] = [name for name in names if (object_of(name), 0) in objects[split]]
+        return by_split
 
 
 def _capture_folders(root: Path) -> list[Path]:

@@ -13,7 +13,7 @@ from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.scenes import EvaluationScenes, TrainingScenes, collate
 from completesplat.data.loading.view_selection import item_generator
 from completesplat.data.tolerance import ErrorTolerance
-from completesplat.errors import DataError
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.signals import leave_to_parent
 
 logger = logging.getLogger(__name__)
@@ -49,6 +49,22 @@ class EpochSampler(Sampler[tuple[int, int]]):
         rank, count = processes()
         local = order[rank::count][: len(self)]
         return iter([(epoch, int(index)) for index in local[self.start :]])
+
+
+def workers_refusal(error: BaseException) -> str | None:
+    """Return one line for an error of worker processes that lack shared memory or open files, else None.
+
+    Their tensors lie in `/dev/shm`, of which Docker gives 64 MB, or in open files.
+    """
+    text = str(error)
+    shared = "shared memory" in text or "Bus error" in text or "No space left on device" in text
+    files = "Too many open files" in text or "received 0 items of ancdata" in text
+    if files:
+        return "data.workers: too many open files; raise `ulimit -n`, or set data.workers=0"
+    if shared:
+        advice = "start the container with --shm-size=2g or --ipc=host, or set data.workers=0"
+        return f"data.workers: no space in shared memory (/dev/shm); {advice}"
+    return None
 
 
 class RepeatedEpoch(EpochSampler, SequentialSampler):  # type: ignore[misc]
@@ -131,6 +147,11 @@ class SceneLoader:
                     self._report()
                 if scenes is not None:
                     yield scenes
+        except (RuntimeError, OSError) as error:
+            reason = workers_refusal(error)
+            if reason is None:
+                raise
+            raise CompleteSplatError(reason) from error
         except GeneratorExit:  # The caller stopped before the end of the epoch.
             if self._batches < len(self):
                 self._report()

@@ -17,7 +17,7 @@ from completesplat.data.packed.shards import OpenShard
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import path_below, require_file
 from completesplat.errors import BadAnnotation, ChangedFile, DataError, MissingFile, UnreadableFile, errors_at
-from completesplat.files import atomic_path, write_bytes
+from completesplat.files import atomic_path, home_path, user_cache, write_bytes
 from completesplat.weights import sha256_of
 
 ADDRESS = "address.txt"
@@ -34,8 +34,8 @@ def local_root(root: str) -> Path:
     """
     if "://" not in root:
         return Path(root)
-    place = os.environ.get("COMPLETESPLAT_CACHE", "~/.cache/completesplat")
-    folder = Path(place).expanduser() / "stores" / _digest(root.encode())
+    place = os.environ.get("COMPLETESPLAT_CACHE")
+    folder = (home_path(place) if place else user_cache()) / "stores" / _digest(root.encode())
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / ".lock"):
         try:

@@ -40,7 +40,9 @@ def require_file(path: Path) -> Path:
 
 
 def path_below(root: Path, relative: str) -> Path:
-    """Return the path below `root` that an annotation names. Links are followed if they stay below `root`.
+    """Return the path below `root` that an annotation names.
+
+    Links are followed if they stay below `root`, or lead to the store of the program that made them (`_stores`).
 
     Backslashes are separators, as on Windows. An absolute path may lead into `root`.
 
@@ -59,12 +61,27 @@ def path_below(root: Path, relative: str) -> Path:
         real_path = os.path.realpath(root / path)
     except ValueError:
         raise OutsidePath(f"characters that no file name has: {preview}") from None
-    if windows.drive or os.path.commonpath([real_root, real_path]) != real_root:
+    inside = any(os.path.commonpath([place, real_path]) == place for place in (real_root, *_stores(real_root)))
+    if windows.drive or not inside:
         if absolute and not os.path.lexists(path):
             raise OutsidePath(f"a path of another machine; make it relative to {root}: {preview}")
         advice = "" if absolute else "; links may not leave it, so name the real folder"
         raise OutsidePath(f"leads outside of {root}: {preview} is {real_path}{advice}")
     return root / (os.path.relpath(real_path, real_root) if absolute else path)
+
+
+def _stores(real_root: str) -> list[str]:
+    """Return the folders that hold the content of links in a folder of the Hugging Face hub, DVC or git-annex.
+
+    The hub's snapshot `REPOSITORY/snapshots/REVISION` has links to `REPOSITORY/blobs`. In a repository, DVC's links
+    lead to `.dvc/cache`, and git-annex's to `.git/annex/objects`.
+    """
+    places = []
+    for folder in (Path(real_root), *Path(real_root).parents):
+        if folder.parent.name == "snapshots":
+            places.append(folder.parent.parent / "blobs")
+        places += [folder / ".dvc" / "cache", folder / ".git" / "annex" / "objects"]
+    return [str(place) for place in places if place.is_dir()]
 
 
 def read_json(path: Path, allow_nan: bool = False) -> Any:

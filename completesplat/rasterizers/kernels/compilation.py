@@ -3,16 +3,19 @@
 import hashlib
 import inspect
 import logging
-import os
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
+
+from completesplat.errors import CompleteSplatError
+from completesplat.files import private_folder, user_cache
 
 Result = TypeVar("Result")
 numba_config: Any = numba.config
@@ -50,14 +53,15 @@ def helper(function: Callable[..., Result], **changed: object) -> Callable[..., 
 
 @cache
 def cache_directory() -> Path | None:
-    """Return the first writable of $NUMBA_CACHE_DIR, a folder beside the sources and the user's cache, or None.
+    """Return the first writable of $NUMBA_CACHE_DIR, a folder beside the sources and the user's caches, or None.
 
     numba invalidates a cached function when its file changes, but not when a helper in another file does, so the
     folder's name contains a digest of all kernel sources, and of the processor and versions that they are compiled for.
     """
     here = Path(__file__).parent
-    user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "completesplat"
-    bases = [Path(numba_config.CACHE_DIR)] if numba_config.CACHE_DIR else [here / "__pycache__", user_cache]
+    bases = [here / "__pycache__", *_user_folders()]
+    if numba_config.CACHE_DIR:
+        bases = [Path(numba_config.CACHE_DIR)]
     machine = repr((get_host_cpu_name(), get_host_cpu_features().flatten(), sys.version, numba.__version__)).encode()
     sources = b"".join(path.read_bytes() for path in sorted(here.glob("*.py")))
     digest = hashlib.sha256(machine + sources).hexdigest()
@@ -71,5 +75,15 @@ def cache_directory() -> Path | None:
         if not any(folder.glob("kernels_*/*.nbc")):
             logger.info("compiling the kernels on first use, once on this machine, takes 10 to 30 s")
         return folder
-    logger.info("no writable cache folder (%s): kernels are compiled anew in every process", bases[-1])
+    message = "no writable cache folder (%s): kernels are compiled anew in every process, which takes 10 to 30 s"
+    logger.warning(message, ", ".join(map(str, bases)))
     return None
+
+
+def _user_folders() -> Iterator[Path]:
+    """Yield the user's folders for caches, the last one among the temporary files."""
+    with suppress(CompleteSplatError):
+        yield user_cache()
+    temporary = private_folder()
+    if temporary is not None:
+        yield temporary
