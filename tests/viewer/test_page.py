@@ -43,6 +43,10 @@ class Browser(viser.ClientHandle):
     def __init__(self) -> None:
         self.messages: list[str] = []
         self.files: dict[str, bytes] = {}
+        self.camera = SimpleNamespace(image_width=0, image_height=0)
+
+    def atomic(self) -> nullcontext:
+        return nullcontext()
 
     def add_notification(self, title: str, body: str, **_: object) -> None:
         self.messages.append(body)

@@ -12,7 +12,7 @@ viser = pytest.importorskip("viser", reason="the viewer's extra is not installed
 
 from completesplat.viewer.access import start_server  # noqa: E402
 from completesplat.viewer.splat_view import SplatView  # noqa: E402
-from completesplat.viewer.turning import REST, SPEED, Turntable  # noqa: E402
+from completesplat.viewer.turning import REST, SLOW, SPEED, Turntable  # noqa: E402
 
 QUARTER = np.pi / 2 / SPEED  # seconds
 
@@ -21,7 +21,10 @@ class Browser(viser.ClientHandle):
     """Stands in for one that is connected."""
 
     def __init__(self) -> None:
-        self.camera = SimpleNamespace(image_width=0, image_height=0, position=np.zeros(3))
+        self.reports = []
+        self.camera = SimpleNamespace(
+            image_width=0, image_height=0, position=np.zeros(3), on_update=self.reports.append
+        )
 
     def atomic(self):
         return nullcontext()
@@ -62,6 +65,8 @@ def test_the_camera_rests_at_the_front_and_then_goes_round_the_scene_at_its_heig
     turntable.step(REST + 2 * QUARTER)
     behind = 2 * pivot - front
     assert place(browsers[0]) == pytest.approx(behind, abs=1e-4)
+    for report in browsers[0].reports:
+        report(browsers[0].camera)
     turntable.step(REST + QUARTER)
     aside = place(browsers[0]) - pivot
     assert aside @ (front - pivot) == pytest.approx(0, abs=1e-4)
@@ -81,8 +86,9 @@ def test_a_touch_stops_the_scene_of_one_browser_until_it_turns_again_or_another_
     turntable.start(0, REST + QUARTER)
     turntable.step(REST + QUARTER + 1)
     assert place(browsers[0]) is not None
+    (report,) = browsers[0].reports
+    report(browsers[0].camera)
     turntable.stop(0)
-    browsers[0].camera.position = None
     turntable.view.set_up((0.0, -1.0, 0.0))
     turntable.view.show([balls_sample()])
     browsers[0].camera.position = None
@@ -90,6 +96,21 @@ def test_a_touch_stops_the_scene_of_one_browser_until_it_turns_again_or_another_
     assert place(browsers[0]) is None
     turntable.step(100 + REST + 1)
     assert place(browsers[0]) is not None
+
+
+@pytest.mark.parametrize(("seconds", "goes_on"), [(SLOW / 2, True), (2 * SLOW, False)])
+def test_a_browser_is_moved_when_it_has_reported_the_last_move_and_a_slow_one_stops(
+    turntable, browsers, seconds, goes_on
+):
+    turntable.step(0)
+    turntable.step(REST + 3)
+    first = place(browsers[0])
+    turntable.step(REST + 3 + seconds)
+    assert place(browsers[0]) is first
+    (report,) = browsers[0].reports
+    report(browsers[0].camera)
+    turntable.step(REST + 4 + seconds)
+    assert (place(browsers[0]) is not first) == goes_on
 
 
 @pytest.mark.parametrize("kind", ["forming", "side by side", "nothing", "only the direction up"])
