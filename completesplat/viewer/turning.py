@@ -4,7 +4,6 @@ import math
 import warnings
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 
 import viser
 
@@ -58,7 +57,7 @@ class Turntable:
             return
         for number, client in clients.items():
             if number not in self._turns:
-                client.camera.on_update(partial(self._reported, number))
+                client.camera.on_update(lambda _, number=number: self._reported(number))
             turn = self._turns.get(number)
             if turn is None or turn.arrangement is not arrangement:
                 turn = Turn(arrangement, now)
@@ -82,7 +81,7 @@ class Turntable:
         """Return whether a browser's scene was touched, or the browser is slow."""
         return client_id in self._turns and self._turns[client_id].stopped
 
-    def _reported(self, number: int, _: viser.CameraHandle) -> None:
+    def _reported(self, number: int) -> None:
         sent = self._unreported.pop(number, self._now)
         if self._now - sent > SLOW:
             self.stop(number)
