@@ -18,6 +18,7 @@ from completesplat.wording import printable
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 WEIGHT_SUFFIXES = (".ckpt", ".pth", ".safetensors")
 PAUSE = 2.0  # seconds between two checks for new scenes of a run
+FRAME = 1 / 30  # seconds between two images of a scene that turns
 SCENE_FILES = ("sample_*.ply", "scene.ply")
 AT_STEP = "step {} of the training"
 
@@ -41,7 +42,6 @@ def run(config: DictConfig, out: Path) -> None:
     server = start_server(0 if config.export is not None else config.port)
     address = f"{server.address} (Ctrl-C ends it)"
     page = None
-    step = None
     try:
         if config.export is None and not own_files:
             print(address, flush=True)
@@ -50,12 +50,22 @@ def run(config: DictConfig, out: Path) -> None:
             return export(page, Path(config.export))
         if own_files:
             print(address, flush=True)
-        while True:
-            time.sleep(PAUSE)
-            if config.watch is not None:
-                step = show_newest(page, Path(config.watch), step)
+        stay(page, None if config.watch is None else Path(config.watch))
     finally:
         stop_server(server) if page is None else page.close()
+
+
+def stay(page: Any, run: Path | None) -> None:
+    """Turn the page's scene, and show what a run (None: none) writes, until Ctrl-C."""
+    step = None
+    checked = time.monotonic()
+    while True:
+        time.sleep(FRAME)
+        now = time.monotonic()
+        page.turntable.step(now)
+        if run is not None and now - checked > PAUSE:
+            step = show_newest(page, run, step)
+            checked = now
 
 
 def check_asked(config: DictConfig) -> None:

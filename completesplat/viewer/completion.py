@@ -17,8 +17,8 @@ from completesplat.photo.reading import Photograph
 from completesplat.quantities import Crop
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.access import show_status
-from completesplat.viewer.page import SHOWN, Page
-from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_completion_controls, nearest_steps, preview_of
+from completesplat.viewer.page import COMPARED, SHOWN, Page
+from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, Pixels, add_completion_controls, nearest_steps
 from completesplat.viewer.sample import Sample
 
 PAUSE = 0.2  # seconds between two images of a scene that forms
@@ -34,6 +34,7 @@ class Completion:
         self.photograph: tuple[str, Photograph] | None = None
         self.controls = add_completion_controls(page.server.gui, model, start)
         page.complete = self.complete
+        page.invite()
         self.controls.draw.on_click(lambda event: self.request(event.client))
         for name in SLIDERS:
             getattr(self.controls, name).on_update(self._moved)
@@ -41,14 +42,20 @@ class Completion:
     def load(self, name: str, photograph: Photograph, client: viser.ClientHandle | None = None) -> None:
         """Show this photo in the panel, and draw its samples."""
         self.photograph = name, photograph
-        self.page.photo.content = ""  # of an earlier scene
         words = [name, f"field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"]
         framed = framing_line(photograph)
         words += [] if framed is None else [framed]
-        shown = photograph.shown_at(self.model.image_size)
-        self.controls.preview.content = preview_of(to_pixels(shown), ", ".join(words))
+        self.page.withdraw_invitation()
+        self.page.view.fade()
+        self.page.set_photo(self._seen(photograph), ", ".join(words))
+        self.controls.draw.disabled = False
         self.page.view.set_up(self.model.up.tolist())
         self.request(client)
+
+    def _seen(self, photograph: Photograph) -> Pixels:
+        """Return the photo as the model takes it, pale where it is continued, at the size of the comparison or its own."""
+        size = min(COMPARED, self.model.front_size(photograph, self.controls.detail.value))
+        return to_pixels(photograph.shown_at(size))
 
     def request(self, client: viser.ClientHandle | None = None) -> None:
         """Queue a drawing with the present settings."""
@@ -92,7 +99,7 @@ class Completion:
             seconds = time.monotonic() - began
             self.page.show(drawing.arranged(scenes, finished=True), f"{len(scenes)} drawn in {seconds:.1f} s")
         except Exception:
-            if self.page.view.samples is not before:
+            if self.page.view.samples is not before or self.page.view.faded:
                 self.page.show(before)
             raise
         finally:

@@ -3,11 +3,13 @@
 import logging
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,11 +35,13 @@ from completesplat.viewer import panel
 from completesplat.viewer.access import GuardedServer, show_status, stop_server, with_head
 from completesplat.viewer.sample import Sample, read_scene
 from completesplat.viewer.splat_view import SplatView
+from completesplat.viewer.turning import Turntable
 from completesplat.wording import printable
 
 Task = Callable[[], None]
 
-THUMBNAIL = 96  # px
+THUMBNAIL = 160  # px
+COMPARED = 384  # px, of the photo in the panel
 MOST_THUMBNAILS = 24
 SHOWN = "shown"  # kind of all jobs that show other samples
 
@@ -128,7 +132,13 @@ class Saver:
     def thumbnail(self, sample: Sample, size: int) -> panel.Pixels:
         """Render a sample from behind, where samples differ, with `size` px on the longer side."""
         up = torch.from_numpy(self.view.up).to(sample.reference.intrinsics)
-        camera = orbit(sample.reference, sample.pivot(), up, 2)[1]
+        return self._rendered(sample, orbit(sample.reference, sample.pivot(), up, 2)[1], size)
+
+    def front(self, sample: Sample, size: int) -> panel.Pixels:
+        """Render a sample from the photo's place, with `size` px on the longer side."""
+        return self._rendered(sample, sample.reference, size)
+
+    def _rendered(self, sample: Sample, camera: Cameras, size: int) -> panel.Pixels:
         scene = sample.for_viewers()
         factor = size / max(camera.image_size)
         height = max(1, round(camera.image_size[0] * factor))
@@ -182,12 +192,14 @@ class Page:
         self.file_controls = panel.add_file_controls(server.gui, [*scenes])
         self.file_controls.upload.on_upload(self._upload)
         self.file_controls.chosen.on_update(self._choose)
-        self.photo = server.gui.add_html("", order=0.4)
+        self.turntable = Turntable(server, view)
         self.view_controls = panel.add_view_controls(server.gui)
         self._connect_view_controls()
         self.save_controls = panel.add_save_controls(server.gui, FORMATS)
         self.save_controls.save.on_click(self._save)
         self._thumbnails: list[panel.Pixels] = []
+        self._photo: tuple[panel.Pixels, str] | None = None
+        self.invitation: SimpleNamespace | None = None
         self.show(view.samples)
 
     def show(self, samples: Sequence[Sample], status: str = "") -> None:
@@ -200,9 +212,26 @@ class Page:
         layers = max((sample.layers for sample in samples), default=0)
         for i, box in enumerate(self.view_controls.layers):
             box.visible = i < layers
+        self.save_controls.save.disabled = not samples
+        self.view_controls.folder.visible = bool(samples)
+        self.view_controls.motion.visible = bool(samples)
+        if samples:
+            self.withdraw_invitation()
         show_status(self.server, status)
         if all(sample.finished for sample in samples):
+            self.worker.submit("comparison", self._draw_comparison)
             self.worker.submit("thumbnails", partial(self._draw_thumbnails, samples))
+
+    def invite(self) -> None:
+        """Ask for a photo if nothing is shown."""
+        if not self.view.samples:
+            self.invitation = panel.add_invitation(self.server.gui)
+            self.invitation.upload.on_upload(self._upload)
+
+    def withdraw_invitation(self) -> None:
+        if self.invitation is not None:
+            self.invitation.window.close()
+            self.invitation = None
 
     def open(self, path: Path, name: str) -> None:
         """Show what `read_scene` reads instead of the samples, from the front."""
@@ -220,11 +249,27 @@ class Page:
         """
         folder = scene if scene.is_dir() else scene.parent
         file = folder / PHOTO_FILE
-        self.photo.content = ""
+        self.set_photo(None)
         if file.is_file() and is_described(folder):
             with refused_as_bad(str(file)), open_image(file, ("PNG",)) as image:
-                pixels = np.asarray(image.convert("RGB").resize((THUMBNAIL, THUMBNAIL)))
-                self.photo.content = panel.preview_of(pixels, "photo")
+                image.thumbnail((COMPARED, COMPARED))
+                self.set_photo(np.asarray(image.convert("RGB")), "photo")
+
+    def set_photo(self, photo: panel.Pixels | None, label: str = "") -> None:
+        """Show a photo in the panel (None: none), and beside it what is on the page, when that is finished."""
+        self._photo = None if photo is None else (photo, label)
+        self.view_controls.photo.content = "" if photo is None else panel.comparison(photo, None, label)
+        self.worker.submit("comparison", self._draw_comparison)
+
+    def _draw_comparison(self) -> None:
+        """Render the first of the samples on the page from the photo's place, in the worker's thread."""
+        photo = self._photo
+        samples = self.view.visible
+        if photo is None or not samples or self.view.faded or not samples[0].finished:
+            return
+        scene = self.saver.front(samples[0], max(photo[0].shape[:2]))
+        if self._photo is photo:
+            self.view_controls.photo.content = panel.comparison(photo[0], scene, photo[1])
 
     def _choose(self, event: viser.GuiEvent[Any]) -> None:
         name = self.file_controls.chosen.value
@@ -234,7 +279,7 @@ class Page:
 
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
         """Show an uploaded scene, or complete an uploaded image, when the scene that is being drawn is finished."""
-        file = self.file_controls.upload.value
+        file = event.target.value
         name = printable(file.name)
         content = file.content
         file.content = b""  # which the button would keep until the next upload
@@ -272,9 +317,9 @@ class Page:
         self._mark_thumbnail()
 
     def _mark_thumbnail(self) -> None:
-        row = panel.thumbnail_row(self._thumbnails, self.view.chosen) if self._thumbnails else ""
-        if self.view_controls.thumbnails.content != row:
-            self.view_controls.thumbnails.content = row
+        row = panel.sample_tiles(self._thumbnails, self.view.chosen) if self._thumbnails else ""
+        if self.view_controls.tiles.content != row:
+            self.view_controls.tiles.content = row
 
     def submit(self, kind: Hashable, client: viser.ClientHandle | None, job: Task) -> None:
         """Let the worker do a job (`Worker.submit`) whose errors go to one browser (None: to all)."""
@@ -316,6 +361,15 @@ class Page:
             view.cameras = {name for name, box in controls.cameras.items() if box.value}
             view.refresh()
             self._mark_thumbnail()
+            self.worker.submit("comparison", self._draw_comparison)
+
+        def moved(event: viser.GuiEvent[Any]) -> None:
+            if controls.motion.value == panel.TURN:
+                self.turntable.start(event.client_id, time.monotonic())
+                return
+            self.turntable.stop(event.client_id)
+            if controls.motion.value == panel.FROM_THE_FRONT:
+                view.look_from_the_front(event.client)
 
         def pressed(index: int, _: viser.CommandEvent) -> None:
             if index < len(controls.chosen.options) - 1:  # key 0, which is -1, chooses all
@@ -326,7 +380,9 @@ class Page:
         controls.chosen.on_update(changed)
         for box in (*controls.layers, controls.depth, *controls.cameras.values()):
             box.on_update(changed)
-        controls.front.on_click(lambda event: view.look_from_the_front(event.client))
+        controls.motion.on_click(moved)
+        controls.turn.on_trigger(lambda event: self.turntable.start(event.client_id, time.monotonic()))
+        controls.stop.on_trigger(lambda event: self.turntable.stop(event.client_id))
 
     def _save(self, event: viser.GuiEvent[Any]) -> None:
         client = event.client

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import viser
+import viser.transforms as vtf
 from jaxtyping import Float
 from torch import Tensor
 
@@ -25,6 +26,7 @@ LARGEST_COVARIANCE = 3e4
 GAP = 1.25
 NARROWEST_WINDOW = 1.1
 SAME = 0.15
+FADED = 0.15  # factor of the opacities of an earlier photo's scene
 MARGIN = 1.15  # height and width that are shown, as multiples of the photo's
 REFERENCE_COLOR = (200, 60, 40)
 ORBIT_COLOR = (60, 60, 60)
@@ -99,6 +101,7 @@ def arrangement_of(samples: Sequence[Sample]) -> Arrangement:
 class SplatView:
     """Splats and cameras on the page: one sample or all side by side, all layers or some, in colour or by depth.
 
+    `arrangement` is the row that the cameras were last placed for, None before that and for another direction up.
     `refresh` draws everything anew from the attributes, under a lock because callbacks come from several threads.
 
     Side by side, only the middle part of each sample is shown, because scenes are wider than an image and would hide
@@ -115,7 +118,8 @@ class SplatView:
         self._splats: dict[str, viser.GaussianSplatHandle] = {}
         self._frusta: list[viser.CameraFrustumHandle] = []
         self._lock = threading.RLock()
-        self._arrangement: Arrangement | None = None
+        self.arrangement: Arrangement | None = None
+        self.faded = False
         self.set_up(up)
         server.on_client_connect(self._welcome)
 
@@ -131,13 +135,20 @@ class SplatView:
         """Set the direction up, and make the next drawing be seen from the front, because it shows another scene."""
         with self._lock:
             self.up = np.asarray(up, float)
-            self._arrangement = None
+            self.arrangement = None
             self.server.scene.set_up_direction(self.up)
 
     def show(self, samples: Sequence[Sample]) -> None:
         """Replace the samples, and draw the new ones."""
         with self._lock:
+            self.faded = False
             self.samples = list(samples)
+            self.refresh()
+
+    def fade(self) -> None:
+        """Draw the samples faintly until others are shown, because those of another photo are being drawn."""
+        with self._lock:
+            self.faded = True
             self.refresh()
 
     def refresh(self) -> None:
@@ -149,16 +160,16 @@ class SplatView:
             arrangement = arrangement_of(samples)
             self._draw_splats(samples, arrangement)
             self._draw_cameras(samples, arrangement)
-            if self._arrangement is None or not arrangement.looks_like(self._arrangement):
-                self._arrangement = arrangement
+            if self.arrangement is None or not arrangement.looks_like(self.arrangement):
+                self.arrangement = arrangement
                 self.look_from_the_front()
 
     def look_from_the_front(self, client: viser.ClientHandle | None = None) -> None:
         """Move a browser's camera (None: those of all present and future browsers) to where the photo was taken."""
         with self._lock:
-            if self._arrangement is None:
+            if self.arrangement is None:
                 return
-            view = self._arrangement
+            view = self.arrangement
             start = self.server.initial_camera
             start.position = view.position
             start.look_at = view.look_at
@@ -173,20 +184,35 @@ class SplatView:
                     if camera.image_width * camera.image_height:  # else hidden: `_welcome` fits its view when it shows
                         camera.fov = view.fov_in(camera.image_width / camera.image_height)
 
+    def look_from_aside(self, client: viser.ClientHandle, angle: float) -> None:
+        """Move a browser's camera to the front's place, turned about the scene by an angle in radians."""
+        with self._lock:
+            if self.arrangement is None:
+                return
+            axis = self.up / np.linalg.norm(self.up)
+            rotation = vtf.SO3.exp(axis * angle)
+            offset = self.arrangement.position - self.arrangement.look_at
+            with client.atomic():
+                client.camera.up_direction = self.up
+                client.camera.position = self.arrangement.look_at + rotation @ offset
+                client.camera.look_at = self.arrangement.look_at
+
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """Fit the view to a new browser's window, even a phone's, and show a notice until it has drawn an image."""
+        """Fit the view to a new browser's window, even a phone's, and show a notice until it has drawn a scene."""
         last_aspect: float | None = None
 
         def fit(camera: viser.CameraHandle) -> None:
             nonlocal last_aspect
             aspect = camera.image_width / max(camera.image_height, 1)
-            view = self._arrangement
+            view = self.arrangement
             if view is not None and aspect > 0 and aspect != last_aspect:
                 last_aspect = aspect
                 camera.fov = view.fov_in(aspect)
 
         client.camera.on_update(fit)
         fit(client.camera)
+        if not self.samples:
+            return
         with suppress(RuntimeError):  # it has left
             drawing = client.add_notification("Drawing the first image", "", loading=True, with_close_button=False)
             client.get_render(height=1, width=1)  # returns when the browser has drawn it
@@ -197,6 +223,8 @@ class SplatView:
         scenes = [sample.for_viewers().seen_from(sample.reference.centers) for sample in samples]
         if self.depth:
             scenes = depth_colored(scenes, [sample.reference for sample in samples])
+        if self.faded:
+            scenes = [replace(scene, opacities=scene.opacities * FADED) for scene in scenes]
         earlier = self._splats
         self._splats = {}
         names = {f"/sample_{i}/layer_{layer}" for i, sample in enumerate(samples) for layer in range(sample.layers)}

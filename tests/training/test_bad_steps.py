@@ -177,7 +177,7 @@ def test_a_shorter_run_also_ends_if_all_its_steps_were_bad(tmp_path, steps):
 
 
 def test_a_run_whose_last_steps_were_bad_or_whose_weights_are_not_finite_has_no_checkpoint(tmp_path):
-    with pytest.raises(DivergenceError, match="^step 5: 2 steps in a row"):
+    with pytest.raises(DivergenceError, match=r"^step 5: 2 steps in a row"):
         train(Faulty(FAULTS["a loss that is NaN"], batches=(4, 5)), Checkpoints(str(tmp_path)), steps=6, most=10)
     assert not list(tmp_path.iterdir())
 

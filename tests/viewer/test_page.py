@@ -33,7 +33,7 @@ from completesplat.viewer import page as page_module  # noqa: E402
 from completesplat.viewer.access import start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
 from completesplat.viewer.page import Page, Saver  # noqa: E402
-from completesplat.viewer.panel import SIDE_BY_SIDE, preview_of, thumbnail_row  # noqa: E402
+from completesplat.viewer.panel import SIDE_BY_SIDE, comparison, sample_tiles  # noqa: E402
 from completesplat.viewer.splat_view import SplatView  # noqa: E402
 
 
@@ -43,6 +43,10 @@ class Browser(viser.ClientHandle):
     def __init__(self) -> None:
         self.messages: list[str] = []
         self.files: dict[str, bytes] = {}
+        self.camera = SimpleNamespace(image_width=0, image_height=0)
+
+    def atomic(self) -> nullcontext:
+        return nullcontext()
 
     def add_notification(self, title: str, body: str, **_: object) -> None:
         self.messages.append(body)
@@ -127,7 +131,7 @@ def test_layers_are_switched_and_samples_chosen_and_placed(page):
 def test_keys_and_thumbnails_choose_a_sample(page):
     page.show([balls_sample()] * 3)
     finish(page)
-    thumbnails = page.view_controls.thumbnails
+    thumbnails = page.view_controls.tiles
     assert thumbnails.content.count("<img") == 3
     assert "key:'3'" in thumbnails.content
     first = thumbnails.content
@@ -167,7 +171,9 @@ def test_the_photo_of_a_predictions_folder_is_in_the_panel_and_a_damaged_one_ref
             (tmp_path / "photo.png").write_bytes(content)
         with nullcontext() if shown is not None else pytest.raises(CompleteSplatError, match=r"photo\.png: not an im"):
             page.open(tmp_path, "scene")
-        assert ("<img" in page.photo.content) == bool(shown)
+        assert ("the photo" in page.view_controls.photo.content) == bool(shown)
+        finish(page)
+        assert ("the scene" in page.view_controls.photo.content) == bool(shown)
 
 
 def test_depth_replaces_colours_and_frusta_stand_at_the_cameras(page):
@@ -202,7 +208,7 @@ def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(comple
     for sample, expected in zip(samples, model(completion.photograph[1], **SETTINGS), strict=True):
         assert torch.equal(sample.gaussians.means, expected.means)
         assert torch.equal(sample.gaussians.scales, expected.scales)
-    assert "photo.png" in completion.controls.preview.content
+    assert "photo.png" in completion.page.view_controls.photo.content
     assert completion.page.view_controls.chosen.options == ("sample 1", "sample 2", "all, side by side")
     assert [sample.finished for sample in seen] == [False, False, True]
     assert said[:2] == ["completesplat: reading photo.png", "completesplat: drawing from photo.png"]
@@ -281,8 +287,9 @@ def test_one_of_several_scenes_is_chosen(server, tmp_path):
 
 
 def test_a_slider_draws_anew_unless_drawing_is_off(completion):
-    before = load(completion.page)[0].gaussians.means
     controls = completion.controls
+    controls.live.value = True
+    before = load(completion.page)[0].gaussians.means
     controls.skip_weight.value = 0.25
     sample = finish(completion.page)[0]
     assert sample.settings["skip_weight"] == 0.25
@@ -476,13 +483,91 @@ def test_a_taken_port_leads_to_the_next_one(server):
     second.stop()
 
 
-def test_names_of_images_are_text_in_the_panels_html_and_thumbnails_without_a_key_choose_nothing():
+def test_names_of_images_are_text_in_the_panels_html_and_tiles_without_a_key_choose_nothing():
     image = np.zeros((2, 2, 3), np.uint8)
-    html = preview_of(image, "<img src=x onerror=alert(1)>")
+    html = comparison(image, None, "<img src=x onerror=alert(1)>")
     assert html.count("<img") == 1
     assert "&lt;img src=x" in html
-    row = thumbnail_row([image] * 11, chosen=None)
-    assert (row.count("<img"), row.count("onclick")) == (11, 9)
+    tiles = sample_tiles([image] * 11, chosen=1)
+    assert (tiles.count("<img"), tiles.count("onclick"), tiles.count("disabled")) == (11, 9, 2)
+    assert tiles.count('aria-pressed="true"') == 1
+
+
+def test_an_empty_page_asks_for_a_photo_and_has_nothing_to_draw_save_or_turn(page, model):
+    page.show([])
+    made = Completion(page, model, SETTINGS | {"remove_background": False})
+    invitation = page.invitation.window
+    assert not invitation.closed
+    assert made.controls.draw.disabled
+    assert page.save_controls.save.disabled
+    assert not page.view_controls.folder.visible
+    assert not page.view_controls.motion.visible
+    load(page, "notes.txt", b"no image")
+    assert not invitation.closed
+    load(page)
+    assert invitation.closed
+    assert not made.controls.draw.disabled
+    assert not page.save_controls.save.disabled
+    assert page.view_controls.folder.visible
+    assert page.view_controls.motion.visible
+
+
+def test_the_button_of_the_invitation_loads_a_scene_too(page, model, tmp_path):
+    page.show([])
+    Completion(page, model, SETTINGS | {"remove_background": False})
+    upload = page.invitation.upload
+    write_splat(tmp_path / "a.splat", balls_sample().gaussians)
+    upload._impl.value = SimpleNamespace(name="a.splat", content=(tmp_path / "a.splat").read_bytes())
+    assert len(press(page, upload)) == 1
+    assert page.invitation is None
+
+
+def test_a_page_with_a_scene_does_not_ask_for_a_photo(completion):
+    assert completion.page.invitation is None
+
+
+def test_nothing_is_drawn_when_a_slider_moves_on_a_cpu(completion):
+    assert completion.controls.live.value is False
+    before = load(completion.page)
+    completion.controls.seed.value = 7
+    assert finish(completion.page) is before
+
+
+def opacities(page: Page) -> int:
+    return max(int(node.opacities.max()) for node in nodes(page).values())
+
+
+def test_an_earlier_scene_is_faint_while_a_new_photo_is_drawn_and_clear_again_after_a_failure(
+    completion, model, monkeypatch
+):
+    page = completion.page
+    clear = opacities(page)
+    seen = []
+    forward = type(model).forward
+    monkeypatch.setattr(type(model), "forward", lambda *_, **__: (seen.append(opacities(page)), 1 / 0))
+    before = page.view.samples
+    load(page)
+    assert seen[0] < clear / 4
+    assert page.view.samples == before
+    assert opacities(page) == clear
+    monkeypatch.setattr(type(model), "forward", forward)
+    load(page)
+    assert not page.view.faded
+
+
+def test_the_photo_stands_beside_the_chosen_sample_from_the_photos_place(completion):
+    page = completion.page
+    samples = load(page)
+    assert "the scene" in page.view_controls.photo.content
+    first = page.view_controls.photo.content
+    page.view_controls.chosen.value = "sample 2"
+    finish(page)
+    assert page.view_controls.photo.content != first
+    assert page.saver.front(samples[0], 24).shape == (24, 24, 3)
+    camera = samples[0].reference
+    rendering = ReferenceRasterizer()(samples[0].gaussians[None].to("cpu"), camera[None][None]).over(0.5)
+    ours = to_pixels(rendering[0, 0])
+    assert abs(page.saver.front(samples[0], len(ours)).astype(float) - ours).mean() < 6
 
 
 def test_the_object_is_cut_out_on_request(completion, model, monkeypatch):
