@@ -60,8 +60,8 @@ class BadSteps(Callback):
 
     Args:
         most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row. At the end, before a
-            checkpoint is written, it does so if all steps or the last ones (two or more) were skipped, or if weights
-            are not finite.
+            checkpoint is written, it does so if the last two steps were skipped, or the last one and half of all, or
+            if weights are not finite.
     """
 
     def __init__(self, most_bad_steps: Positive = 10) -> None:
@@ -122,7 +122,8 @@ class BadSteps(Callback):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Raise DivergenceError if the weights cannot be trusted, before a checkpoint of them is written."""
         self._count_last()
-        if self.in_a_row > 1 or self.total == trainer.global_step > 0:
+        half_were_bad = 2 * self.total >= trainer.global_step
+        if self.in_a_row > 1 or (self.in_a_row == 1 and half_were_bad):
             raise DivergenceError(self.divergence)
         name = not_finite(pl_module.state_dict())
         if name is not None:

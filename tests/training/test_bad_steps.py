@@ -181,6 +181,9 @@ def test_a_run_whose_last_steps_were_bad_or_whose_weights_are_not_finite_has_no_
         train(Faulty(FAULTS["a loss that is NaN"], batches=(4, 5)), Checkpoints(str(tmp_path)), steps=6, most=10)
     assert not list(tmp_path.iterdir())
 
+    with pytest.raises(DivergenceError, match=r"^step 5: 1 steps in a row"):
+        train(Faulty(FAULTS["a loss that is NaN"], batches=(1, 3, 5)), Checkpoints(str(tmp_path)), steps=6, most=10)
+
     class Broken(Faulty):
         def optimizer_step(self, *arguments):
             super().optimizer_step(*arguments)
@@ -239,7 +242,7 @@ class OnOne(Faulty):
 
 for name, fault in FAULTS.items():
     module = OnOne(fault, batches=(1, 2, 4))
-    assert train(module, steps=5, devices=2, strategy="ddp").total == 3, name
+    assert train(module, steps=6, devices=2, strategy="ddp").total == 3, name
     one, other = module.all_gather(module.layer.weight.detach())
     assert torch.equal(one, other) and one.isfinite().all(), name
 """
@@ -286,10 +289,10 @@ def test_a_run_with_one_bad_step_says_so_in_json_that_is_valid(command, toy_root
 
     def failing(self, prediction, truth, step):
         total, terms = weighted(self, prediction, truth, step)
-        return total * (NAN if step == 1 else 1.0), terms
+        return total * (NAN if step == 2 else 1.0), terms
 
     monkeypatch.setattr(WeightedSum, "__call__", failing)
-    assert fit(command, toy_root, tmp_path / "run").status == 0
+    assert fit(command, toy_root, tmp_path / "run", "trainer.max_steps=3").status == 0
     result = strict_json(tmp_path / "run/metrics.json")
     assert result["train/bad_steps"] == 1
     assert result["train/loss"] is None
