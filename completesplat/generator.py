@@ -32,7 +32,8 @@ from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.photo.choice import likeliest_for
-from completesplat.photo.reading import SMALLEST_SIDE, Framing, ImageLike, read_square
+from completesplat.photo.crop import SMALLEST_SIDE
+from completesplat.photo.reading import Framing, ImageLike, read_square
 from completesplat.scene import Views
 from completesplat.scene_model import DEFAULT_SAMPLING, OnScenes, Sampling, SceneModel, Visible, both
 from completesplat.splatter_image import SplatterImage

@@ -53,7 +53,7 @@ class Completion:
         self.request(client)
 
     def _seen(self, photograph: Photograph) -> Pixels:
-        """Return the photo as the model takes it, pale where it is continued, at the size of the comparison or its own."""
+        """Return the photo as the model takes it, pale where it is continued, as large as it is compared."""
         size = min(COMPARED, self.model.front_size(photograph, self.controls.detail.value))
         return to_pixels(photograph.shown_at(size))
 

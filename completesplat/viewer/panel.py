@@ -62,7 +62,7 @@ def add_completion_controls(gui: viser.GuiApi, model: SceneModel, start: dict[st
         start: initial values.
     """
     draws = model.draws_samples
-    draw = gui.add_button("Draw again", color="blue", icon="refresh", disabled=True, visible=draws, order=0.1)
+    draw = gui.add_button("Draw again", color="blue", icon=viser.Icon.REFRESH, disabled=True, visible=draws, order=0.1)
     progress = gui.add_progress_bar(0.0, visible=False, order=0.11)
     with gui.add_folder("Photograph", order=1):
         if not draws:
@@ -111,7 +111,7 @@ def add_file_controls(gui: viser.GuiApi, scenes: Sequence[str]) -> SimpleNamespa
     """Add controls that load files, and return handles of `upload` and of `chosen`, which chooses one of the scenes."""
     return SimpleNamespace(
         chosen=gui.add_dropdown("Scene", scenes or [""], visible=len(scenes) > 1, order=0.3),
-        upload=gui.add_upload_button("Load a file", mime_type=UPLOADS, hint=FILES, icon="upload", order=0.31),
+        upload=gui.add_upload_button("Load a file", mime_type=UPLOADS, hint=FILES, icon=viser.Icon.UPLOAD, order=0.31),
     )
 
 
@@ -120,7 +120,7 @@ def add_invitation(gui: viser.GuiApi) -> SimpleNamespace:
     window = gui.add_modal("Drop a photo here")
     with window:
         gui.add_markdown("It becomes a 3D scene that you can turn and save.")
-        upload = gui.add_upload_button("Choose a photo", mime_type=UPLOADS, color="blue", icon="photo")
+        upload = gui.add_upload_button("Choose a photo", mime_type=UPLOADS, color="blue", icon=viser.Icon.PHOTO)
     return SimpleNamespace(window=window, upload=upload)
 
 
@@ -156,7 +156,7 @@ def add_view_controls(gui: viser.GuiApi) -> SimpleNamespace:
 def add_save_controls(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
     """Add the button `save` and the file's `kind` (a format or a video), and return their handles."""
     hint = "sog and html need Node.js, usdz completesplat[usd], mesh completesplat[mesh]"
-    save = gui.add_button("Save", hint="what is shown, with all layers", icon="download", disabled=True, order=0.2)
+    save = gui.add_button("Save", hint="what is shown, with all layers", icon=viser.Icon.DOWNLOAD, disabled=True, order=0.2)
     return SimpleNamespace(save=save, kind=gui.add_dropdown("Format", (*formats, VIDEO), hint=hint, order=0.21))
 
 

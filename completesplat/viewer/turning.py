@@ -4,6 +4,7 @@ import math
 import warnings
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 import viser
 
@@ -57,7 +58,7 @@ class Turntable:
             return
         for number, client in clients.items():
             if number not in self._turns:
-                client.camera.on_update(lambda _, number=number: self._reported(number))
+                client.camera.on_update(partial(self._reported_by, number))
             turn = self._turns.get(number)
             if turn is None or turn.arrangement is not arrangement:
                 turn = Turn(arrangement, now)
@@ -81,7 +82,8 @@ class Turntable:
         """Return whether a browser's scene was touched, or the browser is slow."""
         return client_id in self._turns and self._turns[client_id].stopped
 
-    def _reported(self, number: int) -> None:
+    def _reported_by(self, number: int, _: object) -> None:
+        """Note that a browser has reported the camera that it was sent; stop turning where that took long."""
         sent = self._unreported.pop(number, self._now)
         if self._now - sent > SLOW:
             self.stop(number)
