@@ -156,7 +156,8 @@ def add_view_controls(gui: viser.GuiApi) -> SimpleNamespace:
 def add_save_controls(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
     """Add the button `save` and the file's `kind` (a format or a video), and return their handles."""
     hint = "sog and html need Node.js, usdz completesplat[usd], mesh completesplat[mesh]"
-    save = gui.add_button("Save", hint="what is shown, with all layers", icon=viser.Icon.DOWNLOAD, disabled=True, order=0.2)
+    shown = "what is shown, with all layers"
+    save = gui.add_button("Save", hint=shown, icon=viser.Icon.DOWNLOAD, disabled=True, order=0.2)
     return SimpleNamespace(save=save, kind=gui.add_dropdown("Format", (*formats, VIDEO), hint=hint, order=0.21))
 
 
