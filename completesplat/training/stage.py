@@ -117,7 +117,7 @@ class Stage(Scorer):
 
         Positions of Gaussians and the statistics of images need weights in float32.
         """
-        precision = self.trainer.precision  # type: ignore[attr-defined]
+        precision = self.trainer.precision
         if precision not in get_args(schema.Precision):
             allowed = ", ".join(name for name in get_args(schema.Precision) if "-" in str(name))
             raise CompleteSplatError(f"Trainer(precision={precision!r}): choose one of {allowed}")
