@@ -197,15 +197,15 @@ def test_a_run_whose_last_steps_were_bad_or_whose_weights_are_not_finite_has_no_
 
 def test_the_count_goes_on_in_a_continued_run(tmp_path):
     def module() -> Faulty:
-        return Faulty(FAULTS["a loss that is NaN"], batches=(3, 4))
+        return Faulty(FAULTS["a loss that is NaN"], batches=(5, 6))
 
     whole = module()
     first = module()
     second = module()
-    assert train(whole, ExponentialMovingAverage(0.9), steps=4, accumulated=2).total == 2
-    train(first, ExponentialMovingAverage(0.9), Checkpoints(str(tmp_path)), steps=2, accumulated=2)
+    assert train(whole, ExponentialMovingAverage(0.9), steps=5, accumulated=2).total == 2
+    train(first, ExponentialMovingAverage(0.9), Checkpoints(str(tmp_path)), steps=3, accumulated=2)
     path = tmp_path / "last.ckpt"
-    bad = train(second, ExponentialMovingAverage(0.9), steps=4, accumulated=2, ckpt_path=path)
+    bad = train(second, ExponentialMovingAverage(0.9), steps=5, accumulated=2, ckpt_path=path)
     assert bad.total == 2
     assert equal(whole.seen[-1], second.seen[-1])
 
