@@ -246,7 +246,7 @@ def test_an_empty_page_asks_for_a_photo_and_then_turns_its_scene_until_it_is_tou
     tab.get_by_role("dialog", name="Drop a photo here").wait_for()
     assert not tab.get_by_text("Drawing the first image").is_visible()
     assert tab.get_by_role("button", name="Draw again", include_hidden=True).is_disabled()
-    assert tab.get_by_role("button", name="Save", include_hidden=True).is_disabled()
+    assert tab.get_by_role("button", name="Save", exact=True, include_hidden=True).is_disabled()
     with tab.expect_file_chooser() as chooser:
         tab.get_by_role("button", name="Choose a photo").click()
     chooser.value.set_files(file)
