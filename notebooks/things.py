@@ -1,6 +1,6 @@
 """Picture of scanned things from eight sides, beside the truth (card of `general`).
 
-python notebooks/things.py SCANS WEIGHTS OUT.png [seed=0] [count=10]
+python notebooks/things.py SCANS WEIGHTS OUT.jpg [seed=0] [count=10]
 
 SCANS is a folder of captures with `splits.json`. Each of `count` test objects, drawn by the seed, has two rows: the
 photo and seven other views, from those near the photo to those from behind, and below them one sample of WEIGHTS.
@@ -53,7 +53,7 @@ def main(root, weights, out, *words):
         for images in rows_of(name, data, model, rasterizer):
             strips.append(torch.cat(list(images), dim=-1))
         print(name, flush=True)
-    Image.fromarray(to_pixels(torch.cat(strips, dim=-2))).save(out)
+    Image.fromarray(to_pixels(torch.cat(strips, dim=-2))).save(out, quality=88)
 
 
 if __name__ == "__main__":
