@@ -16,7 +16,7 @@ SLOW = 0.5  # seconds in which a browser draws an image
 
 
 @dataclass
-class Turn:
+class TurnState:
     """Turning of a scene in one browser.
 
     Attributes:
@@ -41,7 +41,7 @@ class Turntable:
     def __init__(self, server: viser.ViserServer, view: SplatView) -> None:
         self.server = server
         self.view = view
-        self._turns: dict[int, Turn] = {}
+        self._turns: dict[int, TurnState] = {}
         self._unreported: dict[int, float] = {}  # times of moves by browser
         self._now = 0.0
 
@@ -61,7 +61,7 @@ class Turntable:
                 client.camera.on_update(partial(self._reported_by, number))
             turn = self._turns.get(number)
             if turn is None or turn.arrangement is not arrangement:
-                turn = Turn(arrangement, now)
+                turn = TurnState(arrangement, now)
                 self._turns[number] = turn
             angle = SPEED * (now - turn.began - REST)
             if angle > 0 and not self.has_stopped(number) and number not in self._unreported:
@@ -71,7 +71,7 @@ class Turntable:
     def start(self, client_id: int | None, now: float) -> None:
         """Turn the scene of a browser again, from the front."""
         if client_id in self._turns and self.view.arrangement is not None:
-            self._turns[client_id] = Turn(self.view.arrangement, now - REST)
+            self._turns[client_id] = TurnState(self.view.arrangement, now - REST)
 
     def stop(self, client_id: int | None) -> None:
         """Let the scene of a browser stand still."""
