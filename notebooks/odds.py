@@ -38,7 +38,7 @@ def features_of(folder, size, seed):
     for number, place in enumerate(places):
         images = by_folder[place]
         for path in images[:: -(-len(images) // IMAGES)]:
-            image = read_square(path, Framing(size)).image
+            image = read_square(path, Framing(size), crop="center").image
             parts[number % HELD_OUT == 0].append(image_features(image).double())
     return tuple(torch.stack(part) for part in parts)
 

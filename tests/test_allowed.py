@@ -98,7 +98,7 @@ REFUSED = [
     ("training", None, "training=None: must be a mapping"),
     ("training", {"picture_mean": [0.5] * 7}, "must have 8 entries"),
     # Larger than what the file of weights has.
-    ("denoiser.channels", [2048] * 4, "denoiser.network.conv_in.weight"),
+    ("denoiser.channels", [2048] * 3, "denoiser.network.conv_in.weight"),
     (f"{ENCODER}.latent_channels", 8192, f"{ENCODER}.network.conv_out.weight"),
 ]
 

@@ -104,7 +104,8 @@ def test_what_is_hidden_counts_as_background(tmp_path):
     visible[..., 8:] = 0
     changed = replace(photograph, image=photograph.image.clone())
     changed.image[..., 8:] = 1
-    assert torch.equal(model(photograph, visible)[0].means, model(changed)[0].means)
+    plain = {"color_fits": 0, "detail": 0}
+    assert torch.equal(model(photograph, visible, **plain)[0].means, model(changed, **plain)[0].means)
     assert not model.architecture.get("training", {}).get("box_masks")
 
 

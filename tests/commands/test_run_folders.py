@@ -143,7 +143,7 @@ def test_only_the_end_of_a_run_may_move_and_its_record_keeps_the_earlier_one(tmp
     with pytest.raises(CompleteSplatError, match="a run with another folder: "):
         continuing.is_finished(moved, placed[moved] | {"folder": "elsewhere"})
     # Another folder that begins with the same letters did not move.
-    assert not continuing._differences({"a": "/r/run_data"}, {"a": "/r/run_data"}, ("/r/run", "/r/run2"))
+    assert not continuing.differences({"a": "/r/run_data"}, {"a": "/r/run_data"}, ("/r/run", "/r/run2"))
     (moved / RUN_CHECKPOINT).rename(moved / "checkpoints/step=9.ckpt")
     with pytest.raises(CompleteSplatError, match="a run with another folder: "):
         continuing.is_finished(moved, placed[moved] | {"folder": "elsewhere"})

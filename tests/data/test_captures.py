@@ -376,8 +376,8 @@ COLMAP = {
     "an image outside": ("images.txt", replaced(b"left/3.png", b"../3.png"), OutsidePath, "frame 3: leads outside"),
     "an image twice": ("images.txt", replaced(b"left/3.png", b"left/4.png"), DataError, "frame 4: the same image"),
     "a word for a number": ("points3D.txt", lambda content: b"1 2 three\n", DataError, r"points3D\.txt"),
-    "another lens": ("cameras.txt", replaced(b"PINHOLE", b"FULL_OPENCV"), BadCamera, LENS),
-    "another lens in binary": ("cameras.bin", lambda content: content[:12] + b"\6" + content[13:], BadCamera, LENS),
+    "another lens": ("cameras.txt", replaced(b"PINHOLE", b"FOV"), BadCamera, LENS),
+    "another lens in binary": ("cameras.bin", lambda content: content[:12] + b"\7" + content[13:], BadCamera, LENS),
 }
 
 

@@ -47,8 +47,10 @@ def written(folder, scene: Gaussians) -> tuple[trimesh.Trimesh, np.ndarray]:
     assert file == {"a_mesh": "a_mesh.glb"}
     (result,) = trimesh.load(folder / "a_mesh.glb", process=False).geometry.values()
     colors = result.visual.vertex_attributes["color"]
-    assert (colors.dtype, set(colors[:, 3])) == (np.uint16, {65535})
-    return result, colors[:, :3] / 65535
+    assert (colors.dtype, set(colors[:, 3])) == (np.float32, {1.0})
+    shown = trimesh.load(folder / "a_mesh.glb", process=False, force="mesh", skip_materials=True).visual.vertex_colors
+    assert np.abs(shown[:, :3] / 255 - colors[:, :3]).max() <= 1 / 255
+    return result, colors[:, :3]
 
 
 def test_a_hollow_sphere_becomes_a_closed_solid_and_what_floats_or_lies_behind_is_left_out(tmp_path):

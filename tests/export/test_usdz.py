@@ -1,5 +1,6 @@
 """`.usdz`, read by OpenUSD itself."""
 
+import re
 import sys
 
 import numpy as np
@@ -16,6 +17,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.geometry.harmonics import SH_C0
 from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.installation import install_command
 
 usd = pytest.importorskip("pxr.Usd")
 from pxr import UsdGeom, UsdUtils, UsdVol  # noqa: E402
@@ -63,7 +65,7 @@ def test_openusd_reads_the_same_gaussians(tmp_path):
 
 def test_without_the_extra_it_is_refused_before_anything_runs(monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr.Usd", None)
-    with pytest.raises(CompleteSplatError, match=r"completesplat\[usd\]"):
+    with pytest.raises(CompleteSplatError, match=re.escape(install_command("usd"))):
         OutputFiles(("usdz",))
 
 

@@ -306,7 +306,7 @@ def test_what_is_neither_a_file_nor_pixels_is_refused(source, monkeypatch):
 
 def test_the_square_is_kept_with_the_photos_own_pixels():
     pixels = torch.randint(256, (3, 30, 40), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    photograph = read_square(pixels, Framing(SIDE))
+    photograph = read_square(pixels, Framing(SIDE), crop="center")
     assert photograph.square.size == (30, 30)
     assert torch.equal(photograph.square_at(30), pixels[..., 5:35].float() / 255)
     assert torch.equal(photograph.square_at(SIDE), photograph.image)

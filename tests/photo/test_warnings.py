@@ -38,7 +38,7 @@ def test_a_photo_unlike_the_training_images_gets_a_warning_with_nearer_weights(t
 
 
 def test_whoever_reads_a_photo_through_the_door_is_warned_by_its_name(tmp_path, caplog):
-    Image.new("RGB", (40, 32), "blue").save(tmp_path / "a.png")
+    Image.new("RGB", (32, 32), "blue").save(tmp_path / "a.png")
     for source, name in ((tmp_path / "a.png", "a.png"), (Image.open(tmp_path / "a.png"), "the image")):
         caplog.clear()
         read_photograph(source, Framing(32, training=REDS))

@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pandas
 import pytest
@@ -102,7 +103,7 @@ def test_figures_of_the_layers_are_those_of_the_reference_s_pixels():
 def test_the_bits_of_the_channels_are_those_of_the_posterior():
     means = torch.randn(3, 4, 5, 6) * torch.tensor([0.0, 1, 0.05, 1])[:, None, None]  # 0.05^2 / 2 nats are 0.0018 bits
     posterior = Posterior(means, torch.zeros(3, 4, 5, 6))
-    model = lambda scenes: SimpleNamespace(posterior=posterior)  # noqa: E731
+    model = Mock(model=None, return_value=SimpleNamespace(posterior=posterior))
     logged = ReconstructionModule.latent_figures(model, scene_batch())
     bits = [logged[f"latent/bits_{channel}"] for channel in range(4)]
     assert logged["latent/bits"] == pytest.approx(sum(bits))

@@ -574,9 +574,9 @@ def test_the_object_is_cut_out_on_request(completion, model, monkeypatch):
     seen = []
     read = type(model).read
 
-    def reading(self, file, *given, remove_background=False):
+    def reading(self, file, *given, remove_background=False, crop="whole"):
         seen.append(remove_background)
-        return read(self, file)
+        return read(self, file, crop=crop)
 
     monkeypatch.setattr(type(model), "read", reading)
     load(completion.page)

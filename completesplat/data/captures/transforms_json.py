@@ -136,7 +136,7 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
         undistorted, _ = frame.read()
         if ORIENTATION in read_exif(undistorted):  # `read_square` would turn it
             undistorted = Image.fromarray(np.array(undistorted))
-        squares.append(read_square(undistorted, Framing(size)).image)
+        squares.append(read_square(undistorted, Framing(size), crop="center").image)
         camera = frame.camera()
         height, width = camera.image_size
         side = min(camera.image_size)
