@@ -12,28 +12,24 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import torch
 import viser
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.description import is_described
 from completesplat.export.formats import FORMATS, suffix, write_format
 from completesplat.export.images import to_pixels
 from completesplat.export.placed_scene import PlacedScene
-from completesplat.export.prediction import PHOTO_FILE
 from completesplat.export.splat_transform import PageView
 from completesplat.export.subject import all_around, subject_of
 from completesplat.export.video import render_views, write_video
 from completesplat.files import write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit
-from completesplat.photo.files import open_image, refused_as_bad
 from completesplat.quantities import SPLATS
 from completesplat.rasterizers import Rasterizer
 from completesplat.viewer import panel
 from completesplat.viewer.access import GuardedServer, show_status, stop_server, with_head
-from completesplat.viewer.sample import Sample, read_scene
+from completesplat.viewer.sample import Sample, read_scene, read_stored_photo
 from completesplat.viewer.splat_view import SplatView
 from completesplat.viewer.turning import Turntable
 from completesplat.wording import printable
@@ -242,18 +238,9 @@ class Page:
         self.show_photo(path)
 
     def show_photo(self, scene: Path) -> None:
-        """Show a prediction's photo, if its folder has one, in the panel.
-
-        Raises:
-            BadImage: it is damaged.
-        """
-        folder = scene if scene.is_dir() else scene.parent
-        file = folder / PHOTO_FILE
-        self.set_photo(None)
-        if file.is_file() and is_described(folder):
-            with refused_as_bad(str(file)), open_image(file, ("PNG",)) as image:
-                image.thumbnail((COMPARED, COMPARED))
-                self.set_photo(np.asarray(image.convert("RGB")), "photo")
+        """Show a prediction's photo, if its folder has one, in the panel."""
+        self.set_photo(None)  # also if the next is damaged
+        self.set_photo(read_stored_photo(scene, COMPARED), "photo")
 
     def set_photo(self, photo: panel.Pixels | None, label: str = "") -> None:
         """Show a photo in the panel (None: none), and beside it what is on the page, when that is finished."""

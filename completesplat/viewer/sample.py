@@ -6,17 +6,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from completesplat.data.validation import field, read_json
 from completesplat.errors import CompleteSplatError, errors_at
 from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.description import SCENE_FILE, UP, described_camera, described_up, is_described
+from completesplat.export.prediction import PHOTO_FILE
 from completesplat.export.reading import read_gaussians
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
+from completesplat.photo.files import open_image, refused_as_bad
 from completesplat.wording import by_numbers
 
 NEWEST_FILE = "scenes.json"
@@ -61,6 +64,21 @@ class Sample:
         weights = finite.opacities[mask][order].cumsum(0)
         depth = ordered[(weights < weights[-1] / 2).sum()].item() if len(ordered) else 1.0
         return self.reference.centers + self.reference.camera_to_world[:3, 2] * depth
+
+
+def read_stored_photo(scene: Path, longest: int) -> UInt8[np.ndarray, "_ _ 3"] | None:
+    """Return a prediction's photo, no longer than so many pixels, or None if the folder of the scene has none.
+
+    Raises:
+        BadImage: it is damaged.
+    """
+    folder = scene if scene.is_dir() else scene.parent
+    file = folder / PHOTO_FILE
+    if not (file.is_file() and is_described(folder)):
+        return None
+    with refused_as_bad(str(file)), open_image(file, ("PNG",)) as image:
+        image.thumbnail((longest, longest))
+        return np.asarray(image.convert("RGB"))
 
 
 def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:

@@ -377,7 +377,7 @@ COLMAP = {
     "an image twice": ("images.txt", replaced(b"left/3.png", b"left/4.png"), DataError, "frame 4: the same image"),
     "a word for a number": ("points3D.txt", lambda content: b"1 2 three\n", DataError, r"points3D\.txt"),
     "another lens": ("cameras.txt", replaced(b"PINHOLE", b"FOV"), BadCamera, LENS),
-    "another lens in binary": ("cameras.bin", lambda content: content[:12] + b"\7" + content[13:], BadCamera, LENS),
+    "another lens in binary": ("cameras.bin", lambda content: content[:12] + b"\x08" + content[13:], BadCamera, LENS),
 }
 
 
