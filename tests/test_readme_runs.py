@@ -58,7 +58,8 @@ NEED_BLENDER = ("RENDERS", "ASSET", "RUN40", "RUN41")
 # What they need cannot be made here: Infinigen (`test_rendering` has such commands), CO3D, eight GPUs, VGG16
 # (`test_sweeps` has these two sweeps with a random one), Splatter Image's published weights (`test_published` has
 # made-up ones), images that Python lines of a README write (`test_scene_files` runs them), photos that COLMAP can pose
-# (`test_importing` draws them), published captures, random solids, scanned things, the mixture of things for a GPU (MIX, STORE), and weights that a GPU made.
+# (`test_importing` draws them), published captures, random solids, scanned things, the mixture of things for a
+# GPU (MIX, STORE), weights that a GPU made.
 NEEDS_MORE = ["IMAGES", "SOFA", "COUCH", "SPLATS", "PART1", "TABLE_OF_A", "PHOTOS", "FOX", "MOUSE", "CUP", "FRUITS"]
 NEEDS_MORE += ["FRUIT_TURNS", "ETH80_FRUIT", "RUN7", "evaluation=co3d", "trainer.devices=8", "splatter_image:"]
 NEEDS_MORE += ["model_hydrants.pth", "SHAPES", "MIX", "STORE", "RUN90", "TOYS_TEST", "=CAN", "=TRACTOR"]
