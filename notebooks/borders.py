@@ -12,12 +12,10 @@ import sys
 
 import numpy as np
 import torch
-from neighbours import near_views, resized
+from neighbours import placed_objects, resized
 from PIL import Image, ImageFilter
 
 import completesplat
-from completesplat.data.captures.capture_set import CaptureSetDataModule
-from completesplat.errors import DataError
 from completesplat.geometry.cameras import crop_resize
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.selection import auto
@@ -102,19 +100,9 @@ def main():
     model = completesplat.CompleteSplat.from_pretrained(sys.argv[2])
     size = model.image_size
     side = round(size * (1 - float(words.get("share", 0.75))) / 2)
-    data = CaptureSetDataModule(sys.argv[1], test_fraction=1, val_fraction=0, image_size=size, batch_size=1)
-    data.setup("test")
-    source = data.source("test")
     background = 0.5 if model.background is None else model.background
     scores = {}
-    for name in source.names:
-        try:
-            images, cameras, depth = near_views(source.read(name))
-        except DataError as error:
-            print(error)
-            continue
-        if len(images) < 2:
-            continue
+    for name, images, cameras, depth in placed_objects(sys.argv[1], size):
         depth_range = torch.tensor([[max(0.1, depth - 1), depth + float(words.get("depth_after", 3))]])
         images = resized(images, size)
         cameras = crop_resize(cameras, 0, 0, cameras.image_size[0], size)

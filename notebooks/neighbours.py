@@ -77,23 +77,29 @@ def photo_at(image, size):
     return resized(image[None], size)[0]
 
 
-def main():
-    words = dict(word.split("=") for word in sys.argv[2:] if "=" in word)
-    models = {name: completesplat.CompleteSplat.from_pretrained(name) for name in sys.argv[2:] if "=" not in name}
-    least, size = (of(model.image_size for model in models.values()) for of in (min, max))
-    if "size" in words:
-        least = size = int(words["size"])
-    data = CaptureSetDataModule(sys.argv[1], test_fraction=1, val_fraction=0, image_size=size, batch_size=1)
+def placed_objects(root, size):
+    """Yield name, photos, cameras and depth of each capture that has neighbours (`near_views`), and print errors."""
+    data = CaptureSetDataModule(root, test_fraction=1, val_fraction=0, image_size=size, batch_size=1)
     data.setup("test")
-    source, scores, sheet, seconds = data.source("test"), {}, [], []
+    source = data.source("test")
     for name in source.names:
         try:
             images, cameras, depth = near_views(source.read(name))
         except DataError as error:
             print(error)
             continue
-        if len(images) < 2:
-            continue
+        if len(images) > 1:
+            yield name, images, cameras, depth
+
+
+def main():
+    words = dict(word.split("=") for word in sys.argv[2:] if "=" in word)
+    models = {name: completesplat.CompleteSplat.from_pretrained(name) for name in sys.argv[2:] if "=" not in name}
+    least, size = (of(model.image_size for model in models.values()) for of in (min, max))
+    if "size" in words:
+        least = size = int(words["size"])
+    scores, sheet, seconds = {}, [], []
+    for _, images, cameras, depth in placed_objects(sys.argv[1], size):
         drawn = {"copy": images[:1].expand_as(images), "plane": on_a_plane(images[0], cameras[0], depth, cameras)}
         for weights, model in models.items():
             before, after = 1.0, float(words.get("depth_after", 4))
