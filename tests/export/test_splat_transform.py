@@ -22,7 +22,7 @@ def bin_folder(tmp_path, monkeypatch):
 
 
 def test_without_node_the_message_names_what_to_install(bin_folder):
-    with pytest.raises(CompleteSplatError, match=r"need Node\.js 20 .* ply, splat and glb need nothing"):
+    with pytest.raises(CompleteSplatError, match=r"need Node\.js 20 .* ply, .* spz and glb need nothing"):
         find_splat_transform()
 
 
