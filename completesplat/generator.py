@@ -28,14 +28,18 @@ from completesplat.diffusion.sampling import (
     part_of,
     with_forward_process,
 )
+from completesplat.diffusion.step_table import step_table
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
+from completesplat.onnx_graphs import Graph
 from completesplat.photo.choice import likeliest_for
 from completesplat.photo.crop import SMALLEST_SIDE
 from completesplat.photo.reading import Framing, ImageLike, read_square
+from completesplat.photo.visible import Visible, both
+from completesplat.sampling_settings import DEFAULT_SAMPLING, OnScenes, Sampling
 from completesplat.scene import Views
-from completesplat.scene_model import DEFAULT_SAMPLING, OnScenes, Sampling, SceneModel, Visible, both
+from completesplat.scene_model import SceneModel
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import concatenate, in_float32
 from completesplat.weights import first_line
@@ -161,6 +165,50 @@ class CompleteSplat(SceneModel):
         check_architecture({**self.architecture, "sampler": config})
         self.sampler = build(config)
         self.architecture["sampler"] = config
+
+    def description(self) -> dict[str, Any]:
+        """Return what a program needs beside the networks, with the noise's shape and the sampler's steps.
+
+        Raises:
+            CompleteSplatError: see `step_table`.
+        """
+        image = torch.full((1, 3, self.image_size, self.image_size), 0.5)
+        with torch.no_grad():
+            shape = (self.denoiser.latent_channels, *self.conditioning(image).shape[-2:])
+        return {**super().description(), "noise_shape": list(shape), "steps": step_table(self.sampler)}
+
+    @torch.no_grad()
+    def graphs(self) -> list[Graph]:
+        """Return the parts of the model for ONNX: what is computed once a photo, once a step, and once a sample."""
+        image = torch.full((1, 3, self.image_size, self.image_size), 0.5)
+        seen = self._image_part({"image": image})
+        conditioning = seen.pop("conditioning").repeat(2, 1, 1, 1)
+        latent = torch.zeros(2, self.denoiser.latent_channels, *conditioning.shape[-2:])
+        step = {"latent": latent, "timestep": torch.ones(2, dtype=torch.int64), "conditioning": conditioning}
+        decode = {"latent": latent, "skip_weight": torch.tensor([1.0]), **self.example_camera(), **seen}
+        return [
+            Graph("image", self, self._image_part, {"image": image}),
+            Graph("step", self, self._step_part, step, tuple(step)),
+            Graph("decode", self, self._decode_part, decode, ("latent",)),
+        ]
+
+    def _image_part(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        stage1 = self.autoreconstructor
+        features = stage1.encoder.features(inputs["image"] * 2 - 1, stage1.reconstructor.feature_levels)
+        numbered = {f"feature{level}": feature for level, feature in enumerate(features)}
+        return {"conditioning": self.conditioning(inputs["image"]), **numbered}
+
+    def _step_part(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {"prediction": self.denoiser(inputs["latent"], inputs["timestep"], inputs["conditioning"])}
+
+    def _decode_part(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        latent = inputs["latent"]
+        count = len(latent)
+        features = [value for name, value in inputs.items() if name.startswith("feature")]
+        unscaled = latent * self.latent_std + self.latent_mean
+        splatter_image = self.autoreconstructor.reconstructor(unscaled, features, inputs["skip_weight"])
+        intrinsics = inputs["intrinsics"].expand(count, 3, 3)
+        return self.placed(splatter_image, intrinsics, inputs["depth_range"].expand(count, 2))
 
     @staticmethod
     @in_float32()

@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,70 +20,24 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import make_folder, write_bytes, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
+from completesplat.onnx_graphs import Graph, Precision, write_graphs
 from completesplat.photo.photograph import read_photograph
 from completesplat.photo.reading import Framing, ImageLike, Photograph
-from completesplat.quantities import Crop, Detail, Natural, Positive, Seed
+from completesplat.photo.visible import Visible, both
+from completesplat.quantities import Crop, Detail
 from completesplat.rasterizers.front_detail import fit_detail, front_targets
 from completesplat.rasterizers.front_fitting import fit_front
 from completesplat.rasterizers.selection import auto
+from completesplat.sampling_settings import COLOR_FITS, DEFAULT_SAMPLING, DETAIL, OnFit, OnScenes, Sampling
 from completesplat.scene import Views
 from completesplat.settings.composition import has_bfloat16
 from completesplat.settings.schema import check_settings, check_value
-from completesplat.splatter_image import Parameterization
+from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import concatenate, in_float32
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
 
-Visible = Float[Tensor, "batch 1 height width"]  # masks that are 0 where an image is hidden, and 1 elsewhere
-OnScenes = Callable[[int, int, Gaussians], None]
-"""Callback: (number of the denoiser call, timestep, scenes as they are estimated now) -> None."""
-OnFit = Callable[[int], None]
-"""Callback: (number of the sample) -> None."""
 OBJECT_SHARE = 0.9  # of the image's side that an object on a background fills, as on imported turntables
-COLOR_FITS = 40
-"""Default number of rounds of fitting a photo's scenes to it, at the model's size; `Sampling` has the paper's, 0."""
-DETAIL = 512
-"""Default of the largest side, in pixels, of the image that a scene's front is fitted to."""
 _rasterizer = cache(auto)
-
-
-def both(first: Visible | None, second: Visible | None) -> Visible | None:
-    """Return the product of two masks, of which None is 1 everywhere."""
-    if first is None or second is None:
-        return second if first is None else first
-    return first * second
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """Settings of the scenes that a model makes of one image.
-
-    Models that draw no samples use only `samples`, which must be 1, and `color_fits`.
-
-    Attributes:
-        samples: number of scenes of each image.
-        steps: denoising steps; by default the sampler's number.
-        guidance_weight: share of the unconditional prediction; more gives more diverse samples.
-        skip_weight: default 1, the most faithful (supplement, "Diverse Sampling"), or 0 if something is hidden.
-        seed: seed of all noise, or one for each image, whose samples then do not depend on the other images.
-        color_fits: rounds of fitting to the image at the model's size (`fit_front`); 0 in the paper.
-        batch: the largest number of latents at a time; it changes only rounding. By default all, or fewer if a GPU's
-            memory does not suffice. On a CPU, a small denoiser takes as many at a time as `part_of` returns, unless
-            `on_step` is given.
-        bfloat16: compute the denoiser in bfloat16; a call with a photo does, where the device computes in it. Renders
-            then change about as little as by rounding to 8 bits.
-    """
-
-    samples: Positive = 1
-    steps: int | None = None
-    guidance_weight: float = 0.0
-    skip_weight: float | None = None
-    seed: Seed | Sequence[Seed] = 0
-    color_fits: Natural = 0
-    batch: Positive | None = None
-    bfloat16: bool = False
-
-
-DEFAULT_SAMPLING = Sampling()
 
 
 class SceneModel(nn.Module):
@@ -389,3 +343,56 @@ class SceneModel(nn.Module):
         write_bytes(folder / WEIGHTS_FILE, save(weights))  # safetensors' own files are readable by their owner alone
         write_text(folder / CONFIG_FILE, json.dumps(self.architecture, indent=2) + "\n")
         write_sums(folder)
+
+    def description(self) -> dict[str, Any]:
+        """Return what a program needs beside the networks: sizes, cameras, units (see `conf/export_task/onnx.yaml`)."""
+        framing = self.framing
+        training = framing.training or {}
+        return {
+            "format": "completesplat",
+            "version": 1,
+            "draws_samples": self.draws_samples,
+            "content": training.get("content"),
+            "image_size": self.image_size,
+            "fov_degrees": framing.fov_degrees,
+            "reads_exif": framing.reads_exif,
+            "background": self.background,
+            "object_share": framing.object_share,
+            "depth_range": self.depth_range.tolist(),
+            "depth_before": training.get("depth_before"),
+            "smallest_depth": SMALLEST_NEAR,
+            "up": self.up.tolist(),
+        }
+
+    def graphs(self) -> list[Graph]:
+        """Return the parts of the model for ONNX: one graph from an image to its scene."""
+        size = self.image_size
+        inputs = {"image": torch.full((1, 3, size, size), 0.5), **self.example_camera()}
+        return [Graph("scene", self, self._scene_part, inputs)]
+
+    def example_camera(self) -> dict[str, Tensor]:
+        """Return inputs of a graph that places Gaussians."""
+        intrinsics = pinhole(self.fov_degrees.item(), self.image_size)
+        return {"intrinsics": intrinsics[None], "depth_range": self.depth_range.cpu()[None]}
+
+    def _scene_part(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        splatter_image = self.reconstruction_model(inputs["image"]).splatter_image
+        return self.placed(splatter_image, inputs["intrinsics"], inputs["depth_range"])
+
+    def placed(
+        self,
+        splatter_image: SplatterImage,
+        intrinsics: Float[Tensor, "*batch 3 3"],
+        depth_range: Float[Tensor, "*batch 2"],
+    ) -> dict[str, Tensor]:
+        """Return the Gaussians of Splatter Images in their cameras' frames, by the names of their values."""
+        world_to_camera = torch.eye(4).expand(*intrinsics.shape[:-2], 4, 4)
+        cameras = Cameras(world_to_camera, intrinsics, (self.image_size, self.image_size))
+        return dict(vars(splatter_image.gaussians(cameras, depth_range)))
+
+    def to_onnx(self, folder: Path | str, precision: Precision = "float32") -> None:
+        """Write the networks as ONNX graphs, and `pipeline.json`, by which a program without torch runs them.
+
+        The errors are those of `write_graphs`.
+        """
+        write_graphs(folder, self.eval().graphs(), self.description(), precision)

@@ -19,7 +19,7 @@ import completesplat
 from completesplat.geometry.cameras import crop_resize
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.selection import auto
-from completesplat.scene_model import Sampling
+from completesplat.sampling_settings import Sampling
 
 ROUNDS = 40
 rasterizer = auto()

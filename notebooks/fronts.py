@@ -16,7 +16,7 @@ from completesplat.metrics.images import psnr
 from completesplat.photo.choice import match_shipped
 from completesplat.rasterizers.front_detail import seen_larger
 from completesplat.rasterizers.selection import auto
-from completesplat.scene_model import Sampling
+from completesplat.sampling_settings import Sampling
 
 ROUNDS, rasterizer = (0, 2, 5, 10, 20, 40), auto()
 models, results = {}, {rounds: [] for rounds in ROUNDS}

@@ -27,7 +27,7 @@ from completesplat.geometry.cameras import crop_resize, invert_rigid, nearest_to
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.front_detail import fit_detail, front_targets, seen_larger
 from completesplat.rasterizers.selection import auto
-from completesplat.scene_model import Sampling
+from completesplat.sampling_settings import Sampling
 
 LEAST, MOST, VIEWS, ROUNDS = 1.0, 30.0, 8, (0, 40)  # degrees from the reference, views of an object, `color_fits`
 rasterizer = auto()

@@ -28,7 +28,7 @@ from completesplat.evaluation.regions import object_only
 from completesplat.geometry.cameras import nearest_to_axes
 from completesplat.metrics.images import psnr, sharpness
 from completesplat.scene import CachedScene
-from completesplat.scene_model import Sampling
+from completesplat.sampling_settings import Sampling
 from completesplat.tensors import stack
 from completesplat.training.callbacks import StepSeeds
 from completesplat.training.latent_diffusion import LatentDiffusion

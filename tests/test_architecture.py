@@ -23,7 +23,8 @@ TREES = {path: ast.parse(text, path) for path, text in FILES.items()}
 LAYERS = """
     version installation errors quantities signals wording files settings ply_files weights tensors
     geometry gaussians splatter_image scene rasterizers
-    photo data autoreconstructor diffusion losses metrics scene_model baselines generator export
+    photo data autoreconstructor diffusion losses metrics
+    onnx_graphs sampling_settings scene_model baselines generator export
     evaluation training viewer commands cli
     benchmarks
 """

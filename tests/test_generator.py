@@ -20,7 +20,7 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.scene_model import Sampling
+from completesplat.sampling_settings import Sampling
 from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE
 
 

@@ -14,7 +14,7 @@ from completesplat.generator import CompleteSplat
 from completesplat.geometry.trajectories import orbit
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.tiled import TiledRasterizer
-from completesplat.scene_model import Sampling
+from completesplat.sampling_settings import Sampling
 from completesplat.tensors import stack
 from completesplat.weights import SHIPPED, SUMS_FILE, locate, shipped
 

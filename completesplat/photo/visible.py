@@ -15,7 +15,15 @@ from completesplat.photo.crop import continued
 from completesplat.photo.reading import ImageLike, Photograph, read_whole
 
 SAME_SHAPE = 0.02  # largest difference between the side ratios of a photo and its mask
+Visible = Float[Tensor, "batch 1 height width"]  # masks that are 0 where an image is hidden, and 1 elsewhere
 LANCZOS_REACH = 3  # radius of the filter, in pixels of the coarser image
+
+
+def both(first: Visible | None, second: Visible | None) -> Visible | None:
+    """Return the product of two masks, of which None is 1 everywhere."""
+    if first is None or second is None:
+        return second if first is None else first
+    return first * second
 
 
 def visible_part(

@@ -20,8 +20,8 @@ from completesplat.evaluation.scorer import Scorer
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.quantities import Natural, Positive, Share
+from completesplat.sampling_settings import Sampling
 from completesplat.scene import Batch, SceneBatch
-from completesplat.scene_model import Sampling
 from completesplat.training.encoding import check_cache
 from completesplat.training.stage import Compile, Stage, prepare_network
 from completesplat.weights.checkpoint_reading import load_part

@@ -13,8 +13,8 @@ from completesplat.evaluation.studies.controls import OnProgress, Scenes
 from completesplat.evaluation.studies.samples import SampleRenderer, mean_over_scenes, near_reference
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr, sharpness
+from completesplat.sampling_settings import Sampling
 from completesplat.scene import SceneBatch
-from completesplat.scene_model import Sampling
 from completesplat.splatter_image import SplatterImage
 
 Rows = list[dict[str, str | float | None]]

@@ -16,8 +16,8 @@ from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics import PSNR_LIMIT
 from completesplat.rasterizers import Rasterizer, Rendering
+from completesplat.sampling_settings import Sampling
 from completesplat.scene import SceneBatch
-from completesplat.scene_model import Sampling
 
 
 @dataclass(frozen=True)
