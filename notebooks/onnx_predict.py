@@ -4,7 +4,7 @@ completesplat export onnx weights=general out=ONNX
 python notebooks/onnx_predict.py ONNX photo.jpg out --samples 4 --seed 0
 
 The folder's `pipeline.json` says what the graphs need. The scenes equal those of
-`completesplat predict image=photo.jpg weights=general color_fits=0 detail=0` before they are fitted to the photo. Pillow
+`completesplat predict image=photo.jpg weights=general color_fits=0 detail=0` before they are fitted. Pillow
 reads the photo; its EXIF field of view is not used here.
 """
 

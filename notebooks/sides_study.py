@@ -27,8 +27,8 @@ from completesplat.data.loading.view_selection import spread_around
 from completesplat.evaluation.regions import object_only
 from completesplat.geometry.cameras import nearest_to_axes
 from completesplat.metrics.images import psnr, sharpness
-from completesplat.scene import CachedScene
 from completesplat.sampling_settings import Sampling
+from completesplat.scene import CachedScene
 from completesplat.tensors import stack
 from completesplat.training.callbacks import StepSeeds
 from completesplat.training.latent_diffusion import LatentDiffusion
