@@ -1,5 +1,6 @@
 """`completesplat test`: score a trained model's images against true ones, and its samples against hidden modes."""
 
+import logging
 import re
 import shlex
 from functools import partial
@@ -33,12 +34,23 @@ from completesplat.training.loggers import wandb_runs
 from completesplat.training.stopping import stopped_together
 from completesplat.wording import counted, printable
 
+log = logging.getLogger(__name__)
 METRIC = re.compile(r"\+*evaluation\.metrics\.(\w+)")
 
 
 def built_parts(group: Config | None) -> list[Any]:
-    """Build the parts of a config group, without those that are null."""
-    return [part for part in instantiate(group or {}, _convert_="all").values() if part is not None]
+    """Build the parts of a config group, without those that are null.
+
+    Where a group is left out (`callbacks=null`), an experiment may still set an option of one of its parts. A warning
+    names it.
+    """
+    parts = []
+    for name, part in (group or {}).items():
+        if part is not None and "_target_" not in part:
+            log.warning("%s: no _target_, left out", name)
+        elif part is not None:
+            parts.append(instantiate(part, _convert_="all"))
+    return parts
 
 
 @stopped_together()
@@ -63,7 +75,7 @@ def run(
     set_metrics(module, evaluation)
     loggers = built_parts(logger)
     tester: Trainer = instantiate(trainer, precision=evaluation["precision"], logger=loggers, _convert_="all")
-    with wandb_runs(loggers, OmegaConf.load(out / CONFIG)):
+    with wandb_runs(loggers, OmegaConf.load(out / CONFIG), out):
         tester.test(module, datamodule=data, verbose=False)
         scores = module.test_results()
         if not tester.is_global_zero:
@@ -119,7 +131,7 @@ def run_hidden_modes(
     results = measured.results(evaluation["samples"])
     scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
     loggers: list[Logger] = built_parts(logger)
-    with wandb_runs(loggers, OmegaConf.load(out / CONFIG)):
+    with wandb_runs(loggers, OmegaConf.load(out / CONFIG), out):
         for each in loggers:
             each.log_metrics(scores, step=0)
             each.save()

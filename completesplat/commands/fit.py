@@ -8,7 +8,7 @@ from typing import Any
 import hydra.utils
 from lightning import Trainer, seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import WeightAveraging
+from lightning.pytorch.callbacks import Checkpoint, WeightAveraging
 from lightning.pytorch.utilities.model_summary.model_summary import ModelSummary
 from omegaconf import DictConfig, OmegaConf
 
@@ -27,7 +27,7 @@ from completesplat.evaluation.table_writers import show
 from completesplat.files import write_json
 from completesplat.settings import checks
 from completesplat.training.checkpoints import newest_whole
-from completesplat.training.loggers import wandb_runs
+from completesplat.training.loggers import WandbRun, wandb_runs
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
 from completesplat.weights import RUN_CHECKPOINT, RUN_WEIGHTS
@@ -79,7 +79,9 @@ def run(config: DictConfig, out: Path) -> None:
     tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
     callbacks = built_parts(config.get("callbacks"))
     loggers = built_parts(config.get("logger"))
-    trainer: Trainer = hydra.utils.instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
+    parts = {"callbacks": callbacks, "logger": loggers}
+    keeps = any(isinstance(callback, Checkpoint) for callback in callbacks)  # else Lightning would add one of its own
+    trainer: Trainer = hydra.utils.instantiate(config.trainer, **parts, enable_checkpointing=keeps, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if tested is not None:
         tested.check_test()
@@ -87,7 +89,7 @@ def run(config: DictConfig, out: Path) -> None:
         _print_layers(module)
         logger.info("batch: %s a step, data.batch_per_process=%d", counted(data.batch_size, "scene"), share)
     metrics = {}
-    with wandb_runs(loggers, config):
+    with wandb_runs(loggers, config, out):
         if isinstance(module, Stage):
             metrics.update(_train(trainer, module, data, checkpoint, out))
         if tested is not None:
@@ -95,6 +97,8 @@ def run(config: DictConfig, out: Path) -> None:
         for run_logger in loggers:  # a run shorter than the logging interval has its figures too
             run_logger.log_metrics(metrics, step=trainer.global_step)
             run_logger.save()
+            if isinstance(run_logger, WandbRun) and isinstance(module, Stage):
+                run_logger.log_weights(out / RUN_WEIGHTS, metrics)
         # Every process calls this, because per-scene fits gather their empty pixels in it.
         scores = module.test_results() if tested is not None else None
         if not trainer.is_global_zero:

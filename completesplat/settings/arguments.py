@@ -32,6 +32,8 @@ PATHS = (
     "export",
 )
 """Last parts of the names of settings for files and folders, whose names may look like numbers."""
+GROUPS_TO_LEAVE_OUT = ("logger", "callbacks")
+"""Config groups with a default that `group=null` leaves out."""
 SWEEP = ("-m", "--multirun")
 HYDRA_FLAGS = (*SWEEP, "--resolve")
 FLAGS_WITH_VALUE = ("--cfg", "--config-dir")
@@ -52,7 +54,7 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
     """Return flags and settings as Hydra reads them, the flags first, because Hydra takes none between settings.
 
     `data import DIR` is short for `data_task=import folder=DIR`, `predict A B` for `image=[A,B]`, `view PATH` for
-    `path=PATH`, and `new KIND NAME` for `kind=KIND name=NAME`.
+    `path=PATH`, and `new KIND NAME` for `kind=KIND name=NAME`. `logger=null` and `callbacks=null` leave the group out.
 
     Raises:
         CompleteSplatError: Hydra has no such flag, a flag lacks its value, or there are too many words.
@@ -66,7 +68,13 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
         others = others[1:]
     if command in WORDS:
         others = with_words(command, others)
-    return [*flags, *task, *map(_path_as_text, others)]
+    return [*flags, *task, *(_path_as_text(_left_out(argument)) for argument in others)]
+
+
+def _left_out(argument: str) -> str:
+    """Return Hydra's words for a group that is left out, which it does not read as `group=null`."""
+    group, _, option = argument.partition("=")
+    return f"~{group}" if group in GROUPS_TO_LEAVE_OUT and option in ("null", "[]") else argument
 
 
 def _path_as_text(argument: str) -> str:

@@ -1,4 +1,4 @@
-"""Training callbacks: seeds of steps, skipped steps, averaged weights, the progress bar, speed and memory."""
+"""Training callbacks: seeds, skipped steps, figures of the optimizer, averaged weights, the progress bar, speed."""
 
 import logging
 import time
@@ -128,6 +128,21 @@ class BadSteps(Callback):
         name = not_finite(pl_module.state_dict())
         if name is not None:
             raise DivergenceError(f"after {trainer.global_step} steps, {name} is not finite; lower optimizer.lr")
+
+
+class OptimizerFigures(Callback):
+    """Callback that logs the learning rate and the norm of all gradients before they are clipped, of logged steps.
+
+    The rate is that of the optimizer's first group of weights.
+    """
+
+    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
+        norm = pl_module.gradient_norm if isinstance(pl_module, Stage) else None  # by `BadSteps`
+        if norm is None:
+            gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+            norm = torch.nn.utils.get_total_norm(gradients)
+        rate = torch.tensor(float(optimizer.param_groups[0]["lr"]))
+        pl_module.log_dict({"train/learning_rate": rate, "train/gradient_norm": norm}, batch_size=1)
 
 
 def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import WandbLogger
+from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from PIL import Image
 from torch import Tensor
 
@@ -90,6 +90,8 @@ class DrawsFixedScenes(Callback):
 
                 media: dict[str, Any] = {self.folder.name: wandb.Image(sheet)}
                 logger.log_metrics(media, step=row)
+            elif isinstance(logger, TensorBoardLogger):
+                logger.experiment.add_image(self.folder.name, np.asarray(sheet), row, dataformats="HWC")
 
 
 @contextmanager

@@ -4,10 +4,11 @@ import csv
 import io
 import logging
 import secrets
-from collections.abc import Iterable, Iterator, Mapping
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict, Unpack
 
 from lightning.fabric.loggers.logger import rank_zero_experiment
 from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
@@ -16,6 +17,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.records import read_record
 from completesplat.files import write_text, writing
 from completesplat.weights import first_line
 
@@ -96,6 +98,14 @@ class MetricsFile(ExperimentWriter):
         return [row for row in rows if int(row["step"]) < first]
 
 
+class Words(TypedDict, total=False):
+    """What to find a run of W&B by."""
+
+    job_type: str | None
+    tags: Sequence[str]
+    notes: str | None
+
+
 class WandbRun(WandbLogger):
     """Logger of a directory's only W&B run. Its id is in `save_dir/wandb_id`, so a resumed run continues it.
 
@@ -104,6 +114,8 @@ class WandbRun(WandbLogger):
 
     Args:
         group, name: by default the sweep's folder (in a sweep), and the directory's name.
+        log_model: whether `log_weights` keeps the weights with the run.
+        **words: what to find the run by.
     """
 
     def __init__(
@@ -113,7 +125,8 @@ class WandbRun(WandbLogger):
         project: str,
         group: str | None = None,
         name: str | None = None,
-        job_type: str | None = None,
+        log_model: bool = False,
+        **words: Unpack[Words],
     ) -> None:
         self.folder = Path(save_dir).absolute()
         # Hydra's file in a sweep's folder, which may hold its jobs in further folders.
@@ -125,12 +138,13 @@ class WandbRun(WandbLogger):
                 project=project,
                 mode=mode,
                 group=group or next(sweeps, None),
-                job_type=job_type,
+                **words,
             )
         except ModuleNotFoundError as error:
             raise CompleteSplatError("logger=wandb needs wandb: pip install wandb, or leave it out") from error
         self._wandb_init.pop("anonymous", None)  # W&B would warn that Lightning gives it
         self.lost = False
+        self.keeps_weights = log_model
 
     @property
     @rank_zero_experiment
@@ -178,6 +192,23 @@ class WandbRun(WandbLogger):
             self.experiment.log(row)
 
     @rank_zero_only
+    def log_weights(self, folder: Path, figures: Mapping[str, object]) -> None:
+        """Keep a folder of weights with the run as an artifact of type model, if `log_model` asks for it.
+
+        Args:
+            figures: the run's last figures, which describe the artifact.
+        """
+        import wandb
+
+        if not self.keeps_weights or not folder.is_dir():
+            return
+        with self._dispensable():
+            run = self.experiment
+            artifact = wandb.Artifact(f"weights-{run.id}", type="model", metadata=dict(figures))
+            artifact.add_dir(str(folder))
+            run.log_artifact(artifact)
+
+    @rank_zero_only
     def finish(self, exit_code: int) -> None:
         """Close the run if it has begun."""
         import wandb
@@ -215,16 +246,28 @@ def _refused_by_wandb() -> Iterator[None]:
 
 
 @contextmanager
-def wandb_runs(loggers: Iterable[Logger], config: DictConfig | ListConfig) -> Iterator[None]:
+def wandb_runs(loggers: Iterable[Logger], config: DictConfig | ListConfig, folder: Path) -> Iterator[None]:
     """Log the config to W&B's runs, and close them in the end, so that the next job does not log to them.
 
     Their exit code is 1 after an error.
+
+    Args:
+        folder: folder of the job, whose record has the chosen options (`options.ablation`), the user's own command and
+            the commit.
     """
+    record = read_record(folder)
+    program, *arguments = record.get("command") or [""]
+    asked = {
+        "options": record.get("groups"),
+        "command": f"{program} {shlex.join(arguments)}",
+        "commit": record.get("commit"),
+    }
     runs = [run for run in loggers if isinstance(run, WandbRun)]
     exit_code = 1
     try:
         for run in runs:
-            run.log_hyperparams(OmegaConf.to_container(config, resolve=True))
+            settings: Any = OmegaConf.to_container(config, resolve=True)
+            run.log_hyperparams({**settings, **asked})
         yield
         exit_code = 0
     finally:

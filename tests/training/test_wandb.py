@@ -22,7 +22,7 @@ FIT, TESTED = (STAGE1, STAGE2), (STAGE1, STAGE2, TEST)  # `fit` ends with a test
 LOGGED = [
     ("number", FIT, "train/loss val/psnr_novel gaussians/opacity_p* gaussians/log10_scale_p* gaussians/depth_p*"),
     ("number", FIT, "layers/opacity_* layers/behind_*"),
-    ("number", FIT, "speed/scenes_per_second speed/data_wait train/bad_steps"),
+    ("number", FIT, "speed/scenes_per_second speed/data_wait train/bad_steps train/learning_rate train/gradient_norm"),
     ("number", FIT if Path("/proc/self/status").exists() else (), "memory/process_gb"),
     ("number", FIT if torch.cuda.is_available() else (), "memory/gpu_gb"),
     ("image", FIT, "images"),

@@ -33,7 +33,7 @@ def test_without_an_answer_the_run_is_soon_offline(online, tmp_path, monkeypatch
             server.close()
         monkeypatch.setenv("WANDB_BASE_URL", url)
         begun = time.monotonic()
-        with wandb_runs([run_logger := WandbRun(str(tmp_path), "online", "some")], OmegaConf.create({})):
+        with wandb_runs([run_logger := WandbRun(str(tmp_path), "online", "some")], OmegaConf.create({}), tmp_path):
             run_logger.log_metrics({"a": 1.0}, step=3)
             assert time.monotonic() - begun < 10 * START_SECONDS  # on a busy machine
     (run,) = offline_runs(tmp_path)
@@ -46,11 +46,11 @@ def test_training_goes_on_when_the_process_of_wandb_dies(tmp_path, monkeypatch, 
     one, other = (WandbRun(str(tmp_path), "offline", "some") for _ in range(2))
     for name in ("log", "finish"):
         monkeypatch.setattr(one.experiment, name, Mock(side_effect=ConnectionResetError("Connection lost")))
-    with wandb_runs([one], OmegaConf.create({})):
+    with wandb_runs([one], OmegaConf.create({}), tmp_path):
         one.log_metrics({"a": 1.0})
         one.log_metrics({"a": 2.0})
     assert caplog.text.count("its process ended") == 1
-    with wandb_runs([other], OmegaConf.create({})):  # What comes next has a process again.
+    with wandb_runs([other], OmegaConf.create({}), tmp_path):  # What comes next has a process again.
         other.log_metrics({"a": 3.0})
     assert offline_runs(tmp_path)[-1].history[0]["a"] == 3
 
@@ -58,7 +58,7 @@ def test_training_goes_on_when_the_process_of_wandb_dies(tmp_path, monkeypatch, 
 def test_a_run_that_is_stopped_says_so(tmp_path):
     one = WandbRun(str(tmp_path), "offline", "some")
     one.log_metrics({"a": 1.0})
-    with pytest.raises(KeyboardInterrupt), wandb_runs([one], OmegaConf.create({})):
+    with pytest.raises(KeyboardInterrupt), wandb_runs([one], OmegaConf.create({}), tmp_path):
         raise KeyboardInterrupt
     (run,) = offline_runs(tmp_path)
     assert run.only("exit").exit_code == 1
@@ -69,7 +69,7 @@ def test_the_recorded_id_is_the_runs_also_under_a_sweeps_agent(tmp_path, monkeyp
     wandb.teardown()
     for name, value in agent.items():
         monkeypatch.setenv(name, value)
-    with wandb_runs([run_logger := WandbRun(str(tmp_path), "offline", "some")], OmegaConf.create({})):
+    with wandb_runs([run_logger := WandbRun(str(tmp_path), "offline", "some")], OmegaConf.create({}), tmp_path):
         run_logger.log_metrics({"a": 1.0})
     wandb.teardown()
     (run,) = offline_runs(tmp_path)
