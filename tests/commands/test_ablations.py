@@ -79,6 +79,16 @@ def test_a_stage_that_diverges_ends_with_status_1_and_without_weights(command, t
     assert "not finite" in strict_json(Path("RUN/run.json"))["diverged"]
 
 
+def test_a_stage_whose_last_step_made_its_predictions_not_finite_has_no_weights(command, toy_root: Path) -> None:
+    given = ["experiment=toy_var", f"data.root={toy_root}", *QUICK, "optimizer.lr=1e20", "optimizer.adam_lr=1e20"]
+    done = command("fit", *given, "out=RUN")
+    assert (done.status, done.err.count("\n")) == (1, 1), done.err
+    assert "predictions are not finite" in done.err
+    assert not list(Path("RUN").glob("weights*"))
+    assert not Path("RUN/checkpoints/last.ckpt").exists()
+    assert "predictions are not finite" in strict_json(Path("RUN/run.json"))["diverged"]
+
+
 @pytest.mark.parametrize("name", ["1e3", "NAN", "true", "007"])
 def test_folders_are_called_as_they_are_given(name: str, command) -> None:
     command.succeeds("data", "toy", "kind=objects", "scenes=1", "frames=2", "size=16", "workers=1", f"out={name}")
