@@ -94,18 +94,6 @@ def test_image_files_have_any_of_their_suffixes(suffix, tmp_path):
     assert torch.equal(module(root, val_fraction=0.0).source("train").read("a").read(3).image, expected)
 
 
-def test_a_text_without_its_first_line_has_all_its_frames(tmp_path):
-    root = write_tree(tmp_path, "text", [make_clip("a")], [])
-    expected = module(root, val_fraction=0.0).source("train").read("a")
-    text = root / "train/a.txt"
-    address, _, rows = text.read_text().partition("\n")
-    assert address.startswith("http")
-    text.write_text(rows)
-    read = module(root, val_fraction=0.0).source("train").read("a")
-    assert read.frames == expected.frames
-    assert torch.equal(read.cameras.world_to_camera, expected.cameras.world_to_camera)
-
-
 def test_targets_stay_near_the_reference_and_may_be_none(root):
     data = module(root, min_gap=1, max_gap=2)
     for seed in range(50):
