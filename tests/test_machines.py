@@ -329,6 +329,14 @@ def test_what_npm_says_is_short(tmp_path: Path) -> None:
     assert "A complete log" not in str(caught.value)
 
 
+def test_npx_keeps_its_files_elsewhere_where_the_home_cannot_be_written(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.delenv("npm_config_cache", raising=False)
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
+    program = write_program(tmp_path / "splat-transform", 'echo "$npm_config_cache" >&2\nexit 1')
+    with pytest.raises(CompleteSplatError, match=f"status 1: {files.private_folder()}/npm$"):
+        convert(str(program), tmp_path / "a.ply", tmp_path / "a.sog")
+
+
 def test_torch_exports_a_model_with_what_it_returns() -> None:
     model = tiny_generator().autoreconstructor
     images = torch.rand(2, 3, 32, 32)
