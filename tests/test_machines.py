@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import huggingface_hub
@@ -14,7 +15,7 @@ import torch
 from hydra.utils import instantiate
 from packed_sequences import ListedSource, pack
 from scenes_for_training import opened, quiet_trainer
-from support import compose_config, python, refused, tiny_generator, waited_for, write_program
+from support import LIMIT, compose_config, python, refused, tiny_generator, waited_for, write_program
 
 import completesplat
 from completesplat import files
@@ -126,6 +127,55 @@ def test_workers_without_memory_or_files_are_told_of_in_one_line(error: Exceptio
     with pytest.raises(CompleteSplatError, match=f"^data.workers: .*{advice}.* data.workers=0$"):
         next(iter(loader))
     assert workers_refusal(RuntimeError("another")) is None
+
+
+WORKERS = """
+import sys
+import time
+
+import torch
+
+from completesplat.data.loading.loader import SceneLoader
+from completesplat.data.loading.scenes import LoadedScenes
+from completesplat.data.tolerance import SKIP_ALL
+from completesplat.scene import CachedScene
+
+latent = torch.zeros(4, 8, 8)
+scenes = [LoadedScenes(CachedScene(latent, latent, latent, torch.tensor(0), "scene"), ())] * 1000
+batches = iter(SceneLoader(scenes, 1, None, 2, SKIP_ALL))
+next(batches)
+print("ready", flush=True)
+time.sleep(float(sys.argv[1]))
+"""
+
+
+@pytest.mark.processes
+def test_folders_of_killed_workers_are_removed_by_the_next_run() -> None:
+    with tempfile.TemporaryDirectory() as temporary:  # of a short name, because sockets have no long ones
+        environment = os.environ | {"TMPDIR": temporary}
+
+        def start(seconds: float) -> subprocess.Popen[str]:
+            command = [sys.executable, "-c", WORKERS, str(seconds)]
+            settings = {"env": environment, "start_new_session": True, "text": True}
+            return subprocess.Popen(command, stdout=subprocess.PIPE, **settings)
+
+        def sockets() -> set[Path]:
+            return set(Path(temporary).rglob("pymp-*/listener-*"))
+
+        running = start(10 * LIMIT)
+        assert running.stdout.readline() == "ready\n"
+        of_running = sockets()
+        killed = start(10 * LIMIT)
+        assert killed.stdout.readline() == "ready\n"
+        assert sockets() > of_running
+        os.killpg(killed.pid, signal.SIGKILL)
+        killed.wait()
+        assert start(0).wait() == 0
+        left = sockets()
+        os.killpg(running.pid, signal.SIGKILL)
+        running.wait()
+        assert left == of_running
+        assert [path.name for path in Path(temporary).iterdir()] == [f"completesplat-{os.getuid()}"]
 
 
 def snapshot(root: Path, store: Path) -> Path:
@@ -277,6 +327,14 @@ def test_what_npm_says_is_short(tmp_path: Path) -> None:
         convert(str(program), tmp_path / "a.ply", tmp_path / "a.sog")
     assert len(str(caught.value)) < 200
     assert "A complete log" not in str(caught.value)
+
+
+def test_npx_keeps_its_files_elsewhere_where_the_home_cannot_be_written(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.delenv("npm_config_cache", raising=False)
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
+    program = write_program(tmp_path / "splat-transform", 'echo "$npm_config_cache" >&2\nexit 1')
+    with pytest.raises(CompleteSplatError, match=f"status 1: {files.private_folder()}/npm$"):
+        convert(str(program), tmp_path / "a.ply", tmp_path / "a.sog")
 
 
 def test_torch_exports_a_model_with_what_it_returns() -> None:

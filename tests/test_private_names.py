@@ -24,6 +24,7 @@ REASONS = {
     "commands/__init__.py sys.argv": DURING_JOB,
     "commands/jobs.py sys.argv": DURING_JOB,
     f"data/loading/loader.py {LOADERS}._BaseDataLoaderIter": "the type of `_iterator`, by which Lightning ends workers",
+    "data/loading/worker_folder.py tempfile.tempdir": "documented: the folder of a worker's temporary files",
     "data/validation/processes.py _processes": "executors cannot end workers before Python 3.14",
     "losses/efficientnet.py _blocks _bn0 _conv_stem _swish": NO_FEATURES,
     "settings/checks.py _get_node _get_root _value": NO_ORIGIN,

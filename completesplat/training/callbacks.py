@@ -60,8 +60,8 @@ class BadSteps(Callback):
 
     Args:
         most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row. At the end, before a
-            checkpoint is written, it does so if the last two steps were skipped, or the last one and half of all, or
-            if weights are not finite.
+            checkpoint is written, it does so if the last two steps were skipped, or the last one and half of all, if
+            weights are not finite, or if they are so large that a prediction for the last batch is not.
     """
 
     def __init__(self, most_bad_steps: Positive = 10) -> None:
@@ -71,6 +71,7 @@ class BadSteps(Callback):
         self.losses: list[Tensor] = []
         self.last: tuple[Tensor, torch.cuda.Event] | None = None  # whether the last step was bad, on its way here
         self.divergence = "all steps had a loss or gradients that are not finite"
+        self.batch: object = None  # of the last step
 
     def state_dict(self) -> dict[str, int]:
         self._count_last()
@@ -107,6 +108,11 @@ class BadSteps(Callback):
                 parameter.grad = None  # optimizers skip these parameters
         pl_module.log(BAD_STEPS, torch.tensor(float(self.total)), batch_size=1)
 
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
+    ) -> None:
+        self.batch = batch
+
     def _count(self, bad: bool) -> bool:
         self.total += bad
         self.in_a_row = (self.in_a_row + 1) * bad
@@ -128,6 +134,15 @@ class BadSteps(Callback):
         name = not_finite(pl_module.state_dict())
         if name is not None:
             raise DivergenceError(f"after {trainer.global_step} steps, {name} is not finite; lower optimizer.lr")
+        if not isinstance(pl_module, Stage) or not isinstance(self.batch, Batch):
+            return
+        pl_module.eval()
+        with trainer.precision_plugin.val_step_context():
+            finite = pl_module.predicts_finite(self.batch)
+        self.batch = None
+        if not all(gather_values(finite)):
+            advice = "the last steps were too large; lower optimizer.lr"
+            raise DivergenceError(f"after {trainer.global_step} steps, predictions are not finite: {advice}")
 
 
 class OptimizerFigures(Callback):
@@ -307,7 +322,7 @@ class Throughput(Callback):
         self.ended = None
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         self.ended = time.perf_counter()
         if self.started is not None:

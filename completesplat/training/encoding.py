@@ -6,6 +6,7 @@ import shutil
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +24,12 @@ from completesplat.data.loading.distributed import gather_values, processes
 from completesplat.data.loading.latent_cache import CachedSequence, LatentCache, Origin, Rows, Sums, write_cache
 from completesplat.data.loading.scenes import LoadedScenes, SceneStore, collate
 from completesplat.data.loading.view_selection import spread_around
+from completesplat.data.loading.worker_folder import prepare_worker, worker_folder
 from completesplat.data.packed.manifest import MANIFEST
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import SceneBatch
-from completesplat.signals import leave_to_parent
 from completesplat.wording import counted
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
@@ -251,7 +252,7 @@ def _encoded_batches(
         batch_sampler=batches[rank::count],
         num_workers=workers,
         collate_fn=collate,
-        worker_init_fn=leave_to_parent,
+        worker_init_fn=partial(prepare_worker, worker_folder() if workers > 0 else None),
     )
     loaded = iter(loader)
     for first in track(range(0, len(batches), count), "encoding", disable=not progress or rank > 0):

@@ -217,6 +217,13 @@ class LatentDiffusion(DiffusionScorer, Stage):
         latent = parts.standardised(parts.autoreconstructor.training_latent(posterior))
         return latent, batch.condition if parts.conditioning.frozen else parts.conditioning(batch.condition)
 
+    @torch.no_grad()
+    def predicts_finite(self, batch: Batch) -> bool:
+        """Return whether the denoiser's output for the batch's first scene, which may be encoded, is finite."""
+        latent, conditioning = self.inputs(batch[:1])
+        timestep = torch.zeros(1, dtype=torch.int64, device=self.device)
+        return bool(self.completesplat.denoiser(latent, timestep, conditioning).isfinite().all())
+
     def training_step(self, batch: Batch, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat
         latent, conditioning = self.inputs(batch)

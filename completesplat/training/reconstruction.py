@@ -19,7 +19,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.generator import DeterministicModel
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.metrics.images import psnr
-from completesplat.scene import SceneBatch, Views
+from completesplat.scene import Batch, SceneBatch, Views
 from completesplat.splatter_image import SplatterImage
 from completesplat.training.stage import Compile, Stage, prepare_network
 from completesplat.weights import CAMERA
@@ -183,6 +183,13 @@ class ReconstructionModule(ReconstructionScorer, Stage):
         logged = {f"train/{name}": value for name, value in values.items()}
         self.log_step({"train/loss": total.detach(), "train/psnr": quality, **logged}, batch_size=len(scenes.names))
         return total
+
+    @torch.no_grad()
+    def predicts_finite(self, batch: Batch) -> bool:
+        """Return whether most Gaussians of the batch's first scene are finite."""
+        assert isinstance(batch, SceneBatch)
+        finite = self.reconstruct(batch[:1]).finite()
+        return finite.float().mean().item() > 0.5
 
     def validation_step(self, scenes: SceneBatch, index: int) -> None:
         """Score the reference image alone, and if the posterior sees views, also with every other target encoded.

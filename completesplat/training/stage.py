@@ -89,6 +89,10 @@ class Stage(Scorer):
     def save_weights(self, folder: Path) -> None:
         """Write the weights that `predict` and `from_pretrained` read, if the model makes scenes from photos."""
 
+    def predicts_finite(self, batch: Batch) -> bool:
+        """Return whether a prediction for the batch's first scene is finite, for networks that could make others."""
+        return True
+
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]
         cls, checkpoint_path: str | Path, map_location: torch.device | str | None = None, trust: bool = False

@@ -1,13 +1,17 @@
 """Ablations: what each changes at the paper's size, and jobs of ablations that change nothing."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
 from support import SMALL, compose_config, strict_json
 
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
+from completesplat.commands import ablations
+from completesplat.settings.options import conf_folder, options
 
 QUICK = [*SMALL, "trainer.max_steps=1", "callbacks.images=null", "test=false"]
 PAPER = ["experiment=paper_var_stage2", "data.root=/nowhere", "model.checkpoint=/nowhere"]
@@ -25,6 +29,13 @@ CHANGES: dict[str, tuple[int, set[str], dict[str, object]]] = {
     "no_color_aug": (0, set(), {"data.color_jitter": None}),
 }
 """By ablation: the difference in parameters, the loss terms that it removes, and other settings that it changes."""
+IDLE: dict[str, set[str]] = {
+    "paper_var_stage1": {"no_lpips"},
+    "paper_var_stage2": set(),
+    "toy_var": {"no_lpips"},
+}
+"""By experiment: the ablations that change nothing there."""
+ABLATIONS = conf_folder() / "ablation"
 
 
 def method(*ablation: str) -> tuple[int, set[str], dict[str, object]]:
@@ -61,6 +72,53 @@ def test_an_ablation_that_changes_nothing_says_so_and_can_be_left_out(command, t
     assert not list(Path("S").glob("*seed*/metrics.json"))
 
 
+def with_ablation(config: DictConfig, ablation: str) -> DictConfig:
+    """Return a config with the settings of an ablation, which `conf/fit.yaml` lists last. (Hydra takes 0.3 s.)"""
+    changed = config.copy()
+    parts: list[tuple[str, object]] = [("", OmegaConf.to_container(OmegaConf.load(ABLATIONS / f"{ablation}.yaml")))]
+    while parts:
+        place, value = parts.pop()
+        if isinstance(value, dict):
+            parts += [(f"{place}.{name}" if place else name, part) for name, part in value.items()]
+        elif value is not None or OmegaConf.select(config, place) is not None:
+            OmegaConf.update(changed, place, value, force_add=True)
+    return changed
+
+
+def trained_and_tested(config: DictConfig) -> list[object]:
+    """Return the resolved settings of data, model and all else that Hydra makes objects of."""
+    return [OmegaConf.to_container(config[part], resolve=True) for part in ("data", "model", "trainer", "callbacks")]
+
+
+@pytest.mark.parametrize("experiment", options("experiment"))
+def test_every_ablation_of_every_experiment_is_known_to_change_something_or_nothing(experiment, monkeypatch) -> None:
+    config = compose_config("fit", f"experiment={experiment}", "data.root=/nowhere")
+    plain = trained_and_tested(config)
+    monkeypatch.setattr(ablations, "compose", lambda *_: config)
+    monkeypatch.setattr(ablations, "take_architecture", lambda _: None)
+    verdicts, listed = {}, {}
+    for ablation in CHANGES:
+        job = SimpleNamespace(choices={"ablation": ablation})
+        given = SimpleNamespace(task=[f"experiment={experiment}", f"ablation={ablation}"])
+        hydra_config = SimpleNamespace(runtime=job, overrides=given)
+        monkeypatch.setattr(ablations, "HydraConfig", SimpleNamespace(get=lambda chosen=hydra_config: chosen))
+        changed = with_ablation(config, ablation)
+        verdicts[ablation] = ablations.idle_ablation(changed) is not None
+        listed[ablation] = trained_and_tested(changed) == plain
+    assert verdicts == listed
+    idle = {ablation for ablation, nothing in listed.items() if nothing}
+    if experiment in IDLE:
+        assert idle == IDLE[experiment]
+
+
+def test_settings_of_an_ablation_are_those_that_hydra_composes() -> None:
+    given = ["experiment=toy_var", "data.root=/nowhere"]
+    config = compose_config("fit", *given)
+    for ablation in ("no_variational", "skips_first_two"):
+        composed = compose_config("fit", *given, f"ablation={ablation}")
+        assert trained_and_tested(with_ablation(config, ablation)) == trained_and_tested(composed)
+
+
 @pytest.mark.parametrize("given", [["ablation=glob(zzz*)"], ["seed=range(0)"], ["ablation=full,m1", "data=glob(x*)"]])
 def test_a_sweep_without_a_job_is_refused(given: list[str], command) -> None:
     reason = command.refuses("fit", "-m", "experiment=toy_var", *given, "out=S")
@@ -77,6 +135,16 @@ def test_a_stage_that_diverges_ends_with_status_1_and_without_weights(command, t
     assert not Path("RUN/metrics.json").exists()
     assert not Path("RUN/checkpoints/last.ckpt").exists()
     assert "not finite" in strict_json(Path("RUN/run.json"))["diverged"]
+
+
+def test_a_stage_whose_last_step_made_its_predictions_not_finite_has_no_weights(command, toy_root: Path) -> None:
+    given = ["experiment=toy_var", f"data.root={toy_root}", *QUICK, "optimizer.lr=1e20", "optimizer.adam_lr=1e20"]
+    done = command("fit", *given, "out=RUN")
+    assert (done.status, done.err.count("\n")) == (1, 1), done.err
+    assert "predictions are not finite" in done.err
+    assert not list(Path("RUN").glob("weights*"))
+    assert not Path("RUN/checkpoints/last.ckpt").exists()
+    assert "predictions are not finite" in strict_json(Path("RUN/run.json"))["diverged"]
 
 
 @pytest.mark.parametrize("name", ["1e3", "NAN", "true", "007"])

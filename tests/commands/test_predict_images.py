@@ -81,6 +81,16 @@ def test_a_folder_is_its_images_sorted(tmp_path):
             find_images(given)
 
 
+def test_a_folders_photos_may_have_any_suffix_of_jpeg(predict, tmp_path):
+    names = ["a.jpe", "b.jfif", "c.JPG", "d.JFIF"]
+    for name in names:
+        save(tmp_path / "photos" / name)
+    finished = predict(tmp_path / "photos")
+    assert finished.status == 0, finished.err
+    scenes = sorted((tmp_path / "out").glob("*/scene.json"))
+    assert [strict_json(scene)["settings"]["image"] for scene in scenes] == names
+
+
 ODD_NAMES = [b"...png", b"\xff.png", b"[red].png", b"new\nline.png", b"a" * 250 + b".png", b"\x1b[31m.png", b"a\\b.png"]
 
 

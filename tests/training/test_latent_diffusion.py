@@ -205,3 +205,19 @@ def test_a_compiled_denoiser_keeps_its_keys_and_runs_what_the_compiler_returns(m
     assert module.state_dict().keys() == module_of(monkeypatch)[0].state_dict().keys()
     module.training_step(scenes(), 0)
     assert compiled == [mode]
+
+
+@pytest.mark.parametrize("cached", [False, True])
+def test_weights_that_are_too_large_predict_nothing_finite(cached: bool, monkeypatch) -> None:
+    module, _ = module_of(monkeypatch)
+    batch = scenes()
+    if cached:
+        posterior = module.completesplat.autoreconstructor.encoder(batch.reference.images)[0].map(torch.Tensor.detach)
+        condition = batch.reference.images
+        frames = batch.reference_frame
+        batch = CachedScene(posterior.mean, posterior.log_variance, condition, frames, batch.names)
+    assert module.predicts_finite(batch)
+    parameter = next(module.completesplat.denoiser.parameters())
+    torch.nn.init.constant_(parameter, 1e38)
+    assert parameter.isfinite().all()
+    assert not module.predicts_finite(batch)

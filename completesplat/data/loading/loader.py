@@ -3,6 +3,7 @@
 import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,9 +13,9 @@ from torch.utils.data.dataloader import _BaseDataLoaderIter
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.scenes import EvaluationScenes, TrainingScenes, collate
 from completesplat.data.loading.view_selection import item_generator
+from completesplat.data.loading.worker_folder import prepare_worker, worker_folder
 from completesplat.data.tolerance import ErrorTolerance
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.signals import leave_to_parent
 
 logger = logging.getLogger(__name__)
 
@@ -106,7 +107,7 @@ class SceneLoader:
             persistent_workers=workers > 0,  # Workers hold the cached images, so they outlive an epoch.
             collate_fn=collate,
             pin_memory=torch.cuda.is_available(),
-            worker_init_fn=leave_to_parent,
+            worker_init_fn=partial(prepare_worker, worker_folder() if workers > 0 else None),
             # A separate generator, so that the random numbers of training do not depend on the number of workers.
             generator=torch.Generator(),
         )
