@@ -24,6 +24,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright is no
 from completesplat.viewer.access import show_status, start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
 from completesplat.viewer.page import Page, Saver, write_viewer_page  # noqa: E402
+from completesplat.viewer.panel import square_text  # noqa: E402
 from completesplat.viewer.splat_view import MARGIN, SplatView  # noqa: E402
 from completesplat.viewer.turning import REST  # noqa: E402
 
@@ -247,6 +248,7 @@ def test_a_square_is_dragged_on_the_photo(tab, page, tmp_path):
     assert completion.crop == pytest.approx((0.75, 0.5, 0.5), abs=0.02)
     assert waited_for(lambda: completion.photo[1].window[2] - completion.photo[1].window[0] < 34)
     field = tab.get_by_role("textbox", name="Square")
+    assert waited_for(lambda: field.input_value() == square_text(completion.crop)), "the page does not show it"
     field.fill("0, 0, 1")
     field.press("Enter")
     assert waited_for(lambda: completion.photo[1].window == (0, 0, 64, 64)), "what is typed does not arrive"
