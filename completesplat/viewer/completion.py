@@ -34,6 +34,7 @@ from completesplat.viewer.photo_file import PhotoFile
 from completesplat.viewer.sample import Sample
 
 PAUSE = 0.2  # seconds between two images of a scene that forms
+CROPPED = "cropped"  # kind of jobs that no drawing drops, lest a choice is lost while a photo is read
 
 
 class Completion:
@@ -108,7 +109,7 @@ class Completion:
         if chosen == SQUARE and isinstance(self.crop, str):
             self.page.submit("square", event.client, partial(self._show_square, (0.0, 0.0, 1.0)))
         elif chosen not in (SQUARE, self.crop):
-            self.page.submit(SHOWN, event.client, partial(self._take, chosen, event.client))
+            self.page.submit(CROPPED, event.client, partial(self._take, chosen, event.client))
 
     def _take_square(self, event: viser.GuiEvent[Any]) -> None:
         """Take the square that was typed or dragged."""
@@ -116,7 +117,7 @@ class Completion:
             square = square_of(self.controls.square.value)
         except CompleteSplatError as error:
             return self.page.tell(error, event.client)
-        self.page.submit(SHOWN, event.client, partial(self._take, square, event.client))
+        self.page.submit(CROPPED, event.client, partial(self._take, square, event.client))
 
     def _take(self, crop: Crop, client: viser.ClientHandle | None) -> None:
         """Read the photo's file again, and draw from another part of it."""
