@@ -16,6 +16,7 @@ SETTINGS = {
     "steps": 2,
     "seed": 0,
 }
+START = SETTINGS | {"crop": "whole", "remove_background": False}  # of the page's controls
 BALLS = {
     "red": ((0.0, 0.0, 4.0), (0.9, 0.1, 0.1)),
     "green": ((0.0, -0.8, 4.0), (0.1, 0.8, 0.1)),

@@ -26,7 +26,7 @@ from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.description import finished_digest, made_from
 from completesplat.export.formats import CONVERTED, FORMATS
 from completesplat.export.placed_scene import PlacedScene
-from completesplat.export.prediction import write_prediction
+from completesplat.export.prediction import SHEET_FILE, write_prediction
 from completesplat.export.progress import PhotoProgress
 from completesplat.export.scene_files import OutputFiles
 from completesplat.export.splat_transform import find_splat_transform
@@ -48,8 +48,11 @@ OF_OBJECT = 0.1  # difference of a channel from the background of weights, from 
 sha256_of_weights = cache(sha256_of)  # a process has one model, of up to gigabytes
 
 
-def run(config: DictConfig, out: Path) -> None:
+def run(config: DictConfig, out: Path) -> str:
     """Write the files of each photo in this shard into `out/<its name>/`, by `devices` processes.
+
+    Returns:
+        The line that says which file to look at first.
 
     Raises:
         CompleteSplatError: the only image failed, or some of several, which the message names; the others are written.
@@ -64,7 +67,8 @@ def run(config: DictConfig, out: Path) -> None:
         raise CompleteSplatError("mask=FILE belongs to one image; box=[x0,y0,x1,y1] goes for several")
     share_of(images, config.shard, config.shards)  # refuses a shard that does not exist
     if config.cameras is not None:
-        return predict_from_views(config, images, outputs, out)
+        predict_from_views(config, images, outputs, out)
+        return sheet_line(out, images[:1])
     start = time.perf_counter()
     if config.devices == 1:
         results = [predict_share(config, images, outputs, out, 0)]
@@ -79,6 +83,13 @@ def run(config: DictConfig, out: Path) -> None:
     if failed:
         text = f"{len(failed)} of {count + len(failed)} images failed ({', '.join(failed)})"
         raise CompleteSplatError(f"{text}; the others are in {out}" if count else text)
+    return sheet_line(out, images)
+
+
+def sheet_line(out: Path, images: Sequence[Path]) -> str:
+    """Return the line that says where the sheets of one or more images are."""
+    name = safe_name(images[0].stem) if len(images) == 1 else "*"
+    return f"look at {out / name / SHEET_FILE}"
 
 
 def predict_on_device(

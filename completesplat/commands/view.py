@@ -151,6 +151,7 @@ def page_of_model(server: Any, config: DictConfig, out: Path) -> Any:
     from completesplat.commands.trained import open_generator
     from completesplat.viewer.completion import Completion
     from completesplat.viewer.panel import SLIDERS
+    from completesplat.viewer.photo_file import PhotoFile
 
     image = None if config.image is None else Path(config.image)
     remove = config.background == REMOVE
@@ -158,9 +159,12 @@ def page_of_model(server: Any, config: DictConfig, out: Path) -> Any:
     photograph = None if image is None else model.read(image, config.fov, remove, crop=config.crop)
     page = empty_page(server, config, out, model.up.tolist(), model)
     start = {name: config[name] for name in SLIDERS}
-    completion = Completion(page, model, {**start, "remove_background": remove}, config.crop)
+    start["remove_background"] = remove
+    start["crop"] = config.crop if isinstance(config.crop, str) else "whole"
+    completion = Completion(page, model, start)
     if image is not None and photograph is not None:
-        completion.load(printable(image.name), photograph)
+        file = PhotoFile(printable(image.name), image.read_bytes(), config.fov, remove)
+        completion.open(file, photograph, config.crop)
     return page
 
 

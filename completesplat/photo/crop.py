@@ -1,5 +1,6 @@
 """Squares that are cut out of images or laid around them: the whole image, its middle, a given part, or an object."""
 
+from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -85,6 +86,21 @@ def window_of(size: tuple[int, int], crop: Crop) -> Window:
         )
     ends = min(round(right), size[0]), min(round(lower), size[1])
     return ends[0] - round(side), ends[1] - round(side), *ends
+
+
+def square_within(size: tuple[int, int], square: Sequence[float]) -> tuple[float, float, float]:
+    """Return the square [x, y, size] (`window_of`) nearest to a given one that lies within a photo of this size.
+
+    Args:
+        size: the photo's width and height in pixels, of which the shorter has at least `SMALLEST_SIDE`.
+    """
+    width, height = size
+    shorter = min(size)
+    x, y, share = square
+    share = min(max(share, SMALLEST_SIDE / shorter), 1.0)
+    x = min(max(x, 0.0), 1 - share * shorter / width)
+    y = min(max(y, 0.0), 1 - share * shorter / height)
+    return x, y, share
 
 
 def part_within(window: Window, size: tuple[int, int]) -> Window:

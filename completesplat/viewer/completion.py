@@ -12,42 +12,68 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.images import to_pixels
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
+from completesplat.photo.crop import square_within
 from completesplat.photo.photograph import framing_line
 from completesplat.photo.reading import Photograph
 from completesplat.quantities import Crop
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.access import show_status
 from completesplat.viewer.page import COMPARED, SHOWN, Page
-from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, Pixels, add_completion_controls, nearest_steps
+from completesplat.viewer.panel import (
+    MOST_SAMPLES,
+    SLIDERS,
+    SQUARE,
+    Pixels,
+    add_completion_controls,
+    nearest_steps,
+    square_of,
+    square_on,
+    square_text,
+)
+from completesplat.viewer.photo_file import PhotoFile
 from completesplat.viewer.sample import Sample
 
 PAUSE = 0.2  # seconds between two images of a scene that forms
+CROPPED = "cropped"  # kind of jobs that no drawing drops, lest a choice is lost while a photo is read
 
 
 class Completion:
     """Controls that complete a photo, added to a page. The model runs only in the page's worker."""
 
-    def __init__(self, page: Page, model: SceneModel, start: dict[str, Any], crop: Crop = "whole") -> None:
+    def __init__(self, page: Page, model: SceneModel, start: dict[str, Any]) -> None:
         self.page = page
         self.model = model
-        self.crop = crop
-        self.photograph: tuple[str, Photograph] | None = None
+        self.photo: tuple[PhotoFile, Photograph] | None = None
+        self.crop: Crop = "whole"  # of this photo
+        self.whole: Pixels | None = None  # all of the photo, once a square was shown on it
         self.controls = add_completion_controls(page.server.gui, model, start)
         page.complete = self.complete
         page.invite()
         self.controls.draw.on_click(lambda event: self.request(event.client))
+        self.controls.crop.on_update(self._choose_crop)
+        self.controls.form.on_submit(self._take_square)
         for name in SLIDERS:
             getattr(self.controls, name).on_update(self._moved)
 
-    def load(self, name: str, photograph: Photograph, client: viser.ClientHandle | None = None) -> None:
-        """Show this photo in the panel, and draw its samples."""
-        self.photograph = name, photograph
-        words = [name, f"field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"]
+    def open(
+        self, file: PhotoFile, photograph: Photograph, crop: Crop, client: viser.ClientHandle | None = None
+    ) -> None:
+        """Show a photo in the panel, and draw its samples.
+
+        Args:
+            file: the photo's file.
+            photograph: the part of it that `crop` says.
+        """
+        if self.photo is None or self.photo[0] is not file:
+            self.whole = None
+        self.photo = file, photograph
+        words = [file.name, f"field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"]
         framed = framing_line(photograph)
         words += [] if framed is None else [framed]
         self.page.withdraw_invitation()
         self.page.view.fade()
         self.page.set_photo(self._seen(photograph), ", ".join(words))
+        self._show_crop(crop)
         self.controls.draw.disabled = False
         self.page.view.set_up(self.model.up.tolist())
         self.request(client)
@@ -59,16 +85,70 @@ class Completion:
 
     def request(self, client: viser.ClientHandle | None = None) -> None:
         """Queue a drawing with the present settings."""
-        if self.photograph is None:
+        if self.photo is None:
             return self.page.tell(CompleteSplatError("load an image first"), client)
+        file, photograph = self.photo
         settings = {name: getattr(self.controls, name).value for name in SLIDERS}
-        self.page.submit(SHOWN, client, partial(self._draw, *self.photograph, settings))
+        self.page.submit(SHOWN, client, partial(self._draw, file.name, photograph, settings))
 
     def complete(self, image: Path, name: str, client: viser.ClientHandle | None) -> None:
         """Load an image file, or raise CompleteSplatError if it is none or its background cannot be removed."""
         show_status(self.page.server, f"reading {name}")
-        photograph = self.model.read(image, remove_background=self.controls.remove_background.value, crop=self.crop)
-        self.load(name, photograph, client)
+        crop: Crop = self.controls.crop.value
+        if crop == SQUARE:
+            crop = "whole"  # because the square is of the photo before
+        file = PhotoFile(name, image.read_bytes(), remove_background=self.controls.remove_background.value)
+        self.open(file, file.read(self.model, crop), crop, client)
+
+    def _choose_crop(self, event: viser.GuiEvent[Any]) -> None:
+        """Take the whole photo or its middle, or show a square on it, which can be dragged."""
+        if self.photo is None:
+            return
+        chosen = self.controls.crop.value
+        self.controls.form.visible = chosen == SQUARE
+        if chosen == SQUARE and isinstance(self.crop, str):
+            self.page.submit("square", event.client, partial(self._show_square, (0.0, 0.0, 1.0)))
+        elif chosen not in (SQUARE, self.crop):
+            self.page.submit(CROPPED, event.client, partial(self._take, chosen, event.client))
+
+    def _take_square(self, event: viser.GuiEvent[Any]) -> None:
+        """Take the square that was typed or dragged."""
+        try:
+            square = square_of(self.controls.square.value)
+        except CompleteSplatError as error:
+            return self.page.tell(error, event.client)
+        self.page.submit(CROPPED, event.client, partial(self._take, square, event.client))
+
+    def _take(self, crop: Crop, client: viser.ClientHandle | None) -> None:
+        """Read the photo's file again, and draw from another part of it."""
+        if self.photo is None:
+            return
+        file, photograph = self.photo
+        if not isinstance(crop, str):
+            crop = square_within(photograph.photo_size, crop)
+        show_status(self.page.server, f"reading {file.name}")
+        self.open(file, file.read(self.model, crop), crop, client)
+
+    def _show_crop(self, crop: Crop) -> None:
+        """Show in the controls what is taken of the photo."""
+        self.crop = crop
+        self.controls.form.visible = not isinstance(crop, str)
+        if isinstance(crop, str):
+            self.controls.crop.value = crop
+        else:
+            self.controls.crop.value = SQUARE
+            self._show_square(crop)
+
+    def _show_square(self, square: Sequence[float]) -> None:
+        """Show a square on the whole photo, moved into it, and its numbers."""
+        if self.photo is None:
+            return
+        file, photograph = self.photo
+        if self.whole is None:
+            self.whole = file.whole(COMPARED)
+        within = square_within(photograph.photo_size, square)
+        self.controls.picture.content = square_on(self.whole, within)
+        self.controls.square.value = square_text(within)
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
         if not isinstance(self.model, CompleteSplat):
@@ -77,7 +157,7 @@ class Completion:
         nearest = nearest_steps(self.model.sampler, steps.value)
         if nearest != steps.value:
             steps.value = nearest  # calls this function again
-        elif self.controls.live.value and self.photograph is not None:
+        elif self.controls.live.value and self.photo is not None:
             self.request(event.client)
 
     def _draw(self, name: str, photograph: Photograph, settings: dict[str, Any]) -> None:

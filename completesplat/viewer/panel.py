@@ -1,6 +1,7 @@
 """Controls of the page: completing a photo, viewing its samples, and saving them."""
 
 import base64
+import math
 from collections.abc import Sequence
 from functools import partial
 from html import escape
@@ -14,6 +15,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from completesplat.diffusion.sampling import Sampler
+from completesplat.errors import CompleteSplatError
 from completesplat.generator import CompleteSplat
 from completesplat.photo.saving import image_bytes
 from completesplat.quantities import SPLATS
@@ -38,6 +40,10 @@ CUT_OUT = (
 )
 FILES = f"an image to complete, or a scene ({', '.join(SPLATS)}); or drop the file anywhere on the page"
 UPLOADS = f"image/*,{','.join(SPLATS)}"
+SQUARE = "square"
+CROPS = ("whole", "center", SQUARE)
+CROP = "what is taken of the photo: all of it, the square in its middle, or a square that you drag on it"
+SHARES = "its left and upper edge in shares of width and height, its side in shares of the shorter side; Enter takes it"
 FROM_THE_FRONT = "front"
 TURN = "turn"
 STOP = "stop"
@@ -67,12 +73,21 @@ def add_completion_controls(gui: viser.GuiApi, model: SceneModel, start: dict[st
     with gui.add_folder("Photograph", order=1):
         if not draws:
             gui.add_markdown("One answer for each image: these weights draw no samples.")
+        crop = gui.add_dropdown("Crop", CROPS, initial_value=start["crop"], hint=CROP)
+        form = gui.add_form(None, visible=False)
+        with form:  # where head.html finds the square's text
+            picture = gui.add_html("")
+            square = gui.add_text("Square", "", hint=SHARES)
         remove = gui.add_checkbox("Cut the object out", start["remove_background"], hint=CUT_OUT)
         samples = gui.add_slider("Samples", 1, MOST_SAMPLES, 1, start["samples"], visible=draws)
     with gui.add_folder("Advanced", order=5, expand_by_default=False):
         return SimpleNamespace(
             draw=draw,
             progress=progress,
+            crop=crop,
+            form=form,
+            picture=picture,
+            square=square,
             remove_background=remove,
             samples=samples,
             **_add_advanced_controls(gui, model, start),
@@ -187,6 +202,37 @@ def comparison(photo: Pixels, scene: Pixels | None, label: str) -> str:
     slider = f'<input type="range" value="50" aria-label="photo on the left, scene on the right" oninput="{UNCOVER}">'
     ends = "<span>photo</span><span>scene</span>"
     return f'<div class="comparison"><div>{below}{above}</div>{slider}<div class="ends">{ends}</div>{text}</div>'
+
+
+def square_on(photo: Pixels, square: Sequence[float]) -> str:
+    """Return HTML with a square [x, y, size] on a whole photo, on which head.html lets another one be dragged."""
+    height, width = photo.shape[:2]
+    x, y, share = square
+    side = share * min(height, width)
+    place = f"left:{x:.2%};top:{y:.2%};width:{side / width:.2%};height:{side / height:.2%}"
+    image = f'<img src="{_source(photo)}" alt="the whole photo" draggable="false">'
+    note = "Drag a square from corner to corner."
+    return f'<div class="crop"><div>{image}<span style="{place}"></span></div><p>{note}</p></div>'
+
+
+def square_of(text: str) -> tuple[float, float, float]:
+    """Return the numbers of a square, typed with or without brackets.
+
+    Raises:
+        CompleteSplatError: they are not three finite numbers.
+    """
+    try:
+        x, y, share = (float(word) for word in text.strip(" []").split(","))
+        if math.isfinite(x + y + share):
+            return x, y, share
+    except ValueError:
+        pass
+    raise CompleteSplatError(f"Square: {text!r} is not x, y, size; give three numbers, such as 0, 0.1, 0.8")
+
+
+def square_text(square: Sequence[float]) -> str:
+    """Return the text of a square, which `square_of` reads."""
+    return ", ".join(f"{value:.3g}" for value in square)
 
 
 def _source(image: Pixels) -> str:

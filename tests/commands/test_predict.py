@@ -22,8 +22,11 @@ def predict(command, pipeline, tmp_path):
         image = image or pipeline.photograph()
         given = [f"image={image}", f"weights={pipeline.weights}", f"out={tmp_path / out}", *FEW, *settings]
         finished = command("predict", *given)
-        assert (finished.status, finished.out.splitlines()[-1]) == (0, str(tmp_path / out)), finished.err
-        return tmp_path / out / image.stem
+        assert finished.status == 0, finished.err
+        folder = tmp_path / out / image.stem
+        assert finished.out.splitlines()[-2:] == [str(tmp_path / out), f"look at {folder / 'sheet.png'}"]
+        assert (folder / "sheet.png").is_file()
+        return folder
 
     return run
 

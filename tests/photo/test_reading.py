@@ -11,6 +11,7 @@ from PIL import Image, ImageCms
 
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.photo import files
+from completesplat.photo.crop import square_within, window_of
 from completesplat.photo.reading import Framing, read_square
 
 SIZE = 16
@@ -182,6 +183,21 @@ def test_a_given_square_is_cut_and_others_are_refused():
     for crop in ([0.8, 0, 1], [-0.1, 0, 0.5], [0, 0.6, 0.5], [0, 0, 0.1], [0, 0, 1.1], [math.nan, 0, 0.5]):
         with pytest.raises(CompleteSplatError, match=r"give \[x,y,size\], in shares of width, height and shorter side"):
             read_square(image, Framing(32), crop=crop)
+
+
+@pytest.mark.parametrize("size", [(64, 64), (203, 64), (47, 160), (8, 23)])
+def test_any_square_is_moved_into_the_photo_and_one_within_stays(size):
+    for square in ((-1, -1, -1), (2, 2, 2), (0.9, 0.1, 0.7), (0.1, 0.9, 0.7), (0, 0, 1), (1, 0, 1)):
+        within = square_within(size, square)
+        left, top, right, lower = window_of(size, within)
+        assert left >= 0
+        assert top >= 0
+        assert right <= size[0]
+        assert lower <= size[1]
+        assert right - left == lower - top >= 8
+    inner = (0.25, 0.125, 0.5)
+    assert square_within((64, 128), inner) == inner
+    assert window_of((128, 64), square_within((128, 64), (0.9, 0.9, 0.5))) == (96, 32, 128, 64)
 
 
 def test_what_is_the_photos_own_is_known_at_each_size_and_the_rest_is_pale():

@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 from support import LIMIT, tiny_generator, waited_for
-from viewer_scenes import BALLS, SETTINGS, balls_sample
+from viewer_scenes import BALLS, START, balls_sample
 
 from completesplat.export.splat import write_splat
 from completesplat.geometry.cameras import Cameras, pinhole
@@ -24,6 +24,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright is no
 from completesplat.viewer.access import show_status, start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
 from completesplat.viewer.page import Page, Saver, write_viewer_page  # noqa: E402
+from completesplat.viewer.panel import square_text  # noqa: E402
 from completesplat.viewer.splat_view import MARGIN, SplatView  # noqa: E402
 from completesplat.viewer.turning import REST  # noqa: E402
 
@@ -34,7 +35,6 @@ pytestmark = [
 ]
 SWIFTSHADER = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 WINDOW = {"width": 700, "height": 360}
-START = SETTINGS | {"samples": 1, "remove_background": False}
 GREY = 128
 
 
@@ -54,7 +54,7 @@ def page(tmp_path_factory):
     view.show([balls_sample()])
     saver = Saver(tmp_path_factory.mktemp("saved"), view, ReferenceRasterizer, 2, 0.5)
     made = Page(server, view, saver, {})
-    made.completion = Completion(made, tiny_generator(), START)
+    made.completion = Completion(made, tiny_generator(), START | {"samples": 1})
     yield made
     made.close()
 
@@ -227,12 +227,42 @@ def test_an_upload_gives_a_sample_and_another_seed_another(tab, page, tmp_path):
     changed(tab, first)
 
 
+def test_a_square_is_dragged_on_the_photo(tab, page, tmp_path):
+    """From its lower right corner to a point further left and higher."""
+    file = tmp_path / "wide.png"
+    Image.effect_noise((128, 64), 80).convert("RGB").save(file)
+    completion = page.completion
+    with tab.expect_file_chooser() as chooser:
+        tab.get_by_role("button", name="Load a file").click()
+    chooser.value.set_files(file)
+    assert waited_for(lambda: page.view.samples[0].settings.get("image") == "wide.png"), "no samples"
+    completion.controls.crop.value = "square"
+    photo = tab.get_by_alt_text("the whole photo")
+    photo.scroll_into_view_if_needed(timeout=1000 * LIMIT)
+    box = photo.bounding_box()
+    tab.mouse.move(box["x"] + box["width"] - 1, box["y"] + box["height"] - 1)
+    tab.mouse.down()
+    tab.mouse.move(box["x"] + box["width"] * 0.75, box["y"] + box["height"] * 0.6, steps=3)
+    tab.mouse.up()
+    assert waited_for(lambda: completion.crop != "whole"), "the square does not arrive"
+    assert completion.crop == pytest.approx((0.75, 0.5, 0.5), abs=0.02)
+    assert waited_for(lambda: completion.photo[1].window[2] - completion.photo[1].window[0] < 34)
+    field = tab.get_by_role("textbox", name="Square")
+    assert waited_for(lambda: field.input_value() == square_text(completion.crop)), "the page does not show it"
+    field.fill("0, 0, 1")
+    field.press("Enter")
+    assert waited_for(lambda: completion.photo[1].window == (0, 0, 64, 64)), "what is typed does not arrive"
+    completion.controls.crop.value = "whole"
+    assert waited_for(lambda: completion.photo[1].window == (0, -32, 128, 96))
+    assert tab.errors == []
+
+
 @pytest.fixture
 def empty(tmp_path):
     server = start_server(0)
     view = SplatView(server, (0.0, -1.0, 0.0))
     made = Page(server, view, Saver(tmp_path / "saved", view, ReferenceRasterizer, 2, 0.5), {})
-    Completion(made, tiny_generator(), START)
+    Completion(made, tiny_generator(), START | {"samples": 1})
     show_status(server, "")
     yield made
     made.close()

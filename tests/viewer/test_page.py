@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 from support import LIMIT, tiny_generator
-from viewer_scenes import SETTINGS, balls_sample
+from viewer_scenes import SETTINGS, START, balls_sample
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import with_screen_space_dilation
@@ -34,6 +34,7 @@ from completesplat.viewer.access import start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
 from completesplat.viewer.page import Page, Saver  # noqa: E402
 from completesplat.viewer.panel import SIDE_BY_SIDE, comparison, sample_tiles  # noqa: E402
+from completesplat.viewer.photo_file import PhotoFile  # noqa: E402
 from completesplat.viewer.splat_view import SplatView  # noqa: E402
 
 
@@ -81,7 +82,7 @@ def page(server, tmp_path, monkeypatch):
 
 @pytest.fixture
 def completion(page, model):
-    return Completion(page, model, SETTINGS | {"remove_background": False})
+    return Completion(page, model, START)
 
 
 def finish(page: Page) -> list:
@@ -205,7 +206,7 @@ def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(comple
     show = completion.page.show
     monkeypatch.setattr(completion.page, "show", lambda samples, text: seen.append(samples[0]) or show(samples, text))
     samples = load(completion.page)
-    for sample, expected in zip(samples, model(completion.photograph[1], **SETTINGS), strict=True):
+    for sample, expected in zip(samples, model(completion.photo[1], **SETTINGS), strict=True):
         assert torch.equal(sample.gaussians.means, expected.means)
         assert torch.equal(sample.gaussians.scales, expected.scales)
     assert "photo.png" in completion.page.view_controls.photo.content
@@ -495,7 +496,7 @@ def test_names_of_images_are_text_in_the_panels_html_and_tiles_without_a_key_cho
 
 def test_an_empty_page_asks_for_a_photo_and_has_nothing_to_draw_save_or_turn(page, model):
     page.show([])
-    made = Completion(page, model, SETTINGS | {"remove_background": False})
+    made = Completion(page, model, START)
     invitation = page.invitation.window
     assert not invitation.closed
     assert made.controls.draw.disabled
@@ -514,7 +515,7 @@ def test_an_empty_page_asks_for_a_photo_and_has_nothing_to_draw_save_or_turn(pag
 
 def test_the_button_of_the_invitation_loads_a_scene_too(page, model, tmp_path):
     page.show([])
-    Completion(page, model, SETTINGS | {"remove_background": False})
+    Completion(page, model, START)
     upload = page.invitation.upload
     write_splat(tmp_path / "a.splat", balls_sample().gaussians)
     upload._impl.value = SimpleNamespace(name="a.splat", content=(tmp_path / "a.splat").read_bytes())
@@ -583,3 +584,79 @@ def test_the_object_is_cut_out_on_request(completion, model, monkeypatch):
     completion.controls.remove_background.value = True
     load(completion.page)
     assert seen == [False, True]
+
+
+def choose_crop(completion: Completion, crop: str) -> None:
+    """Choose a crop, and wait until its samples are drawn."""
+    completion.controls.crop.value = crop
+    finish(completion.page)
+
+
+def take_square(completion: Completion, text: str) -> None:
+    completion.controls.square.value = text
+    completion.controls.form.submit()
+    finish(completion.page)
+
+
+def taken(completion: Completion) -> tuple[int, int, int, int]:
+    """The window of the photo from which the samples on the page were drawn."""
+    return completion.photo[1].window
+
+
+def test_the_middle_or_any_square_of_the_photo_is_drawn_on_request(completion):
+    controls = completion.controls
+    before = load(completion.page, content=png(80, 40))
+    assert taken(completion) == (0, -20, 80, 60)
+    choose_crop(completion, "center")
+    assert taken(completion) == (20, 0, 60, 40)
+    assert "40 x 40 of its 80 x 40 pixels" in completion.page.view_controls.photo.content
+    assert completion.page.view.samples is not before
+    assert not controls.form.visible
+    before = completion.page.view.samples
+    choose_crop(completion, "square")  # only shows one
+    assert completion.page.view.samples is before
+    assert controls.form.visible
+    assert controls.square.value == "0, 0, 1"
+    take_square(completion, "0.5, 0.25, 0.5")
+    assert taken(completion) == (40, 10, 60, 30)
+    assert "left:50.00%;top:25.00%;width:25.00%;height:50.00%" in controls.picture.content
+    take_square(completion, "0.9, 0, 1")
+    assert taken(completion) == (40, 0, 80, 40)
+    assert controls.square.value == "0.5, 0, 1"
+    choose_crop(completion, "whole")
+    assert taken(completion) == (0, -20, 80, 60)
+    assert not controls.form.visible
+
+
+def test_a_square_is_of_one_photo_and_a_middle_of_all(completion):
+    load(completion.page, content=png(80, 40))
+    choose_crop(completion, "square")
+    take_square(completion, "0, 0, 0.5")
+    load(completion.page, content=png(40, 80))
+    assert taken(completion) == (-20, 0, 60, 80)
+    assert completion.controls.crop.value == "whole"
+    choose_crop(completion, "center")
+    load(completion.page, content=png(80, 40))
+    assert taken(completion) == (20, 0, 60, 40)
+
+
+def test_a_square_that_is_no_square_is_refused_and_changes_nothing(completion, monkeypatch):
+    browser = Browser()
+    monkeypatch.setattr(completion.page.server, "get_clients", lambda: {0: browser})
+    load(completion.page, content=png(80, 40))
+    choose_crop(completion, "square")
+    before = completion.page.view.samples
+    take_square(completion, "face")
+    assert "Square: 'face' is not x, y, size" in browser.messages[0]
+    assert completion.page.view.samples is before
+
+
+def test_a_grey_photo_of_sixteen_bits_is_shown_whole():
+    content = io.BytesIO()
+    Image.fromarray(np.linspace(0, 65535, 60 * 20).reshape(20, 60).astype(np.uint16)).save(content, "PNG")
+    whole = PhotoFile("x.png", content.getvalue()).whole(30)
+    assert whole.shape == (10, 30, 3)
+    assert whole[0, 0, 0] < 30
+    assert whole[-1, -1, 2] > 225
+    with pytest.raises(CompleteSplatError, match=r"^x\.png: not an image"):
+        PhotoFile("x.png", b"nothing").whole(30)
