@@ -99,6 +99,8 @@ def fit_detail(
         most += int(PARTS_PER_PIXEL * target.image.shape[-1] * target.image.shape[-2] * 3 / 4)
         scene = gaussians[0]
         chosen = worth_splitting(gaussians, target, rasterizer, background, (most - scene.count) // (len(PLACES) - 1))
+        if not chosen.any():  # fitting would only make large Gaussians grow, which shows from the sides
+            continue
         gaussians = split(scene, chosen, camera[0]).repeated(1)
         rounds = LAST_ROUNDS if target is targets[-1] else ROUNDS
         gaussians = fit_front(gaussians, camera, target.image, rasterizer, rounds, background, target.visible, PACE)

@@ -109,7 +109,7 @@ class BadSteps(Callback):
         pl_module.log(BAD_STEPS, torch.tensor(float(self.total)), batch_size=1)
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
     ) -> None:
         self.batch = batch
 
@@ -322,7 +322,7 @@ class Throughput(Callback):
         self.ended = None
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
     ) -> None:
         self.ended = time.perf_counter()
         if self.started is not None:

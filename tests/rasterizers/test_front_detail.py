@@ -132,9 +132,11 @@ def test_only_what_lacks_detail_is_split_and_the_photo_is_met():
     assert errors[1] < errors[0] / 2
 
 
-def test_a_front_that_is_near_enough_is_left_as_it_is():
-    scene = wall(2, 0.5, 0.999)
-    targets = front_targets(CAMERA, lambda side: torch.full((3, side, side), 0.52), LARGE)
+@pytest.mark.parametrize(("opacity", "grey"), [(0.999, 0.52), (0.2, 0.535)])
+def test_a_front_where_nothing_is_worth_splitting_is_left_as_it_is(opacity, grey):
+    """The second wall lets the background through, so that its own error is less than the image's."""
+    scene = wall(2, 0.5, opacity)
+    targets = front_targets(CAMERA, lambda side: torch.full((3, side, side), grey), LARGE)
     after = fit_detail(scene, CAMERA, targets, RENDER, 0.5)
     expected = seen_larger(scene, CAMERA, targets[-1].camera)
     for name, values in vars(expected).items():
