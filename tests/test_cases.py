@@ -220,14 +220,21 @@ def splat_values(name: str) -> Callable[[Path], list[float]]:
 
 def texture_color(name: str) -> Callable[[Path], list[float]]:
     """Return the mean linear colour of a mesh's first texture."""
+    return lambda folder: mean_texel(CASES / name, CASES)
 
-    def read(folder: Path) -> list[float]:
-        mesh = read_mesh(CASES / name, CASES.resolve())
-        start, width, height = mesh.textures.levels[0, 0]
-        texels = mesh.textures.texels[start : start + 4 * width * height].reshape(-1, 4)
-        return (texels[:, :3].mean(0) / 65535).tolist()
 
-    return read
+def mean_texel(path: Path, root: Path) -> list[float]:
+    mesh = read_mesh(path, root.resolve())
+    start, width, height = mesh.textures.levels[0, 0]
+    texels = mesh.textures.texels[start : start + 4 * width * height].reshape(-1, 4)
+    return (texels[:, :3].mean(0) / 65535).tolist()
+
+
+def texture_in_another_case(folder: Path) -> list[float]:
+    """Return the mean linear colour of a mesh's texture, whose file's name has other letters than the .mtl says."""
+    shutil.copytree(CASES / "mtl_backslash", folder / "mesh")
+    (folder / "mesh/tex/back.png").rename(folder / "mesh/tex/Back.PNG")
+    return mean_texel(folder / "mesh/back.obj", folder)
 
 
 def linear_mean(name: str) -> list[float]:
@@ -250,6 +257,7 @@ RIGHT: dict[str, tuple[Callable[[Path], object], object, float]] = {
     "negative_splat": (lambda folder: splat_values("negative_splat/negscale.splat")(folder)[:9], [0.1] * 9, 1e-6),
     "gso": (texture_color("gso/gso_Mug/meshes/model.obj"), linear_mean(MUG), 1e-4),
     "mtl_backslash": (texture_color("mtl_backslash/back.obj"), linear_mean("mtl_backslash/tex/back.png"), 1e-4),
+    "mtl_case": (texture_in_another_case, linear_mean("mtl_backslash/tex/back.png"), 1e-4),
 }
 
 

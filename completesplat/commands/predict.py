@@ -65,7 +65,7 @@ def run(config: DictConfig, out: Path) -> str:
         logger.warning("left out: %s: %s", counted(len(others), "other file"), first_names(others))
     if config.mask is not None and len(images) > 1:
         raise CompleteSplatError("mask=FILE belongs to one image; box=[x0,y0,x1,y1] goes for several")
-    share_of(images, config.shard, config.shards)  # refuses a shard that does not exist
+    shard = share_of(images, config.shard, config.shards)
     if config.cameras is not None:
         predict_from_views(config, images, outputs, out)
         return sheet_line(out, images[:1])
@@ -83,7 +83,7 @@ def run(config: DictConfig, out: Path) -> str:
     if failed:
         text = f"{len(failed)} of {count + len(failed)} images failed ({', '.join(failed)})"
         raise CompleteSplatError(f"{text}; the others are in {out}" if count else text)
-    return sheet_line(out, images)
+    return sheet_line(out, shard)
 
 
 def sheet_line(out: Path, images: Sequence[Path]) -> str:
