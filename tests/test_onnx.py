@@ -13,7 +13,7 @@ import torch
 from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, HeunDiscreteScheduler
 from PIL import Image
 from published_weights import write_published
-from support import tiny_generator
+from support import SMALL, tiny_generator
 
 from completesplat.diffusion.sampling import Sampler
 from completesplat.diffusion.step_table import step_table
@@ -212,3 +212,12 @@ def test_shipped_weights_are_the_same_in_onnx(name, onnx_predict, photo, tmp_pat
     model = CompleteSplat.from_pretrained(name)
     model.to_onnx(tmp_path / "onnx", "float16" if name == "general" else "float32")
     assert_same_scenes(onnx_predict, tmp_path / "onnx", model, photo)
+
+
+@pytest.mark.slow
+def test_a_run_with_an_encoder_of_ones_own_is_the_same_in_onnx(command, onnx_predict, photo, toy_root, tmp_path):
+    command.succeeds("new", "encoder", "wide")
+    own = ["autoreconstructor.encoder._target_=wide.Wide", f"data.root={toy_root}", *SMALL, "test=false"]
+    command.succeeds("fit", "experiment=toy_var", *own, "out=RUN")
+    command.succeeds("export", "weights=RUN", "out=ONNX")
+    assert_same_scenes(onnx_predict, tmp_path / "ONNX", CompleteSplat.from_pretrained("RUN"), photo)
