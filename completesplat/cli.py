@@ -4,7 +4,7 @@ import io
 import os
 import sys
 
-VERBS = ("data", "plan", "fit", "test", "predict", "view", "report", "new", "bench", "doctor")
+VERBS = ("data", "plan", "fit", "test", "predict", "view", "export", "report", "new", "bench", "doctor")
 
 
 def main() -> None:

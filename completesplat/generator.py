@@ -203,10 +203,12 @@ class CompleteSplat(SceneModel):
 
     def _decode_part(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         latent = inputs["latent"]
-        count = len(latent)
-        features = [value for name, value in inputs.items() if name.startswith("feature")]
+        count = latent.shape[0]  # `len` would be one number for every call of the graph
+        seen = [value for name, value in inputs.items() if name.startswith("feature")]
+        features = [value.expand(count, *value.shape[1:]) for value in seen]
         unscaled = latent * self.latent_std + self.latent_mean
-        splatter_image = self.autoreconstructor.reconstructor(unscaled, features, inputs["skip_weight"])
+        weight = inputs["skip_weight"].expand(count)
+        splatter_image = self.autoreconstructor.reconstructor(unscaled, features, weight)
         intrinsics = inputs["intrinsics"].expand(count, 3, 3)
         return self.placed(splatter_image, intrinsics, inputs["depth_range"].expand(count, 2))
 

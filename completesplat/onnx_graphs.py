@@ -19,6 +19,8 @@ from completesplat.installation import install_command
 Precision = Literal["float32", "float16"]
 OPSET = 18
 PIPELINE_FILE = "pipeline.json"
+MOST_SAMPLES = 63
+"""Samples that a graph takes at a time; diffusers' upsampling works otherwise with more."""
 SMALLEST_HALVED = 64
 """Values of a tensor from which on it is stored in float16."""
 
@@ -32,7 +34,8 @@ class Graph:
         owner: module whose weights it uses.
         function: it takes and returns tensors by their names.
         inputs: examples. Those of `per_sample` have two samples.
-        per_sample: names of the inputs whose first axis counts samples; in the graph it has any length.
+        per_sample: names of the inputs whose first axis counts samples; in the graph it has any length up to
+            `MOST_SAMPLES`.
     """
 
     name: str
@@ -94,7 +97,7 @@ def _exported(graph: Graph) -> Any:
     except ImportError as error:
         raise CompleteSplatError(f"ONNX files need further packages: {install_command('onnx')}") from error
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses packages that no graph here needs
-    samples = torch.export.Dim("samples")
+    samples = torch.export.Dim("samples", max=MOST_SAMPLES)
     shapes = {name: {0: samples} if name in graph.per_sample else None for name in graph.inputs}
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch's exporter about itself
@@ -115,6 +118,10 @@ def _exported(graph: Graph) -> Any:
             reason = str(error.__cause__ or error).strip().splitlines()[0]
             raise CompleteSplatError(f"{graph.name}: torch cannot export it to ONNX: {reason}") from error
     assert program is not None
+    for value in program.model_proto.graph.input:
+        if value.name in graph.per_sample and not value.type.tensor_type.shape.dim[0].dim_param:
+            reason = "its code takes the number of samples for a constant (`len(x)` in place of `x.shape[0]`?)"
+            raise CompleteSplatError(f"{graph.name}: {reason}")
     return program.model_proto
 
 

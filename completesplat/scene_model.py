@@ -345,7 +345,7 @@ class SceneModel(nn.Module):
         write_sums(folder)
 
     def description(self) -> dict[str, Any]:
-        """Return what a program needs beside the networks: sizes, cameras, units (see `conf/export_task/onnx.yaml`)."""
+        """Return what a program needs beside the networks: sizes, cameras, units (`export/README.md` explains them)."""
         framing = self.framing
         training = framing.training or {}
         return {

@@ -39,6 +39,8 @@ def check_inputs(verb: str, config: DictConfig) -> None:
     # `auto` chooses weights when the image is read, and names of published weights (with a colon) are checked later.
     if verb in ("predict", "view") and config.weights != AUTO and ":" not in config.weights:
         check_name(config.weights)
+    if verb == "export":
+        check_name(config.weights)
     if verb == "test":
         check_one_model(config.ckpt, config.weights, config.scenes)
         if config.ckpt is not None and not os.path.exists(config.ckpt):

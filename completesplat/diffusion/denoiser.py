@@ -71,7 +71,7 @@ class ConditionalUNet(nn.Module):
     def forward(self, noisy_latent: Latents, timestep: Int[Tensor, " batch"], conditioning: Conditioning) -> Latents:
         """Predict the noise in h_t (paper, Eq. 3), or another target of training (`objective.target`), in float32."""
         inputs = torch.cat([conditioning, noisy_latent], dim=1)
-        return self.network(inputs, timestep, **self.context_of(len(inputs))).sample.float()
+        return self.network(inputs, timestep, **self.context_of(inputs.shape[0])).sample.float()
 
     def context_of(self, batch: int) -> dict[str, Tensor]:
         return {}

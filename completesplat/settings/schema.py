@@ -109,6 +109,14 @@ class ViewSettings(SceneSettings):
     port: Annotated[int, Range(1, 65535)]
 
 
+class ExportSettings(TypedDict):
+    """Settings of `completesplat export`."""
+
+    weights: str
+    precision: Literal["float32", "float16"]
+    trust: bool
+
+
 class ModelSettings(TypedDict):
     """Settings of `completesplat test` and of reports on samples that choose the model."""
 
@@ -137,6 +145,7 @@ VERBS: dict[str, type] = {
     "plan": PlanSettings,
     "predict": PredictSettings,
     "view": ViewSettings,
+    "export": ExportSettings,
     "test": TestSettings,
 }
 """Settings of verbs; the settings of a task are the arguments of its function."""

@@ -68,8 +68,9 @@ class ResidualBlock(nn.Module):
     def _attention(self, x: Tensor) -> Tensor:
         # Query, key and value of a channel are next to each other.
         parts = self.qkv(self.norm2(x)).flatten(2).unflatten(1, (-1, 3)).unbind(2)
-        attended = functional.scaled_dot_product_attention(*(part.mT for part in parts))
-        return attended.mT.reshape(x.shape)
+        # One head has an axis of its own, which the export to ONNX needs.
+        attended = functional.scaled_dot_product_attention(*(part.mT[:, None] for part in parts))
+        return attended[:, 0].mT.reshape(x.shape)
 
 
 class SongUNet(nn.Module):
