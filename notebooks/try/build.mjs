@@ -17,6 +17,7 @@ const MODULES = path.join(SOURCES, "node_modules");
 const PACKAGES = ["onnxruntime-web", "@sparkjsdev/spark", "three"];
 const RUNTIME = "ort-wasm-simd-threaded";
 const COPIED = ["index.html", "style.css", "icon.svg"];
+const KNOWN_LICENCES = /CC0|CC BY(-[A-Z]{2})* \d\.\d|Apache License|MIT License/;
 const folder = process.argv[2];
 
 /** Leaves onnxruntime's module as a file of its own, because its threads load it again. */
@@ -42,7 +43,7 @@ await writeFile(path.join(folder, "licences.txt"), await licences());
 await bundle(["main.js", "worker.js"], {});
 const heavy = await listed(["weights", "ort"], /\.(onnx|json|wasm)$/);
 const examples = await listed(["examples"], /\.jpg$/);
-const licence = (await text("weights/LICENSE.txt")).split("\n")[0].trim();
+const [licence] = (await text("weights/LICENSE.txt")).match(KNOWN_LICENCES) ?? [""];
 await writeFile(path.join(folder, "files.json"), JSON.stringify({ heavy, examples, licence }, null, 1));
 const shell = [
   ...["./", "files.json", "licences.txt", "main.js", "worker.js", "icon.svg", "style.css", "weights/LICENSE.txt"],

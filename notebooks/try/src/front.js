@@ -1,6 +1,6 @@
 /** The front of a scene in the photo's colours. */
 
-import { composited, contributions } from "./raster.js";
+import { contributions } from "./raster.js";
 
 const ENOUGH = 1e-3; // mean squared error (30 dB) at which fitting ends: more of it makes the sides of a scene worse
 const DAMPING = 0.02; // squared weights that hold a colour where it was
@@ -36,12 +36,20 @@ export function fitColors(gaussians, camera, image, own, rounds, background) {
 }
 
 /** Return what an image lacks, [pixel, channel], and 0 where it is not to be fitted. */
-function missing(seen, colors, image, own, background) {
-  const drawn = composited(seen, (place, channel) => colors[3 * seen.gaussians[place] + channel], 3, background);
-  return drawn.map((value, index) => {
+function missing({ gaussians, starts, pixels, weights, open }, colors, image, own, background) {
+  const residuals = new Float32Array(3 * open.length);
+  for (let index = 0; index < residuals.length; index++) {
     const pixel = Math.floor(index / 3);
-    return own[pixel] * (image[(index % 3) * own.length + pixel] - value);
+    residuals[index] = image[(index % 3) * open.length + pixel] - open[pixel] * background;
+  }
+  gaussians.forEach((number, place) => {
+    for (let entry = starts[place]; entry < starts[place + 1]; entry++) {
+      for (let channel = 0; channel < 3; channel++) {
+        residuals[3 * pixels[entry] + channel] -= weights[entry] * colors[3 * number + channel];
+      }
+    }
   });
+  return residuals.map((value, index) => value * own[Math.floor(index / 3)]);
 }
 
 /** Set the colour of one Gaussian, and take the change from the residuals. */

@@ -54,8 +54,8 @@ function wait(words) {
 async function open(file) {
   byId("error").hidden = true;
   page.run += 1;
-  page.file = file;
   page.photo = null;
+  page.input = null;
   say("The photo is read.");
   worker.postMessage({ task: "open", file, run: page.run });
 }
@@ -226,7 +226,7 @@ async function begin() {
   }
   const { heavy, examples, licence } = await response.json();
   page.megabytes = (heavy.reduce((sum, { bytes }) => sum + bytes, 0) / 1e6).toFixed(1);
-  byId("licence").textContent = licence;
+  byId("licence").textContent = licence ? `${licence}, ` : "";
   showExamples(examples, open, fail);
   worker.postMessage({ task: "load", files: heavy });
 }

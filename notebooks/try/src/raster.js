@@ -17,7 +17,6 @@ const FRUSTUM_MARGIN = 0.3;
  *
  * @typedef {object} Contributions what each Gaussian adds to each pixel, nearest Gaussians first
  * @property {Int32Array} gaussians numbers of the Gaussians that are seen
- * @property {Float32Array} depths of these
  * @property {Int32Array} starts of their entries, and the end of the last
  * @property {Int32Array} pixels of the entries
  * @property {Float32Array} weights of the entries
@@ -40,7 +39,7 @@ export function photoCamera({ fovDegrees, axis }, size) {
   };
 }
 
-/** Entries whose number is not known before. */
+/** Numbers of pixels with weights, whose count is not known before. */
 class Entries {
   constructor(capacity) {
     this.count = 0;
@@ -48,22 +47,45 @@ class Entries {
     this.weights = new Float32Array(capacity);
   }
 
-  push(pixel, weight) {
-    if (this.count === this.pixels.length) {
-      this.grow();
+  /** @param {Entries} others */
+  append(others) {
+    if (this.count + others.count > this.pixels.length) {
+      const { pixels, weights } = this;
+      this.pixels = new Int32Array(2 * pixels.length + others.count);
+      this.weights = new Float32Array(2 * pixels.length + others.count);
+      this.pixels.set(pixels);
+      this.weights.set(weights);
     }
-    this.pixels[this.count] = pixel;
-    this.weights[this.count] = weight;
-    this.count += 1;
+    this.pixels.set(others.pixels.subarray(0, others.count), this.count);
+    this.weights.set(others.weights.subarray(0, others.count), this.count);
+    this.count += others.count;
   }
+}
 
-  grow() {
-    const { pixels, weights } = this;
-    this.pixels = new Int32Array(2 * pixels.length);
-    this.weights = new Float32Array(2 * weights.length);
-    this.pixels.set(pixels);
-    this.weights.set(weights);
-  }
+/**
+ * Call a function with what each Gaussian adds to the pixels of an image, nearest first.
+ * @param {import("./pipeline.js").Gaussians} gaussians
+ * @param {Camera} camera
+ * @param {(number: number, depth: number, entries: Entries) => void} take it copies what it keeps of the entries
+ * @returns {Float32Array} what is left of each pixel for the background
+ */
+export function eachSplat(gaussians, camera, take) {
+  const { size } = camera;
+  const { order, depths } = byDepth(gaussians, camera);
+  const open = new Float32Array(size * size).fill(1);
+  const stopped = new Uint8Array(size * size);
+  const entries = new Entries(size * size);
+  order.forEach((number, place) => {
+    const splat = projected(gaussians, camera, number);
+    entries.count = 0;
+    if (splat) {
+      addEntries(splat, size, open, stopped, entries);
+    }
+    if (entries.count > 0) {
+      take(number, depths[place], entries);
+    }
+  });
+  return open;
 }
 
 /**
@@ -73,26 +95,19 @@ class Entries {
  * @returns {Contributions}
  */
 export function contributions(gaussians, camera) {
-  const { size } = camera;
-  const { order, depths } = byDepth(gaussians, camera);
-  const starts = new Int32Array(order.length + 1);
-  const open = new Float32Array(size * size).fill(1);
-  const stopped = new Uint8Array(size * size);
-  const entries = new Entries(32 * order.length + 1);
-  order.forEach((number, place) => {
-    starts[place] = entries.count;
-    const splat = projected(gaussians, camera, number);
-    if (splat) {
-      addEntries(splat, size, open, stopped, entries);
-    }
+  const all = new Entries(64 * gaussians.opacities.length);
+  const numbers = [];
+  const starts = [0];
+  const open = eachSplat(gaussians, camera, (number, _, entries) => {
+    all.append(entries);
+    numbers.push(number);
+    starts.push(all.count);
   });
-  starts[order.length] = entries.count;
   return {
-    gaussians: order,
-    depths: depths,
-    starts,
-    pixels: entries.pixels.subarray(0, entries.count),
-    weights: entries.weights.subarray(0, entries.count),
+    gaussians: Int32Array.from(numbers),
+    starts: Int32Array.from(starts),
+    pixels: all.pixels.subarray(0, all.count),
+    weights: all.weights.subarray(0, all.count),
     open,
   };
 }
@@ -100,11 +115,15 @@ export function contributions(gaussians, camera) {
 /** Return the numbers of the Gaussians in front of a camera, nearest first, and their depths. */
 function byDepth({ means, opacities }, { rotation, translation }) {
   const all = new Float32Array(opacities.length);
+  const seen = [];
   for (let i = 0; i < all.length; i++) {
-    const [x, y, z] = means.subarray(3 * i, 3 * i + 3);
-    all[i] = rotation[6] * x + rotation[7] * y + rotation[8] * z + translation[2];
+    const at = 3 * i;
+    const depth = rotation[6] * means[at] + rotation[7] * means[at + 1] + rotation[8] * means[at + 2] + translation[2];
+    all[i] = depth;
+    if (depth > NEAR && opacities[i] >= MIN_ALPHA) {
+      seen.push(i);
+    }
   }
-  const seen = [...all.keys()].filter((i) => all[i] > NEAR && opacities[i] >= MIN_ALPHA);
   const order = Int32Array.from(seen).sort((i, j) => all[i] - all[j]);
   return { order, depths: Float32Array.from(order, (i) => all[i]) };
 }
@@ -200,52 +219,45 @@ function addEntries({ x, y, xx, xy, yy, height, end, opacity }, size, open, stop
         stopped[pixel] = 1;
         continue;
       }
-      entries.push(pixel, open[pixel] * alpha);
+      entries.pixels[entries.count] = pixel;
+      entries.weights[entries.count] = open[pixel] * alpha;
+      entries.count += 1;
       open[pixel] = behind;
     }
   }
 }
 
 /**
- * Return an image of values of the Gaussians, [pixel, channel], over a background.
- * @param {Contributions} seen
- * @param {(place: number, channel: number) => number} value of the Gaussian at a place in the order
- * @param {number} channels
- * @param {number} background
- * @returns {Float32Array}
- */
-export function composited({ gaussians, starts, pixels, weights, open }, value, channels, background) {
-  const image = new Float32Array(open.length * channels);
-  for (let channel = 0; channel < channels; channel++) {
-    for (let pixel = 0; pixel < open.length; pixel++) {
-      image[pixel * channels + channel] = open[pixel] * background;
-    }
-    for (let place = 0; place < gaussians.length; place++) {
-      const own = value(place, channel);
-      for (let entry = starts[place]; entry < starts[place + 1]; entry++) {
-        image[pixels[entry] * channels + channel] += weights[entry] * own;
-      }
-    }
-  }
-  return image;
-}
-
-/**
- * Return an image of Gaussians in bytes (RGBA), opaque over a background.
+ * Return an image of Gaussians, [pixel, 3].
  * @param {import("./pipeline.js").Gaussians} gaussians
  * @param {Camera} camera
  * @param {number} background grey value
+ * @returns {Float32Array}
+ */
+export function rendered(gaussians, camera, background) {
+  const { colors } = gaussians;
+  const image = new Float32Array(3 * camera.size * camera.size);
+  const open = eachSplat(gaussians, camera, (number, _, { count, pixels, weights }) => {
+    const [red, green, blue] = [colors[3 * number], colors[3 * number + 1], colors[3 * number + 2]];
+    for (let entry = 0; entry < count; entry++) {
+      const at = 3 * pixels[entry];
+      image[at] += weights[entry] * red;
+      image[at + 1] += weights[entry] * green;
+      image[at + 2] += weights[entry] * blue;
+    }
+  });
+  return image.map((value, index) => value + open[Math.floor(index / 3)] * background);
+}
+
+/**
+ * Return an image of numbers from 0 to 1 as opaque bytes (RGBA).
+ * @param {Float32Array} image [pixel, 3]
  * @returns {Uint8ClampedArray}
  */
-export function drawn(gaussians, camera, background) {
-  const seen = contributions(gaussians, camera);
-  const { colors } = gaussians;
-  const image = composited(seen, (place, channel) => colors[3 * seen.gaussians[place] + channel], 3, background);
-  const bytes = new Uint8ClampedArray(4 * seen.open.length).fill(255);
-  for (let pixel = 0; pixel < seen.open.length; pixel++) {
-    for (let channel = 0; channel < 3; channel++) {
-      bytes[4 * pixel + channel] = 255 * image[3 * pixel + channel];
-    }
+export function bytesOf(image) {
+  const bytes = new Uint8ClampedArray((4 * image.length) / 3).fill(255);
+  for (let index = 0; index < image.length; index++) {
+    bytes[index + Math.floor(index / 3)] = 255 * image[index];
   }
   return bytes;
 }

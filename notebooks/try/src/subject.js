@@ -1,6 +1,6 @@
 /** The object that a photo is of: the middle that a scene turns around (the rules of `export/subject.py`). */
 
-import { composited, contributions, photoCamera } from "./raster.js";
+import { eachSplat, photoCamera } from "./raster.js";
 
 const SIDE = 48; // pixels of the image in which an object is sought
 const WIDTH = 0.25; // standard deviation of the kernel, in halves of the image's width at its place
@@ -52,9 +52,13 @@ export function subjectOf(gaussians, photo) {
 
 /** @returns {Seen[]} */
 function frontOf(gaussians, camera, [left, top, right, bottom]) {
-  const seen = contributions(gaussians, camera);
-  const sums = composited(seen, (place) => seen.depths[place], 1, 0);
-  const surface = sums.map((sum, pixel) => (seen.open[pixel] < 0.5 ? sum / (1 - seen.open[pixel]) : 0));
+  const sums = new Float32Array(SIDE * SIDE);
+  const open = eachSplat(gaussians, camera, (_, depth, { count, pixels, weights }) => {
+    for (let entry = 0; entry < count; entry++) {
+      sums[pixels[entry]] += weights[entry] * depth;
+    }
+  });
+  const surface = sums.map((sum, pixel) => (open[pixel] < 0.5 ? sum / (1 - open[pixel]) : 0));
   const pixels = [];
   for (let row = 0; row < SIDE; row++) {
     const depths = surface.subarray(row * SIDE, (row + 1) * SIDE);
@@ -64,7 +68,7 @@ function frontOf(gaussians, camera, [left, top, right, bottom]) {
       const isOwn = x > left * SIDE && x < right * SIDE && y > top * SIDE && y < bottom * SIDE;
       if (depth > 0 && isOwn) {
         const ray = [(x - camera.principal[0]) / camera.focal, (y - camera.principal[1]) / camera.focal, 1];
-        const alpha = 1 - seen.open[row * SIDE + column];
+        const alpha = 1 - open[row * SIDE + column];
         const weight = alpha * (typical / depth) ** STANDING_OUT * depth ** -NEARNESS;
         pixels.push({ ray, point: ray.map((value) => value * depth), weight });
       }
@@ -123,5 +127,5 @@ function quantile(values, share) {
 }
 
 function distance(a, b) {
-  return Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
+  return Math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2); // hypot is slow
 }

@@ -1,6 +1,6 @@
 /** Tiles of the samples: steps while a sample forms, then small images of it turning. */
 
-const FRAME_MS = 130;
+const FRAME_MS = 190;
 
 /** One tile. */
 class Tile {

@@ -5,14 +5,14 @@ import { fitColors } from "./front.js";
 import { cameraAt, viewOf } from "./orbit.js";
 import { ownAt, readPhoto } from "./photo.js";
 import { Pipeline } from "./pipeline.js";
-import { drawn, photoCamera } from "./raster.js";
+import { bytesOf, photoCamera, rendered } from "./raster.js";
 import { subjectOf } from "./subject.js";
 import { Downloads } from "./weights.js";
 
 const BEHIND = 0.5; // grey value behind scenes, unless the weights have a background
 const ROUNDS = 40; // of fitting
-const FRAMES = 24; // small images of a scene in one turn
-const FRAME_SIZE = 112; // pixels
+const FRAMES = 16; // small images of a scene in one turn
+const FRAME_SIZE = 96; // pixels
 
 /** @type {Promise<Pipeline> | null} */
 let loading = null;
@@ -123,8 +123,8 @@ function fitted(gaussians, settings) {
 function postFrame({ sample, gaussians, subject }, frame, number, settings) {
   const turn = { yaw: (2 * Math.PI * frame) / FRAMES, pitch: 0, zoom: 1, look: 1 };
   const view = viewOf(turn, subject, settings.up, photo.fovDegrees);
-  const pixels = drawn(gaussians, cameraAt(view, photo.fovDegrees, FRAME_SIZE), settings.background ?? BEHIND);
-  const image = new ImageData(pixels, FRAME_SIZE, FRAME_SIZE);
+  const camera = cameraAt(view, photo.fovDegrees, FRAME_SIZE);
+  const image = new ImageData(bytesOf(rendered(gaussians, camera, settings.background ?? BEHIND)), FRAME_SIZE);
   self.postMessage({ kind: "frame", run: number, sample, frame, frames: FRAMES, image });
 }
 
