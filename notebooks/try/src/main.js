@@ -61,8 +61,8 @@ async function open(file) {
 }
 
 /** Show a photo that the worker has read, and draw its samples. */
-function showPhoto({ preview, input, fovDegrees, fovIsRecorded, photoSize }) {
-  page.photo = { fovDegrees, up: page.settings.up, fitSize: page.settings.image_size };
+function showPhoto({ preview, input, sizes, fovDegrees, fovIsRecorded, photoSize }) {
+  page.photo = { fovDegrees, up: page.settings.up, fitSize: sizes[FITS ? sizes.length - 1 : 0] };
   page.input = input;
   byId("empty").hidden = true;
   byId("result").hidden = false;

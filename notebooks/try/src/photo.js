@@ -36,10 +36,11 @@ const OPAQUE_KINDS = ["image/jpeg"];
  * Read a photo.
  * @param {Blob} file
  * @param {object} settings `pipeline.json`
- * @param {number[]} sizes of the images; those above the photo's own size are left out, but for the first
+ * @param {number} size of the network's image
+ * @param {number} detail size of a second image, if the photo has so many pixels
  * @returns {Promise<Photo>}
  */
-export async function readPhoto(file, settings, sizes) {
+export async function readPhoto(file, settings, size, detail) {
   const header = await checkedHeader(file);
   const bitmap = await decoded(file);
   try {
@@ -48,9 +49,9 @@ export async function readPhoto(file, settings, sizes) {
     const object = OPAQUE_KINDS.includes(file.type) ? null : opaqueBox(bitmap);
     const window = object ? objectWindow(bitmap, object, settings) : wholeWindow(bitmap);
     const part = object ? window : within(window, bitmap);
-    const largest = Math.max(window.width, sizes[0]);
+    const sizes = new Set([size, Math.max(size, Math.min(detail, window.width))]);
     return {
-      images: resized(bitmap, window, part, background, sizes.filter((size) => size <= largest)),
+      images: resized(bitmap, window, part, background, [...sizes]),
       ...fieldOfView(header, bitmap, window, object, settings),
       part: shares(part, window),
       photoSize: [bitmap.width, bitmap.height],

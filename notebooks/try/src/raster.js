@@ -1,11 +1,12 @@
 /** A rasterizer on the CPU, with the rules of `completesplat/rasterizers` (EWA splatting, front to back). */
 
-const BLUR = 0.3; // px^2, added to the diagonal of a projected covariance
+export const BLUR = 0.3; // px^2, added to the diagonal of a projected covariance
 const NEAR = 0.01;
 const MAX_ALPHA = 0.999;
 const MIN_ALPHA = 1 / 255;
 const MIN_TRANSMITTANCE = 1e-4;
 const FRUSTUM_MARGIN = 0.3;
+const SMALLEST_KEPT = 6e-3; // weight of a Gaussian in a pixel
 
 /**
  * @typedef {object} Camera
@@ -20,7 +21,7 @@ const FRUSTUM_MARGIN = 0.3;
  * @property {Int32Array} starts of their entries, and the end of the last
  * @property {Int32Array} pixels of the entries
  * @property {Float32Array} weights of the entries
- * @property {Float32Array} open what is left of each pixel for the background
+ * @property {Float32Array} image [pixel, 3], of all weights
  */
 
 /**
@@ -47,18 +48,27 @@ class Entries {
     this.weights = new Float32Array(capacity);
   }
 
-  /** @param {Entries} others */
-  append(others) {
-    if (this.count + others.count > this.pixels.length) {
-      const { pixels, weights } = this;
-      this.pixels = new Int32Array(2 * pixels.length + others.count);
-      this.weights = new Float32Array(2 * pixels.length + others.count);
+  /** Make room for as many entries more. */
+  reserve(more) {
+    const { pixels, weights } = this;
+    if (this.count + more > pixels.length) {
+      this.pixels = new Int32Array(2 * pixels.length + more);
+      this.weights = new Float32Array(2 * pixels.length + more);
       this.pixels.set(pixels);
       this.weights.set(weights);
     }
-    this.pixels.set(others.pixels.subarray(0, others.count), this.count);
-    this.weights.set(others.weights.subarray(0, others.count), this.count);
-    this.count += others.count;
+  }
+
+  /** Add those of other entries that are not tiny. */
+  append(others) {
+    this.reserve(others.count);
+    for (let entry = 0; entry < others.count; entry++) {
+      if (others.weights[entry] > SMALLEST_KEPT) {
+        this.pixels[this.count] = others.pixels[entry];
+        this.weights[this.count] = others.weights[entry];
+        this.count += 1;
+      }
+    }
   }
 }
 
@@ -89,16 +99,17 @@ export function eachSplat(gaussians, camera, take) {
 }
 
 /**
- * Return what each Gaussian adds to each pixel of an image.
+ * Return an image of Gaussians, and what each of them adds to each pixel, without tiny weights.
  * @param {import("./pipeline.js").Gaussians} gaussians
  * @param {Camera} camera
+ * @param {number} background grey value
  * @returns {Contributions}
  */
-export function contributions(gaussians, camera) {
+export function contributions(gaussians, camera, background) {
   const all = new Entries(64 * gaussians.opacities.length);
   const numbers = [];
   const starts = [0];
-  const open = eachSplat(gaussians, camera, (number, _, entries) => {
+  const image = rendered(gaussians, camera, background, (number, entries) => {
     all.append(entries);
     numbers.push(number);
     starts.push(all.count);
@@ -106,9 +117,9 @@ export function contributions(gaussians, camera) {
   return {
     gaussians: Int32Array.from(numbers),
     starts: Int32Array.from(starts),
-    pixels: all.pixels.subarray(0, all.count),
-    weights: all.weights.subarray(0, all.count),
-    open,
+    pixels: all.pixels,
+    weights: all.weights,
+    image,
   };
 }
 
@@ -178,7 +189,7 @@ function clampedSlope(slope, focal, principal, size) {
 }
 
 /** Return the rotation matrix, by rows, of a quaternion of any length. */
-function unitMatrix(quaternions, number) {
+export function unitMatrix(quaternions, number) {
   const [w0, x0, y0, z0] = quaternions.subarray(4 * number, 4 * number + 4);
   const length = Math.hypot(w0, x0, y0, z0);
   const [w, x, y, z] = length > 1e-12 ? [w0 / length, x0 / length, y0 / length, z0 / length] : [1, 0, 0, 0];
@@ -232,12 +243,14 @@ function addEntries({ x, y, xx, xy, yy, height, end, opacity }, size, open, stop
  * @param {import("./pipeline.js").Gaussians} gaussians
  * @param {Camera} camera
  * @param {number} background grey value
+ * @param {(number: number, entries: Entries) => void} [take] called with the entries of each
  * @returns {Float32Array}
  */
-export function rendered(gaussians, camera, background) {
+export function rendered(gaussians, camera, background, take = () => {}) {
   const { colors } = gaussians;
   const image = new Float32Array(3 * camera.size * camera.size);
-  const open = eachSplat(gaussians, camera, (number, _, { count, pixels, weights }) => {
+  const open = eachSplat(gaussians, camera, (number, _, entries) => {
+    const { count, pixels, weights } = entries;
     const [red, green, blue] = [colors[3 * number], colors[3 * number + 1], colors[3 * number + 2]];
     for (let entry = 0; entry < count; entry++) {
       const at = 3 * pixels[entry];
@@ -245,6 +258,7 @@ export function rendered(gaussians, camera, background) {
       image[at + 1] += weights[entry] * green;
       image[at + 2] += weights[entry] * blue;
     }
+    take(number, entries);
   });
   return image.map((value, index) => value + open[Math.floor(index / 3)] * background);
 }

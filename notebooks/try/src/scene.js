@@ -9,11 +9,12 @@ const BLUR = 0.3; // px^2 that the rasterizer of the fit adds to projected covar
 const SPEED = (12 * Math.PI) / 180; // a second
 const REST = 1.2; // seconds in which a new scene is seen from the front
 const GLIDE = 1.2; // seconds from the photo's view to the orbit's
-const SLOW = 0.4; // seconds for an image, from which on turning stops
+const SLOW = 0.4; // seconds for an image, from which on images become smaller, and turning stops
 const STEP = Math.PI / 24; // of an arrow key
 const MOST_PITCH = 1.2;
 const ZOOMS = [0.35, 2.5];
 const MOST_PIXEL_RATIO = 2;
+const LEAST_SCALE = 0.25;
 
 /** View of one scene in a canvas. */
 export class SceneView {
@@ -42,6 +43,7 @@ export class SceneView {
     this.isTurning = false;
     this.isRequested = false;
     this.slowImages = 0;
+    this.scale = 1; // of the image's resolution, less without a graphics card
     this.pointers = new Map();
     this.listen();
     new ResizeObserver(() => this.request()).observe(canvas);
@@ -119,10 +121,13 @@ export class SceneView {
     return splats;
   }
 
+  pixelRatio() {
+    return Math.min(devicePixelRatio, MOST_PIXEL_RATIO) * this.scale;
+  }
+
   /** Side of the square in which the photo's view appears, in pixels. */
   side() {
-    const ratio = Math.min(devicePixelRatio, MOST_PIXEL_RATIO);
-    return Math.max(Math.min(this.canvas.clientWidth, this.canvas.clientHeight) * ratio, 1);
+    return Math.max(Math.min(this.canvas.clientWidth, this.canvas.clientHeight) * this.pixelRatio(), 1);
   }
 
   /** Draw when the browser next does. */
@@ -146,12 +151,21 @@ export class SceneView {
     this.place();
     this.renderer.render(this.scene, this.camera);
     if (this.goal || this.isTurning) {
-      this.slowImages = seconds >= SLOW ? this.slowImages + 1 : 0;
-      this.isTurning &&= this.slowImages < 3;
+      this.checkPace(seconds);
       this.request();
     } else {
       this.last = undefined;
     }
+  }
+
+  /** Draw fewer pixels where images are slow, and stop turning where that does not help. */
+  checkPace(seconds) {
+    this.slowImages = seconds >= SLOW ? this.slowImages + 1 : 0;
+    if (this.slowImages === 2 && this.scale > LEAST_SCALE) {
+      this.scale /= 2;
+      this.slowImages = 0;
+    }
+    this.isTurning &&= this.slowImages < 4;
   }
 
   /** Move the camera on. */
@@ -183,8 +197,8 @@ export class SceneView {
 
   fitToCanvas() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
-    const ratio = Math.min(devicePixelRatio, MOST_PIXEL_RATIO);
-    if (this.canvas.width !== Math.round(width * ratio) || this.canvas.height !== Math.round(height * ratio)) {
+    const ratio = this.pixelRatio();
+    if (this.canvas.width !== Math.floor(width * ratio) || this.canvas.height !== Math.floor(height * ratio)) {
       this.renderer.setPixelRatio(ratio);
       this.renderer.setSize(width, height, false);
     }

@@ -1,7 +1,7 @@
 /** All heavy work: networks, photo, fitting, and the small images of turning scenes. */
 
 import { PageError, wordsFor } from "./errors.js";
-import { fitColors } from "./front.js";
+import { fitFront } from "./front.js";
 import { cameraAt, viewOf } from "./orbit.js";
 import { ownAt, readPhoto } from "./photo.js";
 import { Pipeline } from "./pipeline.js";
@@ -10,7 +10,7 @@ import { subjectOf } from "./subject.js";
 import { Downloads } from "./weights.js";
 
 const BEHIND = 0.5; // grey value behind scenes, unless the weights have a background
-const ROUNDS = 40; // of fitting
+const DETAIL = 256; // pixels of the image that fronts are fitted to, if the photo has as many
 const FRAMES = 16; // small images of a scene in one turn
 const FRAME_SIZE = 96; // pixels
 
@@ -69,11 +69,12 @@ async function open({ file, run: number }) {
   run = number;
   photo = null;
   const { settings } = await wantedPipeline();
-  photo = await readPhoto(file, settings, [settings.image_size]);
+  photo = await readPhoto(file, settings, settings.image_size, DETAIL);
   await checkWanted(number);
-  const { images, preview, fovDegrees, fovIsRecorded, part, photoSize } = photo;
+  const { images, preview, fovDegrees, fovIsRecorded, photoSize } = photo;
   const input = images.get(settings.image_size).slice();
-  const answer = { kind: "opened", run: number, input, preview, fovDegrees, fovIsRecorded, part, photoSize };
+  const sizes = [...images.keys()];
+  const answer = { kind: "opened", run: number, input, sizes, preview, fovDegrees, fovIsRecorded, photoSize };
   self.postMessage(answer, [preview]);
 }
 
@@ -90,11 +91,11 @@ async function draw({ samples, seed, fits, run: number }) {
       self.postMessage({ kind: "step", run: number, sample, ...made });
       continue;
     }
-    const scene = fits ? fitted(made.scene, pipeline.settings) : { gaussians: made.scene };
-    const subject = subjectOf(scene.gaussians, photo);
+    const gaussians = fits ? fitted(made.scene, pipeline.settings) : made.scene;
+    const subject = subjectOf(gaussians, photo);
     const seconds = (performance.now() - begun) / 1000;
-    turning.push({ sample, gaussians: scene.gaussians, subject });
-    self.postMessage({ kind: "sample", run: number, sample, seconds, subject, ...scene });
+    turning.push({ sample, gaussians, subject });
+    self.postMessage({ kind: "sample", run: number, sample, seconds, subject, gaussians });
     postFrame(turning[sample], FRAMES / 8, number, pipeline.settings);
     sample += 1;
     begun = performance.now();
@@ -113,10 +114,10 @@ function cancel({ run: number }) {
 }
 
 function fitted(gaussians, settings) {
-  const size = settings.image_size;
-  const camera = photoCamera(photo, size);
-  const behind = settings.background ?? BEHIND;
-  return fitColors(gaussians, camera, photo.images.get(size), ownAt(photo.part, size), ROUNDS, behind);
+  const targets = [...photo.images].map(([size, image]) => {
+    return { camera: photoCamera(photo, size), image, own: ownAt(photo.part, size) };
+  });
+  return fitFront(gaussians, targets, settings.background ?? BEHIND);
 }
 
 /** Post a small image of a scene that turns. */
