@@ -101,8 +101,9 @@ def opened(chromium, address):
     requests = []
     errors = []
 
-    def open_page(query: str = "", **settings):
-        context = chromium.new_context(**settings)
+    def open_page(query: str = "", **settings):  # without motion, because images take long without a graphics card
+        context = chromium.new_context(reduced_motion="reduce", **settings)
+        context.set_default_timeout(1000 * LIMIT)
         contexts.append(context)
         context.on("request", lambda request: requests.append(request.url))
         tab = context.new_page()

@@ -9,12 +9,13 @@ const BLUR = 0.3; // px^2 that the rasterizer of the fit adds to projected covar
 const SPEED = (12 * Math.PI) / 180; // a second
 const REST = 1.2; // seconds in which a new scene is seen from the front
 const GLIDE = 1.2; // seconds from the photo's view to the orbit's
-const SLOW = 0.4; // seconds for an image, from which on images become smaller, and turning stops
+const SLOW = 0.2; // seconds for an image, from which on moving images have fewer pixels, as without a graphics card
 const STEP = Math.PI / 24; // of an arrow key
 const MOST_PITCH = 1.2;
 const ZOOMS = [0.35, 2.5];
 const MOST_PIXEL_RATIO = 2;
-const LEAST_SCALE = 0.25;
+const LEAST_SCALE = 0.125;
+const LONGEST_STEP = 0.1; // seconds by which a scene turns between two images
 
 /** View of one scene in a canvas. */
 export class SceneView {
@@ -42,8 +43,8 @@ export class SceneView {
     this.goal = null; // of a glide
     this.isTurning = false;
     this.isRequested = false;
-    this.slowImages = 0;
-    this.scale = 1; // of the image's resolution, less without a graphics card
+    this.scale = 1; // of the resolution while the scene moves
+    this.fence = null; // until the graphics card has drawn the last image
     this.pointers = new Map();
     this.listen();
     new ResizeObserver(() => this.request()).observe(canvas);
@@ -95,7 +96,6 @@ export class SceneView {
   setTurning(isTurning) {
     this.isTurning = isTurning;
     this.rest = 0;
-    this.slowImages = 0;
     this.goal = null;
     this.request();
   }
@@ -122,12 +122,13 @@ export class SceneView {
   }
 
   pixelRatio() {
-    return Math.min(devicePixelRatio, MOST_PIXEL_RATIO) * this.scale;
+    return Math.min(devicePixelRatio, MOST_PIXEL_RATIO) * (this.isMoving() ? this.scale : 1);
   }
 
   /** Side of the square in which the photo's view appears, in pixels. */
   side() {
-    return Math.max(Math.min(this.canvas.clientWidth, this.canvas.clientHeight) * this.pixelRatio(), 1);
+    const ratio = Math.min(devicePixelRatio, MOST_PIXEL_RATIO);
+    return Math.max(Math.min(this.canvas.clientWidth, this.canvas.clientHeight) * ratio, 1);
   }
 
   /** Draw when the browser next does. */
@@ -140,32 +141,47 @@ export class SceneView {
 
   animate(now) {
     this.isRequested = false;
-    const seconds = Math.min((now - (this.last ?? now)) / 1000, SLOW);
-    this.last = now;
     if (!this.mesh) {
       this.renderer.clear();
       return;
     }
+    if (this.isBusy(now)) {
+      this.request();
+      return;
+    }
+    const seconds = Math.min((now - (this.last ?? now)) / 1000, LONGEST_STEP);
+    this.last = this.isMoving() ? now : undefined;
     this.advance(seconds);
     this.fitToCanvas();
     this.place();
     this.renderer.render(this.scene, this.camera);
+    const gl = this.renderer.getContext();
+    this.fence = { sync: gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), begun: now };
+    gl.flush();
     if (this.goal || this.isTurning) {
-      this.checkPace(seconds);
       this.request();
-    } else {
-      this.last = undefined;
     }
   }
 
-  /** Draw fewer pixels where images are slow, and stop turning where that does not help. */
-  checkPace(seconds) {
-    this.slowImages = seconds >= SLOW ? this.slowImages + 1 : 0;
-    if (this.slowImages === 2 && this.scale > LEAST_SCALE) {
-      this.scale /= 2;
-      this.slowImages = 0;
+  isMoving() {
+    return Boolean(this.goal || this.isTurning || this.pointers.size);
+  }
+
+  /** Return whether the last image is still being drawn; moving images become smaller where that takes long. */
+  isBusy(now) {
+    if (!this.fence) {
+      return false;
     }
-    this.isTurning &&= this.slowImages < 4;
+    const gl = this.renderer.getContext();
+    if (gl.getSyncParameter(this.fence.sync, gl.SYNC_STATUS) !== gl.SIGNALED) {
+      return true;
+    }
+    gl.deleteSync(this.fence.sync);
+    if ((now - this.fence.begun) / 1000 > SLOW) {
+      this.scale = Math.max(this.scale / 2, LEAST_SCALE);
+    }
+    this.fence = null;
+    return false;
   }
 
   /** Move the camera on. */
@@ -246,7 +262,10 @@ export class SceneView {
     });
     canvas.addEventListener("pointermove", (event) => this.drag(event));
     for (const kind of ["pointerup", "pointercancel"]) {
-      canvas.addEventListener(kind, (event) => this.pointers.delete(event.pointerId));
+      canvas.addEventListener(kind, (event) => {
+        this.pointers.delete(event.pointerId);
+        this.request(); // with all pixels
+      });
     }
     const onWheel = (event) => {
       event.preventDefault();
