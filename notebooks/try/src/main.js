@@ -91,6 +91,7 @@ function draw() {
   setEnabled(false);
   setDrawing(true);
   byId("frame").classList.add("waits");
+  byId("frame").style.backgroundColor = "";
   wait(`Imagining ${samples === 1 ? "an answer" : `answer 1 of ${samples}`}`);
   say("Imagining the hidden sides.");
   worker.postMessage({ task: "draw", samples, seed, fits: FITS, run: page.run });
@@ -102,6 +103,12 @@ function setEnabled(isEnabled) {
   }
 }
 
+/** Return the grey behind scenes, as in their fit. */
+function behind() {
+  const byte = Math.round(255 * (page.settings.background ?? 0.5));
+  return `rgb(${byte} ${byte} ${byte})`;
+}
+
 /** Show a sample on the stage. */
 function choose(number) {
   const isFirst = page.chosen === null;
@@ -109,6 +116,7 @@ function choose(number) {
   tiles.mark(number);
   setEnabled(true);
   byId("frame").classList.remove("waits");
+  byId("frame").style.backgroundColor = behind();
   wait(null);
   try {
     view ??= new SceneView(byId("scene"), onTouch);

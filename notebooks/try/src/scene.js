@@ -32,8 +32,11 @@ export class SceneView {
     this.spark = new SparkRenderer({
       renderer: this.renderer,
       onDirty: () => this.request(),
+      // As the rasterizer of the fit.
       preBlurAmount: BLUR,
       blurAmount: 0,
+      maxStdDev: Math.sqrt(2 * Math.log(255)),
+      sortRadial: false,
     });
     this.scene.add(this.spark);
     this.camera = new PerspectiveCamera();
@@ -104,7 +107,8 @@ export class SceneView {
    * Return splats for Spark. They look at the canvas's size as they look at that of the fit, whose pixels blur more.
    */
   packed({ means, quaternions, scales, opacities, colors }, { fovDegrees, fitSize }) {
-    const splats = new PackedSplats({ maxSplats: opacities.length });
+    const rgbMax = colors.reduce((most, value) => Math.max(most, value), 1);
+    const splats = new PackedSplats({ maxSplats: opacities.length, splatEncoding: { rgbMin: 0, rgbMax } });
     const tangent = Math.tan((fovDegrees * Math.PI) / 360);
     const variance = BLUR * (((2 * tangent) / fitSize) ** 2 - ((2 * tangent) / this.side()) ** 2);
     const [center, scale, quaternion, color] = [new Vector3(), new Vector3(), new Quaternion(), new Color()];
@@ -115,7 +119,7 @@ export class SceneView {
       scale.set(a, b, c);
       const [w, x, y, z] = quaternions.subarray(4 * i, 4 * i + 4);
       quaternion.set(x, y, z, w).normalize();
-      color.setRGB(...[0, 1, 2].map((channel) => Math.min(Math.max(colors[3 * i + channel], 0), 1)));
+      color.setRGB(...[0, 1, 2].map((channel) => Math.max(colors[3 * i + channel], 0)));
       splats.pushSplat(center, scale, quaternion, opacities[i], color);
     }
     return splats;
