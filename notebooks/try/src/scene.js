@@ -36,6 +36,7 @@ export class SceneView {
       preBlurAmount: BLUR,
       blurAmount: 0,
       maxStdDev: Math.sqrt(2 * Math.log(255)),
+      maxPixelRadius: 4096,
       sortRadial: false,
     });
     this.scene.add(this.spark);
