@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-processes test-slow test-wheel test-browser fuzz check size lock bench gpu gpu-weights gpu-weights-inputs docs site notebooks release clean
+.PHONY: help demo demo-train test test-processes test-slow test-wheel test-browser fuzz check size lock bench gpu gpu-weights gpu-weights-inputs docs site try notebooks release clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -127,6 +127,21 @@ site: docs ## The site in outputs/site: documents, notebooks, API, weights, and 
 	@$(BIN)/python -c "import furo, myst_nb" 2> /dev/null || \
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev,site]"
 	$(BIN)/python notebooks/website.py
+
+# The page is complete in its folder; any static host serves it. WEIGHTS: a name in the package, or a folder of weights.
+WEIGHTS ?= general
+TRY := outputs/site/try
+LICENCES = $(firstword $(wildcard $(WEIGHTS)/LICENSE.txt completesplat/weights/$(WEIGHTS)/LICENSE.txt) LICENSE)
+
+try: $(READY) ## The page that completes photos in a browser, with WEIGHTS=general, in outputs/site/try (needs Node.js)
+	cd notebooks/try && npm ci --no-audit --no-fund
+	rm -rf $(TRY)
+	mkdir -p $(TRY)
+	$(BIN)/completesplat export weights=$(WEIGHTS) precision=float16 out=$(TRY)/weights
+	cp $(LICENCES) $(TRY)/weights/LICENSE.txt
+	$(BIN)/python notebooks/try/examples.py $(TRY)/examples
+	node notebooks/try/build.mjs $(TRY)
+	@echo "python3 -m http.server --directory $(TRY)"
 
 notebooks: $(READY) ## Run every notebook from top to bottom, and store what it prints and draws
 	$(BIN)/python tests/stored_notebooks.py
