@@ -68,7 +68,9 @@ def test_every_option_of_a_part_composes_fits_the_checks_and_builds(number):
 def builds(config: Any, group: str, option: str) -> None:
     if group == "rasterizer":
         assert instantiate(config.rasterizer.constants) == RenderingConstants()
-    if option == "cuda" and not torch.cuda.is_available():
+    if option in ("cuda", "gpu") and not torch.cuda.is_available():
+        return
+    if option == "mps" and not torch.backends.mps.is_available():
         return
     if group == "autoreconstructor":
         config.autoreconstructor.pretrained = None

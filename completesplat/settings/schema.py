@@ -112,7 +112,6 @@ class ViewSettings(SceneSettings):
 class ExportSettings(TypedDict):
     """Settings of `completesplat export`."""
 
-    weights: str
     precision: Literal["float32", "float16"]
     trust: bool
 

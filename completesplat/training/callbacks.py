@@ -109,7 +109,7 @@ class BadSteps(Callback):
         pl_module.log(BAD_STEPS, torch.tensor(float(self.total)), batch_size=1)
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         self.batch = batch
 
