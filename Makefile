@@ -123,10 +123,11 @@ docs: $(READY) ## The API reference, from the docstrings, in outputs/api
 	@echo "outputs/api/completesplat.html"
 
 # Predictions of the gallery are kept in outputs/gallery: remove it to make them again.
-site: docs ## The site in outputs/site: documents, notebooks, API, weights, and scenes that turn (these need Node.js)
+site: docs ## The site in outputs/site: documents, notebooks, API, weights, scenes that turn, try (these need Node.js)
 	@$(BIN)/python -c "import furo, myst_nb" 2> /dev/null || \
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev,site]"
 	$(BIN)/python notebooks/website.py
+	$(MAKE) try
 
 # The page is complete in its folder; any static host serves it. WEIGHTS: a name in the package, or a folder of weights.
 WEIGHTS ?= general
