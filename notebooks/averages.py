@@ -4,9 +4,11 @@ python notebooks/averages.py RUN OUT SHARE OTHER.ckpt     # OUT: a run like RUN,
 python notebooks/averages.py OUT SHARE=WEIGHTS ...        # OUT: weights (a folder), an average of these
 
 All tensors are averaged (Wortsman et al., CVPR 2022, "Robust fine-tuning of zero-shot models"). Optimizer, steps and
-config of a run are RUN's. The camera of a typical photo and `config.json` of weights are those of the first folder.
+config of a run are RUN's. The camera of a typical photo and the facts of training (`config.json`) of weights are those
+of the first folder; the rest of `config.json` is that of the last.
 """
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -46,7 +48,8 @@ def average_weights(out, *words):
     states = [load_file(f"{folder}/model.safetensors") for folder in folders]
     Path(out).mkdir(parents=True, exist_ok=True)
     save_file(average([float(share) for share in shares], states), f"{out}/model.safetensors")
-    shutil.copy(f"{folders[0]}/config.json", f"{out}/config.json")
+    first, last = (json.loads(Path(folder, "config.json").read_text()) for folder in (folders[0], folders[-1]))
+    Path(out, "config.json").write_text(json.dumps({**last, "training": first["training"]}, indent=2) + "\n")
 
 
 if __name__ == "__main__":
