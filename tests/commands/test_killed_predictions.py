@@ -40,7 +40,7 @@ def test_two_killed_processes_leave_no_process_and_what_is_finished(command, tmp
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen(program, env=environment, stdout=log, stderr=log, start_new_session=True)
     finished = tmp_path / "out"
-    assert waited_for(lambda: len(list(finished.glob("*/scene.json"))) > 1 or process.poll() is not None, 120)
+    assert waited_for(lambda: len(list(finished.glob("*/scene.json"))) > 1 or process.poll() is not None)
     (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
     assert process.wait() == (130 if number == signal.SIGINT else -number)
     assert waited_for(lambda: not left(f"MARK={tmp_path}"), 10), left(f"MARK={tmp_path}")
