@@ -5,13 +5,17 @@ const SAME_DIRECTION = 1 - 1e-6; // cosine of the angle up to which an order sta
 
 /** Order of a scene's Gaussians by depth, kept while the view's direction stays. */
 export class DepthOrder {
-  /** @param {Float32Array} means [n, 3] */
-  constructor(means) {
+  /**
+   * @param {Float32Array} means [n, 3]
+   * @param {number} length of `numbers`, at least n
+   */
+  constructor(means, length) {
     const count = means.length / 3;
+    this.count = count;
     this.means = means;
     this.depths = new Float32Array(count);
     this.keys = new Uint16Array(count);
-    this.numbers = new Uint32Array(count);
+    this.numbers = new Uint32Array(length);
     this.direction = null;
   }
 

@@ -4,19 +4,20 @@ import { DepthOrder } from "./order.js";
 import { BLUR, FRUSTUM_MARGIN, MAX_ALPHA, MIN_ALPHA, NEAR } from "./raster.js";
 
 const TEXELS = 4; // of a Gaussian: mean and opacity, scales, quaternion, colour
-const ROW = 512; // Gaussians in a row of the texture, which then is as wide as every WebGL 2 allows
+const ROW = 512; // Gaussians in a row of the textures, which then are as wide as every WebGL 2 allows
+const QUAD = [0, 1, 2, 2, 1, 3]; // corners of two triangles
 
 const VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
 uniform highp sampler2D gaussians;
+uniform highp usampler2D order;
 uniform vec2 size;
 uniform float focal;
 uniform vec2 principal;
 uniform mat3 rotation;
 uniform vec3 translation;
 uniform float variance;
-in uint number;
 flat out vec4 color;
 out vec2 deviations;
 
@@ -32,8 +33,9 @@ mat3 unitMatrix(vec4 quaternion) {
 }
 
 void main() {
-  int place = int(number);
-  ivec2 texel = ivec2(${TEXELS} * (place % ${ROW}), place / ${ROW});
+  int place = gl_VertexID / 4;
+  int number = int(texelFetch(order, ivec2(place % ${ROW}, place / ${ROW}), 0).r);
+  ivec2 texel = ivec2(${TEXELS} * (number % ${ROW}), number / ${ROW});
   vec4 mean = texelFetch(gaussians, texel, 0);
   vec4 scales = texelFetch(gaussians, texel + ivec2(1, 0), 0);
   vec4 quaternion = texelFetch(gaussians, texel + ivec2(2, 0), 0);
@@ -61,7 +63,7 @@ void main() {
   float first = sqrt(dot(x, x) + blur);
   float both = dot(x, y) / first;
   float second = sqrt(determinant) / first;
-  deviations = sqrt(2.0 * end) * vec2(gl_VertexID % 2 * 2 - 1, gl_VertexID / 2 * 2 - 1);
+  deviations = sqrt(2.0 * end) * vec2(gl_VertexID % 2 * 2 - 1, gl_VertexID / 2 % 2 * 2 - 1);
   vec2 offset = vec2(first * deviations.x, both * deviations.x + second * deviations.y);
   vec2 pixel = focal * at.xy / at.z + principal + offset;
   gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0, 1);
@@ -106,14 +108,17 @@ export class SplatRenderer {
     this.framebuffer = gl.createFramebuffer();
     this.imageSize = [0, 0];
     this.order = null;
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    const number = gl.getAttribLocation(this.program, "number");
-    gl.enableVertexAttribArray(number);
-    gl.vertexAttribIPointer(number, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(number, 1);
+    gl.useProgram(this.program);
+    for (const [unit, name] of ["gaussians", "order"].entries()) {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+      gl.uniform1i(gl.getUniformLocation(this.program, name), unit);
+    }
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
   /**
@@ -135,8 +140,12 @@ export class SplatRenderer {
       texels.set(quaternions.subarray(4 * number, 4 * number + 4), at + 8);
       texels.set(colors.subarray(3 * number, 3 * number + 3), at + 12);
     }
+    gl.activeTexture(gl.TEXTURE0);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, TEXELS * ROW, rows, 0, gl.RGBA, gl.FLOAT, texels);
-    this.order = new DepthOrder(means);
+    // One draw of all quads: some drivers are slow with many instances of a quad.
+    const corners = Uint32Array.from({ length: QUAD.length * count }, (_, index) => 4 * Math.floor(index / QUAD.length) + QUAD[index % QUAD.length]);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    this.order = new DepthOrder(means, ROW * rows);
     this.fitFocal = fitFocal;
   }
 
@@ -149,21 +158,20 @@ export class SplatRenderer {
     const { gl, places, order } = this;
     this.resize(size);
     if (order.sort(rotation.slice(6))) {
-      gl.bufferData(gl.ARRAY_BUFFER, order.numbers, gl.DYNAMIC_DRAW);
+      const rows = order.numbers.length / ROW;
+      gl.activeTexture(gl.TEXTURE1);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, ROW, rows, 0, gl.RED_INTEGER, gl.UNSIGNED_INT, order.numbers);
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
     gl.viewport(0, 0, ...size);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.useProgram(this.program);
     gl.uniform2f(places.size, ...size);
     gl.uniform1f(places.focal, focal);
     gl.uniform2f(places.principal, ...principal);
     gl.uniformMatrix3fv(places.rotation, true, rotation);
     gl.uniform3f(places.translation, ...translation);
     gl.uniform1f(places.variance, BLUR * Math.max(this.fitFocal ** -2 - focal ** -2, 0));
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, order.numbers.length);
+    gl.drawElements(gl.TRIANGLES, QUAD.length * order.count, gl.UNSIGNED_INT, 0);
     gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
     gl.blitFramebuffer(0, 0, ...size, 0, 0, ...size, gl.COLOR_BUFFER_BIT, gl.NEAREST);
   }
