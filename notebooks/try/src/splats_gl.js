@@ -143,7 +143,10 @@ export class SplatRenderer {
     gl.activeTexture(gl.TEXTURE0);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, TEXELS * ROW, rows, 0, gl.RGBA, gl.FLOAT, texels);
     // One draw of all quads: some drivers are slow with many instances of a quad.
-    const corners = Uint32Array.from({ length: QUAD.length * count }, (_, index) => 4 * Math.floor(index / QUAD.length) + QUAD[index % QUAD.length]);
+    const corners = new Uint32Array(QUAD.length * count);
+    for (let number = 0; number < count; number++) {
+      corners.set(QUAD.map((corner) => 4 * number + corner), QUAD.length * number);
+    }
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     this.order = new DepthOrder(means, ROW * rows);
     this.fitFocal = fitFocal;
