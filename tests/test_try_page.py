@@ -212,7 +212,7 @@ def test_the_front_of_a_scene_looks_like_the_photo(opened, built, model, tmp_pat
     difference = (rendered - read.square_at(SIDE)).square() * own
     decibels = -10 * torch.log10(difference.sum() / (3 * own.sum())).item()
     alike = -10 * torch.log10((shown - rendered).square().mean()).item()
-    print(f"{name} in the photo's view: {decibels:.1f} dB to the photo, {alike:.1f} dB from the canvas to the rasterizer")
+    print(f"{name}: {decibels:.1f} dB from the rasterizer to the photo, {alike:.1f} dB to the canvas")
     assert decibels > least
     assert alike > 45
 
