@@ -14,7 +14,7 @@ import { build } from "esbuild";
 
 const SOURCES = path.dirname(fileURLToPath(import.meta.url));
 const MODULES = path.join(SOURCES, "node_modules");
-const PACKAGES = ["onnxruntime-web", "@sparkjsdev/spark", "three"];
+const PACKAGES = ["onnxruntime-web"];
 const RUNTIME = "ort-wasm-simd-threaded";
 const COPIED = ["index.html", "style.css", "icon.svg"];
 const KNOWN_LICENCES = /CC0|CC BY(-[A-Z]{2})* \d\.\d|Apache License|MIT License/;

@@ -1,5 +1,7 @@
 /** Cameras around a scene, in the photo's camera's frame: +x right, +y down, +z forward. */
 
+import { focalOf } from "./raster.js";
+
 const MARGIN = 1.05; // of the distance at which an object just fits into the frame
 
 /** @typedef {[number, number, number]} Vector */
@@ -54,7 +56,7 @@ export function viewOf({ yaw, pitch, zoom, look }, { center, radius }, up, fovDe
 export function cameraAt({ eye, right, down, forward }, fovDegrees, size) {
   return {
     size,
-    focal: size / 2 / Math.tan((fovDegrees * Math.PI) / 360),
+    focal: focalOf(fovDegrees, size),
     principal: [size / 2, size / 2],
     rotation: [...right, ...down, ...forward],
     translation: [right, down, forward].map((row) => -dot(row, eye)),

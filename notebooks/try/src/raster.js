@@ -1,11 +1,11 @@
 /** A rasterizer on the CPU, with the rules of `completesplat/rasterizers` (EWA splatting, front to back). */
 
 export const BLUR = 0.3; // px^2, added to the diagonal of a projected covariance
-const NEAR = 0.01;
-const MAX_ALPHA = 0.999;
-const MIN_ALPHA = 1 / 255;
+export const NEAR = 0.01;
+export const MAX_ALPHA = 0.999;
+export const MIN_ALPHA = 1 / 255;
 const MIN_TRANSMITTANCE = 1e-4;
-const FRUSTUM_MARGIN = 0.3;
+export const FRUSTUM_MARGIN = 0.3;
 const SMALLEST_KEPT = 6e-3; // weight of a Gaussian in a pixel
 
 /**
@@ -33,11 +33,16 @@ const SMALLEST_KEPT = 6e-3; // weight of a Gaussian in a pixel
 export function photoCamera({ fovDegrees, axis }, size) {
   return {
     size,
-    focal: size / 2 / Math.tan((fovDegrees * Math.PI) / 360),
+    focal: focalOf(fovDegrees, size),
     principal: [size * axis[0], size * axis[1]],
     rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1],
     translation: [0, 0, 0],
   };
+}
+
+/** Return the focal length, in pixels, of a camera whose images have a side of this size. */
+export function focalOf(fovDegrees, size) {
+  return size / 2 / Math.tan((fovDegrees * Math.PI) / 360);
 }
 
 /** Numbers of pixels with weights, whose count is not known before. */

@@ -1,11 +1,9 @@
-/** The chosen scene, drawn by Spark: it turns slowly until it is touched. */
+/** The chosen scene: it turns slowly until it is touched. */
 
-import { PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
-import { Color, PerspectiveCamera, Quaternion, Scene, Vector3, WebGLRenderer } from "three";
+import { cameraAt, mix, PHOTO_VIEW, viewOf } from "./orbit.js";
+import { focalOf } from "./raster.js";
+import { SplatRenderer } from "./splats_gl.js";
 
-import { mix, PHOTO_VIEW, viewOf } from "./orbit.js";
-
-const BLUR = 0.3; // px^2 that the rasterizer of the fit adds to projected covariances
 const SPEED = (12 * Math.PI) / 180; // a second
 const REST = 1.2; // seconds in which a new scene is seen from the front
 const GLIDE = 1.2; // seconds from the photo's view to the orbit's
@@ -26,23 +24,8 @@ export class SceneView {
   constructor(canvas, onTouch) {
     this.canvas = canvas;
     this.onTouch = onTouch;
-    const options = { canvas, antialias: false, alpha: true, premultipliedAlpha: true };
-    this.renderer = new WebGLRenderer(options); // throws where there is no WebGL 2
-    this.scene = new Scene();
-    this.spark = new SparkRenderer({
-      renderer: this.renderer,
-      onDirty: () => this.request(),
-      // As the rasterizer of the fit.
-      preBlurAmount: BLUR,
-      blurAmount: 0,
-      maxStdDev: Math.sqrt(2 * Math.log(255)),
-      maxPixelRadius: 4096,
-      sortRadial: false,
-    });
-    this.scene.add(this.spark);
-    this.camera = new PerspectiveCamera();
-    this.camera.matrixAutoUpdate = false;
-    this.mesh = null;
+    this.renderer = new SplatRenderer(canvas); // throws where there is no WebGL 2
+    this.gaussians = null;
     this.turn = { ...PHOTO_VIEW };
     this.goal = null; // of a glide
     this.isTurning = false;
@@ -61,13 +44,7 @@ export class SceneView {
    * @param {boolean} isNew whether it is of another photo
    */
   show({ gaussians, subject }, photo, isNew) {
-    const mesh = new SplatMesh({ packedSplats: this.packed(gaussians, photo) });
-    this.scene.add(mesh);
-    if (this.mesh) {
-      this.scene.remove(this.mesh);
-      this.mesh.dispose();
-    }
-    this.mesh = mesh;
+    this.gaussians = gaussians;
     this.photo = photo;
     this.subject = subject;
     if (isNew) {
@@ -76,17 +53,13 @@ export class SceneView {
       this.isTurning = !matchMedia("(prefers-reduced-motion: reduce)").matches;
       this.rest = REST;
     }
-    mesh.initialized.then(() => this.request());
+    this.upload();
   }
 
   /** Remove the scene. */
   clear() {
-    if (this.mesh) {
-      this.scene.remove(this.mesh);
-      this.mesh.dispose();
-      this.mesh = null;
-      this.request();
-    }
+    this.gaussians = null;
+    this.request();
   }
 
   /** Glide to the photo's view, and stay. */
@@ -104,36 +77,24 @@ export class SceneView {
     this.request();
   }
 
-  /**
-   * Return splats for Spark. They look at the canvas's size as they look at that of the fit, whose pixels blur more.
-   */
-  packed({ means, quaternions, scales, opacities, colors }, { fovDegrees, fitSize }) {
-    const rgbMax = colors.reduce((most, value) => Math.max(most, value), 1);
-    const splats = new PackedSplats({ maxSplats: opacities.length, splatEncoding: { rgbMin: 0, rgbMax } });
-    const tangent = Math.tan((fovDegrees * Math.PI) / 360);
-    const variance = BLUR * (((2 * tangent) / fitSize) ** 2 - ((2 * tangent) / this.side()) ** 2);
-    const [center, scale, quaternion, color] = [new Vector3(), new Vector3(), new Quaternion(), new Color()];
-    for (let i = 0; i < opacities.length; i++) {
-      center.fromArray(means, 3 * i);
-      const added = Math.max(variance, 0) * center.z ** 2;
-      const [a, b, c] = [0, 1, 2].map((axis) => Math.sqrt(scales[3 * i + axis] ** 2 + added));
-      scale.set(a, b, c);
-      const [w, x, y, z] = quaternions.subarray(4 * i, 4 * i + 4);
-      quaternion.set(x, y, z, w).normalize();
-      color.setRGB(...[0, 1, 2].map((channel) => Math.max(colors[3 * i + channel], 0)));
-      splats.pushSplat(center, scale, quaternion, opacities[i], color);
+  /** Give the scene to the renderer. */
+  upload() {
+    const { fovDegrees, fitSize } = this.photo;
+    this.renderer.setScene(this.gaussians, focalOf(fovDegrees, fitSize));
+    this.request();
+  }
+
+  /** Begin again with a new context, such as after a phone's sleep. */
+  restore() {
+    this.renderer = new SplatRenderer(this.canvas);
+    this.fence = null;
+    if (this.gaussians) {
+      this.upload();
     }
-    return splats;
   }
 
   pixelRatio() {
     return Math.min(devicePixelRatio, MOST_PIXEL_RATIO) * (this.isMoving() ? this.scale : 1);
-  }
-
-  /** Side of the square in which the photo's view appears, in pixels. */
-  side() {
-    const ratio = Math.min(devicePixelRatio, MOST_PIXEL_RATIO);
-    return Math.max(Math.min(this.canvas.clientWidth, this.canvas.clientHeight) * ratio, 1);
   }
 
   /** Draw when the browser next does. */
@@ -146,7 +107,7 @@ export class SceneView {
 
   animate(now) {
     this.isRequested = false;
-    if (!this.mesh) {
+    if (!this.gaussians) {
       this.renderer.clear();
       return;
     }
@@ -157,10 +118,8 @@ export class SceneView {
     const seconds = Math.min((now - (this.last ?? now)) / 1000, LONGEST_STEP);
     this.last = this.isMoving() ? now : undefined;
     this.advance(seconds);
-    this.fitToCanvas();
-    this.place();
-    this.renderer.render(this.scene, this.camera);
-    const gl = this.renderer.getContext();
+    this.draw();
+    const { gl } = this.renderer;
     this.fence = { sync: gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), begun: now };
     gl.flush();
     if (this.goal || this.isTurning) {
@@ -177,7 +136,7 @@ export class SceneView {
     if (!this.fence) {
       return false;
     }
-    const gl = this.renderer.getContext();
+    const { gl } = this.renderer;
     if (gl.getSyncParameter(this.fence.sync, gl.SYNC_STATUS) !== gl.SIGNALED) {
       return true;
     }
@@ -216,26 +175,14 @@ export class SceneView {
     this.request();
   }
 
-  fitToCanvas() {
-    const { clientWidth: width, clientHeight: height } = this.canvas;
+  /** Draw the scene from where the camera is; the photo's field of view is that of the shorter side. */
+  draw() {
+    const { fovDegrees, up } = this.photo;
     const ratio = this.pixelRatio();
-    if (this.canvas.width !== Math.floor(width * ratio) || this.canvas.height !== Math.floor(height * ratio)) {
-      this.renderer.setPixelRatio(ratio);
-      this.renderer.setSize(width, height, false);
-    }
-    const tangent = Math.tan((this.photo.fovDegrees * Math.PI) / 360) * Math.max(height / width, 1);
-    this.camera.fov = (2 * Math.atan(tangent) * 180) / Math.PI;
-    this.camera.aspect = width / height;
-    this.camera.near = 0.01;
-    this.camera.updateProjectionMatrix();
-  }
-
-  /** Put the camera in its place; three.js has y up and looks along -z. */
-  place() {
-    const { eye, right, down, forward } = viewOf(this.turn, this.subject, this.photo.up, this.photo.fovDegrees);
-    const rows = [0, 1, 2].map((i) => [right[i], -down[i], -forward[i], eye[i]]);
-    this.camera.matrix.set(...rows.flat(), 0, 0, 0, 1);
-    this.camera.updateMatrixWorld(true);
+    const { clientWidth, clientHeight } = this.canvas;
+    const size = [clientWidth, clientHeight].map((length) => Math.max(Math.floor(length * ratio), 1));
+    const camera = cameraAt(viewOf(this.turn, this.subject, up, fovDegrees), fovDegrees, Math.min(...size));
+    this.renderer.draw({ ...camera, principal: size.map((length) => length / 2) }, size);
   }
 
   /** Stop turning, and let the scene be moved from where it is. */
@@ -247,7 +194,7 @@ export class SceneView {
 
   /** Turn and zoom by what a person did. */
   move(yaw, pitch, zoom) {
-    if (!this.mesh) {
+    if (!this.gaussians) {
       return;
     }
     this.touch();
@@ -279,6 +226,8 @@ export class SceneView {
     canvas.addEventListener("wheel", onWheel, { passive: false });
     canvas.addEventListener("keydown", (event) => this.press(event));
     canvas.addEventListener("dblclick", () => this.toPhoto());
+    canvas.addEventListener("webglcontextlost", (event) => event.preventDefault()); // it may come back
+    canvas.addEventListener("webglcontextrestored", () => this.restore());
   }
 
   /** One pointer turns, two zoom. */
