@@ -18,6 +18,8 @@ from completesplat.installation import install_command
 
 Precision = Literal["float32", "float16"]
 OPSET = 18
+TALKATIVE = ("torch.onnx", "onnxscript", "onnx_ir")
+"""Libraries that log what they simplify, and what packages they miss that no graph here needs."""
 PIPELINE_FILE = "pipeline.json"
 MOST_SAMPLES = 63
 """Samples that a graph takes at a time; diffusers' upsampling works otherwise with more."""
@@ -96,7 +98,8 @@ def _exported(graph: Graph) -> Any:
         import onnxscript  # noqa: F401  the exporter needs it
     except ImportError as error:
         raise CompleteSplatError(f"ONNX files need further packages: {install_command('onnx')}") from error
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses packages that no graph here needs
+    for name in TALKATIVE:
+        logging.getLogger(name).setLevel(logging.ERROR)
     samples = torch.export.Dim("samples", max=MOST_SAMPLES)
     shapes = {name: {0: samples} if name in graph.per_sample else None for name in graph.inputs}
     with torch.no_grad(), warnings.catch_warnings():
