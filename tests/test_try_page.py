@@ -1,7 +1,6 @@
 """The page `notebooks/try` in a browser without a screen: its scenes are those of Python, and it asks nobody else."""
 
 import importlib.util
-import os
 import shutil
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 import torch
+from browsers import CHROMIUM, MISSING, started_chromium
 from PIL import Image, ImageOps
 from support import LIMIT, serving, waited_for
 
@@ -23,21 +23,19 @@ from completesplat.generator import CompleteSplat
 from completesplat.rasterizers.selection import auto
 from completesplat.weights import shipped
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 skimage = pytest.importorskip("skimage", reason="scikit-image is not installed")
 pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
 pytest.importorskip("onnxscript", reason="the extra onnx is not installed")
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ROOT / "notebooks/try"
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = [
     pytest.mark.browser,
     pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (apt-get install chromium)"),
+    pytest.mark.skipif(CHROMIUM is None, reason=MISSING),
     pytest.mark.skipif(shutil.which("npm") is None, reason="Node.js is not installed"),
 ]
-SWIFTSHADER = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 EXIF_TURN = 0x0112
 EXIF_EQUIVALENT = 0xA405
 MARGINS = 36  # pixels beside the scene's canvas in a narrow page
@@ -85,11 +83,8 @@ def address(built):
 
 @pytest.fixture(scope="module")
 def chromium():
-    root = ["--no-sandbox"] if os.geteuid() == 0 else []
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=[*SWIFTSHADER, *root])
+    with started_chromium() as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -2,14 +2,13 @@
 
 import base64
 import io
-import os
-import shutil
 import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from browsers import CHROMIUM, MISSING, started_chromium
 from PIL import Image
 from support import LIMIT, tiny_generator, waited_for
 from viewer_scenes import BALLS, START, balls_sample
@@ -19,7 +18,7 @@ from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 from completesplat.viewer.access import show_status, start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
@@ -28,23 +27,18 @@ from completesplat.viewer.panel import square_text  # noqa: E402
 from completesplat.viewer.splat_view import MARGIN, SplatView  # noqa: E402
 from completesplat.viewer.turning import REST  # noqa: E402
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")  # which GitHub's machines have
 pytestmark = [
     pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (apt-get install chromium)"),
+    pytest.mark.skipif(CHROMIUM is None, reason=MISSING),
 ]
-SWIFTSHADER = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 WINDOW = {"width": 700, "height": 360}
 GREY = 128
 
 
 @pytest.fixture(scope="module")
 def chromium():
-    root = ["--no-sandbox"] if os.geteuid() == 0 else []
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=[*SWIFTSHADER, *root])
+    with started_chromium() as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
