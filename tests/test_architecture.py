@@ -30,7 +30,7 @@ LAYERS = """
 """
 FLOORS = LAYERS.split()
 LATENTS_ONLY = {"gaussians", "splatter_image", "rasterizers"}
-DATASETS = ("co3d", "realestate", "toy", "hydrant", "teddybear")
+DATASETS = ("co3d", "realestate", "toy", "hydrant", "teddybear", "srn")
 LONGEST_FILE = 400
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "shelve", "marshal"}
 MAY_IMPORT = {

@@ -9,7 +9,7 @@ from PIL import Image
 from support import strict_json
 
 from completesplat.data.toy.module import ToyObjectsDataModule
-from completesplat.evaluation.scorer import copy_reference, repeat_image
+from completesplat.evaluation.naive_predictors import copy_reference, repeat_image
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.trajectories import orbit
 from completesplat.metrics.images import psnr

@@ -17,6 +17,7 @@ from rich.progress import track
 
 from completesplat.commands import quieten
 from completesplat.commands.trained import GivenScenes, RunCheckpoint, trained_model
+from completesplat.evaluation.board_results import RESULT, board_result, prepare_for_board, write_for_board
 from completesplat.evaluation.mode_benchmark import (
     HiddenModesEvaluation,
     describe_mode_test,
@@ -24,7 +25,7 @@ from completesplat.evaluation.mode_benchmark import (
     write_modes,
 )
 from completesplat.evaluation.mode_tables import mode_results_table
-from completesplat.evaluation.protocol import Config, describe_test, scored_data, set_metrics
+from completesplat.evaluation.protocol import Config, describe_test, scored_data, set_metrics, tested_names
 from completesplat.evaluation.records import CONFIG, MODEL, PROTOCOL, SCORES, read_record
 from completesplat.evaluation.score_tables import evaluation_table
 from completesplat.evaluation.table_writers import show
@@ -73,6 +74,7 @@ def run(
     data = scored_data(run_config, evaluation)
     module = tested.open_module(run_config)
     set_metrics(module, evaluation)
+    prepare_for_board(module, evaluation)
     loggers = built_parts(logger)
     tester: Trainer = instantiate(trainer, precision=evaluation["precision"], logger=loggers, _convert_="all")
     with wandb_runs(loggers, OmegaConf.load(out / CONFIG), out):
@@ -83,6 +85,7 @@ def run(
         described = describe_test(evaluation, module, data, scores, out) | tested.facts()
         results = {PROTOCOL: described, **scores}
         write_json(out / SCORES, results)
+        write_for_board(module, evaluation, described, tested.label, out)
     label = module.method if isinstance(tested, GivenScenes) else MODEL
     show(evaluation_table(results, label), width=160)
     for name, reason in described["missing"].items():
@@ -119,6 +122,7 @@ def run_hidden_modes(
     tested = trained_model(**trained)
     quieten()
     module, data = tested.open()
+    data.tested_names = tested_names(evaluation)
     data.prepare_data()
     data.setup("test")
     use_gpu = trainer["accelerator"] != "cpu" and torch.cuda.is_available()
@@ -128,6 +132,9 @@ def run_hidden_modes(
     write_modes(measured, evaluation["samples"], out)
     described = describe_mode_test(evaluation, module, data, measured, out) | tested.facts()
     write_json(out / "protocol.json", described)
+    if evaluation["board"] is not None:
+        result = board_result(evaluation, described, measured.by_scene(), tested.label)
+        write_json(out / RESULT, result)
     results = measured.results(evaluation["samples"])
     scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
     loggers: list[Logger] = built_parts(logger)

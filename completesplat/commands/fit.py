@@ -18,6 +18,7 @@ from completesplat.commands.evaluate import built_parts
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError, own_errors
+from completesplat.evaluation.board_results import prepare_for_board, write_for_board
 from completesplat.evaluation.protocol import describe_test, scored_data, set_metrics
 from completesplat.evaluation.provenance import checkpoint_facts
 from completesplat.evaluation.records import SCORES, read_record
@@ -111,6 +112,7 @@ def run(config: DictConfig, out: Path) -> None:
             results["upper_bound"] = module.upper_bound
             results["test"] = test
             show(evaluation_table(test), width=160)
+            write_for_board(module, evaluation, described, None, out)
         write_json(out / SCORES, results)  # the last file, because it means that the job is done
 
 
@@ -213,6 +215,7 @@ def _test(config: DictConfig, module: Scorer, data: SceneDataModule) -> dict[str
         enable_checkpointing=False,
         _convert_="all",
     )
+    prepare_for_board(module, config.evaluation)
     trainer.test(module, datamodule=data, verbose=False)
     return _logged(trainer)
 

@@ -43,6 +43,12 @@ class TrainedModel(ABC):
 
     seed: int
     sampler: Mapping[str, object] | None
+    method: str | None
+
+    @property
+    def label(self) -> str | None:
+        """Return the name of the method for results; None: that of the model's class."""
+        return self.method
 
     @abstractmethod
     def configuration(self) -> Any:
@@ -89,6 +95,7 @@ class RunCheckpoint(TrainedModel):
     trust: bool
     sampler: Mapping[str, object] | None
     seed: int
+    method: str | None
 
     def configuration(self) -> Any:
         """See `TrainedModel`; raise CompleteSplatError if `fit` would refuse an override."""
@@ -125,6 +132,12 @@ class GivenWeights(TrainedModel):
     rasterizer: Mapping[str, object]
     sampler: Mapping[str, object] | None
     seed: int
+    method: str | None
+
+    @property
+    def label(self) -> str:
+        """Return the given name, or else that of the weights."""
+        return Path(self.weights).name if self.method is None else self.method
 
     @cached_property
     def model(self) -> SceneModel:
@@ -188,15 +201,18 @@ class GivenScenes(TrainedModel):
     def files(self) -> "PlySamples":
         from completesplat.evaluation.ply_samples import PlySamples
 
-        rendering = _rendering(self.rasterizer, self.data.get("background"))
-        return PlySamples(self.scenes, self.frame, self.align, self.method, **rendering)
+        rasterizer = instantiate(self.rasterizer, _convert_="all")
+        return PlySamples(self.scenes, self.frame, self.align, self.method, rasterizer=rasterizer)
 
     def configuration(self) -> Any:
         """Return the config of the data."""
         return _given_data(self.data, self.seed)
 
     def scorer(self, configuration: Any) -> "Scorer":
-        """Return the scorer of the files; raise CompleteSplatError if there is no such folder."""
+        """Return the scorer of the files, on the data's background; raise CompleteSplatError without such a folder."""
+        background = configuration.data.get("background")
+        if background is not None:
+            self.files.background = background
         return self.files
 
     def facts(self) -> dict[str, object]:
@@ -222,13 +238,13 @@ def trained_model(**settings: Unpack[TestSettings]) -> TrainedModel:
     sampler = settings.get("sampler")
     seed = settings["seed"]
     check_one_model(ckpt, weights, scenes)
-    if scenes is None and (frame, align, method) != ("opencv", "none", None):
-        raise CompleteSplatError("frame, align, method: these apply to files only; give scenes=DIR")
+    if scenes is None and (frame, align) != ("opencv", "none"):
+        raise CompleteSplatError("frame, align: these apply to files only; give scenes=DIR")
     if ckpt is not None:
         if data is not None:
             raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
         checkpoint = Path(ckpt, RUN_CHECKPOINT) if Path(ckpt).is_dir() else Path(ckpt)
-        return RunCheckpoint(checkpoint, overrides, settings["trust"], sampler, seed)
+        return RunCheckpoint(checkpoint, overrides, settings["trust"], sampler, seed, method)
     if overrides:
         raise CompleteSplatError("overrides change a run's settings: give ckpt=FILE, or else data.KEY=VALUE")
     if data is None:
@@ -238,7 +254,8 @@ def trained_model(**settings: Unpack[TestSettings]) -> TrainedModel:
         if weights == AUTO:
             weights, reason = likeliest_for_test(data, seed)
             print(f"weights: {weights}{reason}")
-        return GivenWeights(weights, settings["trust"], data, settings.get("typed", ()), rasterizer, sampler, seed)
+        typed = settings.get("typed", ())
+        return GivenWeights(weights, settings["trust"], data, typed, rasterizer, sampler, seed, method)
     return GivenScenes(str(scenes), frame, align, method, data, rasterizer, sampler, seed)
 
 

@@ -124,11 +124,20 @@ def placed_sequence(
     factor = OBJECT_HALF_SIZE / placement.half_size
     squares = stack([crop_resize(camera, *square_of(camera), framing.image_size) for camera in cameras])
     squares = squares.scale_world(torch.tensor(factor, dtype=torch.float64))
-    depths = transform_points(squares.world_to_camera, factor * placement.center[None])[..., 0, 2]
+    center = factor * placement.center
     baseline = (squares.centers - squares.centers[0]).norm(dim=-1).max()
+    depths = transform_points(squares.world_to_camera, center[None])[..., 0, 2]
     if not baseline > SMALLEST_BASELINE * depths.abs().mean():
         raise BadCamera("the cameras do not move")
+    return PosedSequence(name, tuple(frames), squares, depths_around(squares, center, framing), read, scale=factor)
+
+
+def depths_around(cameras: Cameras, center: Float[Tensor, "3"], framing: ObjectFraming) -> Float[Tensor, "view 2"]:
+    """Return near and far for each camera [view], before and behind the centre of the object, in float32.
+
+    If a broken pose puts the object behind the camera, the depth range still has a positive length.
+    """
+    depths = transform_points(cameras.world_to_camera, center[None])[..., 0, 2]
     near = (depths - framing.depth_before).clamp(min=SMALLEST_NEAR)
-    # If a broken pose puts the object behind the camera, the depth range still has a positive length.
-    ranges = torch.stack([near, torch.maximum(depths, near) + framing.depth_after], dim=-1).to(torch.float32)
-    return PosedSequence(name, tuple(frames), squares, ranges, read, scale=factor)
+    far = torch.maximum(depths, near) + framing.depth_after
+    return torch.stack([near, far], dim=-1).to(torch.float32)

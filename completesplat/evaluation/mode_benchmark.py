@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, TypedDict
+from typing import Annotated, Any, TypedDict
 
 import torch
 from jaxtyping import Bool, Float
@@ -31,6 +31,7 @@ class HiddenModesEvaluation(TypedDict):
     """Numbers of samples, scenes and views. `conf/evaluation/hidden_modes.yaml` explains each."""
 
     name: str
+    board: Mapping[str, Any] | None
     samples: Annotated[int, Range(2)]
     scenes: Positive | None
     views: Positive
@@ -97,6 +98,11 @@ class ModeMeasurements:
             results[method]["scenes"] = len(self.names)
             results[method]["samples"] = samples
         return results
+
+    def by_scene(self) -> dict[str, dict[str, dict[str, float | None]]]:
+        """Return the scores by method and scene."""
+        names = self.names
+        return {method: dict(zip(names, rows, strict=True)) for method, rows in self.scores.items()}
 
     def shares(self) -> dict[str, list[dict[str, object]]]:
         """Return by method the modes' shares of samples, over all scenes whose modes have the same probabilities.

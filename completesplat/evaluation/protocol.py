@@ -8,6 +8,7 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
+from completesplat.data.lists import listed_names
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
@@ -59,6 +60,8 @@ def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
             raise CompleteSplatError(f"{chosen} needs evaluation.data.{key}=FILE (fit: or test=false)")
         run_config.data[key] = value
     data: SceneDataModule = instantiate(run_config.data, _convert_="all")
+    names = tested_names(evaluation)
+    data.tested_names = names
     data_set = str(data.describe()["data_set"])
     if evaluation["data_set"] not in (None, data_set.partition("/")[0]):
         message = f"is of {evaluation['data_set']}, this run's data are {data_set}: use evaluation=images"
@@ -72,8 +75,15 @@ def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
     larger: SceneDataModule = instantiate(run_config.data, image_size=resolution, _convert_="all")
     if is_packed(data.root):
         settings_must_match(larger.root, larger.packed_settings())
+    larger.tested_names = names
     larger.low_resolution = data
     return larger
+
+
+def tested_names(evaluation: Config) -> list[str] | None:
+    """Return the names of the scenes that a protocol of the board tests; None: all scenes of the data's test."""
+    board = evaluation["board"]
+    return None if board is None or board["list"] is None else listed_names(board["list"])
 
 
 def set_metrics(module: Scorer, evaluation: Config) -> None:

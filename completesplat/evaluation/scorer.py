@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from jaxtyping import Float
@@ -17,6 +17,15 @@ from torch import Tensor
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import gather_values
 from completesplat.data.loading.loader import SceneLoader
+from completesplat.data.loading.object_data_module import ObjectDataModule
+from completesplat.data.sequences import spread_places
+from completesplat.evaluation.naive_predictors import (
+    Renders,
+    copy_reference,
+    flat_reference,
+    mirror_reference,
+    repeat_image,
+)
 from completesplat.evaluation.records import MODEL
 from completesplat.evaluation.regions import REGIONS
 from completesplat.evaluation.scene_scores import SceneScores
@@ -28,22 +37,15 @@ from completesplat.scene import SceneBatch, Views
 from completesplat.signals import restore_handlers
 
 Result = TypeVar("Result")
-Renders = Float[Tensor, "batch view 3 height width"]
+
+PICTURED_VIEWS = 3
 
 
-def copy_reference(scenes: SceneBatch) -> Renders:
-    """Return the reference image for every view. A model that does not beat this and `repeat_image` learned nothing."""
-    return scenes.reference.images[:, None].expand_as(scenes.all_views().images)
+class PicturedScene(NamedTuple):
+    """True images of a scene's reference and of some of its novel views, and the first sample's renders of these."""
 
-
-def mirror_reference(scenes: SceneBatch) -> Renders:
-    """Return the reference image, flipped left to right, for every view: often the best naive guess of a back."""
-    return copy_reference(scenes).flip(-1)
-
-
-def repeat_image(image: Float[Tensor, "3 height width"], scenes: SceneBatch) -> Renders:
-    """Return an image for every view. The training set's mean image is the best constant prediction of the MSE."""
-    return image.to(scenes.reference.images).expand_as(scenes.all_views().images)
+    truth: Float[Tensor, "view 3 height width"]
+    renders: Float[Tensor, "view 3 height width"]
 
 
 def synchronized_time() -> float:
@@ -82,6 +84,8 @@ class Scorer(LightningModule):
         self.rasterizer = rasterizer
         self.background = background
         self.evaluation = SceneScores()
+        self.pictured: dict[str, PicturedScene | None] = {}
+        """Pictures of scenes by name; those whose names are set before a test are taken by it."""
         self.seconds: dict[str, list[float]] = defaultdict(list)
         """Seconds by the name of the work: `inference` of a scene with all its samples, `rendering` of one sample."""
         # This is Lightning's name. One of several processes may have no test scene.
@@ -147,12 +151,18 @@ class Scorer(LightningModule):
         if self.first_novel:
             evaluation.update("copy_reference", copy_reference(scenes), scenes)
             evaluation.update("mirrored_reference", mirror_reference(scenes), scenes)
+            if isinstance(self.data, ObjectDataModule):
+                evaluation.update("flat_reference", flat_reference(scenes), scenes)
 
     def _score_scene(self, name: str, samples: Gaussians, cameras: Cameras, truth: Views) -> None:
         """Score the images and the depth of one scene's samples, rendered from cameras [view]."""
         rendered = self.timed("rendering", partial(self.render_from, samples, cameras), len(samples.means))
         images = upsampled(rendered.over(self.background), truth.cameras.image_size)
         self.evaluation.update_samples(name, images, truth)
+        if name in self.pictured:
+            count = len(truth.images)
+            views = [0, *(first + 1 for first in spread_places(count - 1, PICTURED_VIEWS))]
+            self.pictured[name] = PicturedScene(truth.images[views].cpu(), images[0, views].cpu())
         if truth.depths is not None:
             if truth.depths.shape[-2:] == rendered.alpha.shape[-2:]:
                 self.evaluation.update_depth(name, rendered[0].expected_depth(), truth)

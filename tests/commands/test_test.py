@@ -35,7 +35,7 @@ def scored(command, pipeline, tmp_path):
 def test_scores_stand_beside_the_naive_predictors(scored):
     printed, metrics = scored("var")
     described = metrics.pop("protocol")
-    assert list(metrics) == ["model", "mean_image", "copy_reference", "mirrored_reference"]
+    assert list(metrics) == ["model", "mean_image", "copy_reference", "mirrored_reference", "flat_reference"]
     assert described["data_set"] == "toy_objects"
     assert described["missing"].keys() == {"lpips", "fid", "kid"}
     for scores in metrics.values():
@@ -59,7 +59,7 @@ def test_scores_stand_beside_the_naive_predictors(scored):
 def test_data_without_training_images_have_no_mean_image(scored):
     printed, metrics = scored("var", "overrides=['data.subset=null','data.test_fraction=1']")
     described = metrics.pop("protocol")
-    assert list(metrics) == ["model", "copy_reference", "mirrored_reference"]
+    assert list(metrics) == ["model", "copy_reference", "mirrored_reference", "flat_reference"]
     assert described["missing"]["mean_image"] in printed
     assert metrics["model"]["scenes"] == 4
 

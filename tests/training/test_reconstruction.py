@@ -6,7 +6,7 @@ from scenes_for_training import quiet_trainer, scene_batch
 from support import NETWORKS, compose_config
 from torch.utils.data import DataLoader
 
-from completesplat.evaluation.scorer import copy_reference, mirror_reference, repeat_image
+from completesplat.evaluation.naive_predictors import copy_reference, mirror_reference, repeat_image
 from completesplat.training.callbacks import BadSteps
 from completesplat.weights.checkpoint_reading import read_checkpoint
 

@@ -2,7 +2,7 @@
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -15,10 +15,11 @@ from completesplat.data.loading.training_statistics import TypicalCamera, mean_c
 from completesplat.data.loading.view_selection import Choice
 from completesplat.data.packed.manifest import Scalar, is_packed, settings_must_match
 from completesplat.data.packed.source import PackedSource, local_root
-from completesplat.data.sequences import PosedSequence, SequenceSource
+from completesplat.data.sequences import PosedSequence, SequenceSource, first_names
 from completesplat.data.tolerance import ErrorTolerance, OnBad
-from completesplat.errors import CompleteSplatError, DataError, errors_at
+from completesplat.errors import CompleteSplatError, DataError, MissingFile, errors_at
 from completesplat.quantities import Range, Share, Side
+from completesplat.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +58,8 @@ class SceneDataSet(ABC):
         self.background = background
         self.cache = cache
         self.tolerance = ErrorTolerance(on_bad, max_bad_fraction)
+        self.tested_names: Sequence[str] | None = None
+        """Names of the sequences that a test takes, those of a protocol's list; None: all."""
         self._sources: dict[str, SequenceSource] = {}
         self._stores: dict[str, SceneStore] = {}
 
@@ -117,10 +120,20 @@ class SceneDataSet(ABC):
                 self._sources[split] = PackedSource(self.root, split, self.image_size)
             else:
                 self._sources.update(self.open(split))
+            if split == "test" and self.tested_names is not None:
+                self._take_only(self.tested_names, self._sources[split])
         source = self._sources[split]
         for error in source.refused:
             self.tolerance.check(error)
         return source
+
+    def _take_only(self, names: Sequence[str], source: SequenceSource) -> None:
+        """Leave out the sequences that are not listed; raise MissingFile if one that is listed is not there."""
+        missing = sorted(set(names).difference(source.names))
+        if missing:
+            count = f"{len(missing)} of the {counted(len(names), 'scene')} of the protocol's list"
+            raise MissingFile(f"{count} are not there: {first_names(missing)}", str(self.root))
+        source.names = sorted(set(names))
 
     def store(self, split: str) -> SceneStore:
         """Return the scenes of a split, which must have sequences that can be used. Errors as in `source`."""

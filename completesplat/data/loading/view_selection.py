@@ -57,10 +57,13 @@ class ObjectViews:
 
     def evaluation(self, frames: int, split: str) -> Choice:
         """Return the first frame as reference and others as targets."""
-        targets = self.test_targets
+        return evaluation_views(frames, self.targets_of(split))
+
+    def targets_of(self, split: str) -> int | None:
+        """Return the largest number of targets of a scene of "val" or "test"; None: all other frames."""
         if split == "val" and self.validation_targets is not None:
-            targets = self.validation_targets
-        return evaluation_views(frames, targets)
+            return self.validation_targets
+        return self.test_targets
 
     def described_targets(self) -> str:
         """Return the targets of a test in words."""

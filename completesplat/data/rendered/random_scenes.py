@@ -26,6 +26,12 @@ SMALLEST_ROOM = 3.0  # half size of a room: relative to the farthest camera, and
 TEXTURES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 ENVIRONMENTS = (".hdr", ".exr")
 WHITE_FLOOR = (0.5, 1.1)
+# Of `fixed_cameras`, in degrees.
+FIXED_FOV = 40.0
+FIRST_AZIMUTH = 30.0
+FIRST_ELEVATION = 20.0
+HIGHEST = 60.0
+GOLDEN = (math.sqrt(5) - 1) / 2
 ASIDE = 45.0
 """Largest angle in degrees between the first camera's azimuth and the object's front."""
 
@@ -102,19 +108,21 @@ def draw_cameras(
 
     Args:
         kind: `turn`: around the object at varying heights, as people film for CO3D; `hemisphere`: from random
-            directions above the ground; or the path of a `transforms.json`, whose cameras are taken.
+            directions above the ground; `fixed`: `fixed_cameras`, to which `fov` does not apply; or the path of a
+            `transforms.json`, whose cameras are taken.
         front: azimuth of the object's front (degrees, from x to y), at most `ASIDE` from the first camera; None: any.
         fov: smallest and largest field of view in degrees, drawn once for an object.
 
     Raises:
-        CompleteSplatError: the kind is unknown, the file's cameras cannot be read, or `front` is given with a file.
+        CompleteSplatError: the kind is unknown, the file's cameras cannot be read, or `front` is given with cameras
+            that are not random.
     """
     if kind not in ("turn", "hemisphere"):
-        if Path(kind).suffix != ".json":
-            raise CompleteSplatError(f"cameras={kind}: choose turn, hemisphere or the path of a transforms.json")
+        if kind != "fixed" and Path(kind).suffix != ".json":
+            raise CompleteSplatError(f"cameras={kind}: choose turn, hemisphere, fixed or the path of a transforms.json")
         if front is not None:
-            raise CompleteSplatError(f"front={front}: has no effect on the cameras of a file; leave it out")
-        return read_cameras(Path(kind), size)
+            raise CompleteSplatError(f"front={front}: has no effect on cameras={kind}; leave it out")
+        return fixed_cameras(views, size) if kind == "fixed" else read_cameras(Path(kind), size)
     azimuth, elevation = turn_angles(rng, views) if kind == "turn" else hemisphere(rng, views)
     if front is not None:
         azimuth = azimuth - azimuth[0] + math.radians(front + rng.uniform(-ASIDE, ASIDE))
@@ -125,6 +133,24 @@ def draw_cameras(
     targets = torch.from_numpy(rng.normal(0, 0.05, (views, 3)))
     matrices = look_at(torch.from_numpy(eyes.T.copy()), targets, UP)
     return [Cameras(matrix, pinhole(degrees, size).double(), (size, size)) for matrix in matrices]
+
+
+def fixed_cameras(views: int, size: int) -> list[Cameras]:
+    """Return the cameras that are the same for every object, those of the protocols on meshes.
+
+    They look at the origin from a distance at which the ball around the object touches the image's border. The first
+    is 20 degrees above the horizon, at an azimuth of 30 degrees from x. The others follow all around; their elevations
+    are spread from 0 to 60 degrees by the golden ratio.
+    """
+    number = torch.arange(views, dtype=torch.float64)
+    azimuth = math.radians(FIRST_AZIMUTH) + 2 * math.pi * number / views
+    elevation = math.radians(HIGHEST) * ((number * GOLDEN) % 1)
+    elevation[0] = math.radians(FIRST_ELEVATION)
+    level = elevation.cos()
+    directions = torch.stack([level * azimuth.cos(), level * azimuth.sin(), elevation.sin()], dim=-1)
+    eyes = directions / math.sin(math.radians(FIXED_FOV) / 2)
+    matrices = look_at(eyes, torch.zeros_like(eyes), UP)
+    return [Cameras(matrix, pinhole(FIXED_FOV, size).double(), (size, size)) for matrix in matrices]
 
 
 def turn_angles(rng: np.random.Generator, views: int) -> tuple[Angles, Angles]:

@@ -21,14 +21,16 @@ from rich.progress import track
 from completesplat.data.co3d import category_writers
 from completesplat.data.co3d.annotations import viewpoint
 from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.lists import listed_names
 from completesplat.data.rendered.assets import Asset, BrokenMesh, check_named_files, find_meshes, procedural_objects
 from completesplat.data.rendered.blender import Blender, find_blender, run_job
 from completesplat.data.rendered.mesh_reading import READABLE, import_trimesh
 from completesplat.data.rendered.mesh_renderer import draw_job
 from completesplat.data.rendered.random_scenes import PAINTS, RenderSettings, check_surroundings, draw_rendered_scene
+from completesplat.data.sequences import first_names
 from completesplat.data.validation import read_points
 from completesplat.data.validation.processes import share_of, usable_cores
-from completesplat.errors import CompleteSplatError, DataError, UnreadableFile
+from completesplat.errors import CompleteSplatError, DataError, MissingFile, UnreadableFile
 from completesplat.files import atomic_folder, write_text
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
 from completesplat.photo.saving import save_jpeg, to_uint8
@@ -74,6 +76,7 @@ def render(
     factory: str | None,
     count: Positive,
     out: Path,
+    objects: str | None = None,
     renderer: Renderer = "mesh",
     blender: str | None = None,
     **job: Unpack[JobSettings],
@@ -86,6 +89,7 @@ def render(
 
     Args:
         meshes, factory: a folder of meshes, or a class of Infinigen, of which `count` objects are made.
+        objects: list of the meshes to render (`listed_names`), by the names of their sequences; None: all.
         renderer: `mesh` draws what `READABLE` names without Blender, and the rest with it; `blender` draws all with it.
         blender: see `find_blender`.
 
@@ -100,16 +104,18 @@ def render(
     _check_places(meshes, factory, out)
     check_surroundings(settings)
     draw_rendered_scene("", settings)  # refuses cameras that cannot be read
-    objects = find_meshes(Path(meshes)) if meshes is not None else []
+    assets = find_meshes(Path(meshes)) if meshes is not None else []
+    if objects is not None:
+        assets = _of_list(assets, objects, meshes)
     by_blender = renderer == "blender" or factory is not None or settings["light"] != "random"
-    needed = by_blender or any(not _is_readable(asset) for asset in objects)
+    needed = by_blender or any(not _is_readable(asset) for asset in assets)
     program = find_blender(blender) if needed else None
     if not by_blender:
         import_trimesh()
     category = out / CATEGORY
     if factory is not None and program is not None:
-        objects = procedural_objects(program, factory, count)
-    mine = share_of(objects, job["shard"], job["shards"])
+        assets = procedural_objects(program, factory, count)
+    mine = share_of(assets, job["shard"], job["shards"])
     lock = FileLock(out / LOCK)
     out.mkdir(parents=True, exist_ok=True)
     with lock:
@@ -122,7 +128,7 @@ def render(
     for name, reason in broken.items():
         logger.warning("left out: %s: %s", name, reason)
     with lock:
-        _write_lists(category, objects, broken, len(waiting) - len(broken))
+        _write_lists(category, assets, broken, len(waiting) - len(broken))
     return category
 
 
@@ -132,6 +138,16 @@ def _check_places(meshes: str | None, factory: str | None, out: Path) -> None:
         raise CompleteSplatError("give either meshes=FOLDER or factory=NAME (of Infinigen, such as SofaFactory)")
     if meshes is not None and out.resolve().is_relative_to(Path(meshes).resolve()):
         raise DataError(f"lies in meshes={meshes}, and its points would be taken for meshes", f"out={out}")
+
+
+def _of_list(assets: Sequence[Asset], chosen: str, meshes: str | None) -> list[Asset]:
+    """Return the listed objects; raise MissingFile if one is not among the meshes."""
+    names = set(listed_names(chosen))
+    listed = [asset for asset in assets if asset.name in names]
+    missing = sorted(names.difference(asset.name for asset in listed))
+    if missing:
+        raise MissingFile(f"{len(missing)} of {len(names)} meshes of objects={chosen}: {first_names(missing)}", meshes)
+    return listed
 
 
 def _begin(category: Path, settings: RenderSettings, by_blender: bool) -> None:

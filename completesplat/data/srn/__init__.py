@@ -1,0 +1,1 @@
+"""ShapeNet-SRN: cars and chairs, as Scene Representation Networks rendered them and pixelNeRF distributes them."""
