@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-processes test-slow test-wheel test-browser fuzz check size lock bench gpu gpu-weights gpu-weights-inputs docs site try notebooks release clean
+.PHONY: help board demo demo-train test test-processes test-slow test-wheel test-browser fuzz check size lock bench gpu gpu-weights gpu-weights-inputs docs site try notebooks release clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -97,6 +97,9 @@ lock: $(READY) ## Write requirements.lock: the newest versions that pyproject.to
 
 size: ## Print the lines of code of package and tests, and how dense they are
 	@$(PYTHON) tests/lines_of_code.py completesplat tests
+
+board: $(READY) ## Write the board's page from the results in completesplat/evaluation/board
+	$(BIN)/python -c "from completesplat.evaluation.board_tables import write_page; write_page()"
 
 bench: $(READY) ## Time the rasterizer backends, side by side
 	$(BIN)/completesplat bench rasterizers

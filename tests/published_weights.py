@@ -11,6 +11,13 @@ from completesplat.baselines.splatter_image.network import SongUNet
 # configs/default_config.yaml and configs/dataset/*.yaml of szymanowiczs/splatter-image, with small networks.
 DATA = {
     "hydrants": {"znear": -2.0, "zfar": 2.0, "white_background": False, "origin_distances": True},
+    "cars": {
+        "fov": 51.98948897809546,
+        "znear": 0.8,
+        "zfar": 1.8,
+        "white_background": True,
+        "origin_distances": False,
+    },
     "objaverse": {
         "fov": 49.134342641202636,
         **{"znear": 0.8, "zfar": 3.2, "white_background": True, "origin_distances": False},

@@ -22,6 +22,7 @@ from completesplat.evaluation.tables import (
     marks,
     score_cell,
 )
+from completesplat.files import write_text
 from completesplat.metrics import METRIC_FORMATS, MetricFormat
 from completesplat.settings.composition import compose
 from completesplat.settings.options import options
@@ -190,6 +191,11 @@ def _published(section: BoardSection, columns: Columns) -> list[_Row]:
     return rows
 
 
+def write_page() -> None:
+    """Write the page of the results in the package, beside them (`make board`)."""
+    write_text(BOARD / "README.md", board_markdown(board_sections(None), BOARD))
+
+
 def board_markdown(sections: Sequence[BoardSection], folder: Path) -> str:
     """Return the board as Markdown, with links to pictures relative to `folder`, in which it will lie."""
     parts = ["# Board", INTRODUCTION]
@@ -211,6 +217,6 @@ def board_markdown(sections: Sequence[BoardSection], folder: Path) -> str:
 
 INTRODUCTION = (
     "Scores of methods that complete a scene from one image, on public objects, each by one protocol: the same list of "
-    "scenes, input view, scored views, size and background. `completesplat report board` writes this page from the "
-    "files beside it. [How to add a method](../README.md#the-board)."
+    "scenes, input view, scored views, size and background. `make board` writes this page from the files beside it. "
+    "[How to add a method](../README.md#the-board)."
 )

@@ -123,13 +123,18 @@ class PlySamples(Scorer):
         super().on_test_epoch_end()
 
     def facts(self) -> dict[str, object]:
-        """Return facts for the protocol. The checksum covers the sorted lines of `sha256sum` for the used files."""
+        """Return facts for the protocol, with the SHA-256 of each used file.
+
+        The checkpoint's covers the sorted lines of `sha256sum` for these files.
+        """
         paths = [path.relative_to(self.folder) for scene in self.files.values() for path in scene]
-        lines = sorted(f"{sha256_of(self.folder / path)}  {path.as_posix()}\n" for path in paths)
+        digests = {path.as_posix(): sha256_of(self.folder / path) for path in sorted(paths)}
+        lines = sorted(f"{digest}  {path}\n" for path, digest in digests.items())
         checksum = hashlib.sha256("".join(lines).encode()).hexdigest()
         return {
             "checkpoint": {"path": str(self.folder), "sha256": checksum, "step": None},
             "ema": None,
             "frame": self.frame,
             "align": self.align,
+            "files": digests,
         }

@@ -19,7 +19,7 @@ from completesplat.baselines import densification, fitting
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.sequences import PosedSequence, first_names
 from completesplat.errors import CompleteSplatError
-from completesplat.evaluation.scorer import Renders
+from completesplat.evaluation.naive_predictors import Renders
 from completesplat.export.fitted_scene import FittedViews, write_fitted_scene
 from completesplat.export.placed_scene import FileCoordinates, PlacedScene
 from completesplat.export.scene_files import OutputFiles, write_scene

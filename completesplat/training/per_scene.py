@@ -19,7 +19,8 @@ from completesplat.baselines.preoptimized import SparseVAE, project_to_splatter_
 from completesplat.data.loading.distributed import gather_values, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.errors import CompleteSplatError
-from completesplat.evaluation.scorer import Renders, Scorer
+from completesplat.evaluation.naive_predictors import Renders
+from completesplat.evaluation.scorer import Scorer
 from completesplat.export.fitted_scene import FittedViews, write_fitted_scene
 from completesplat.export.placed_scene import PlacedScene
 from completesplat.files import make_folder, write_bytes

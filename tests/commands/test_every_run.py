@@ -54,7 +54,9 @@ def test_scenes_of_stage_one_are_those_that_its_test_scores(pipeline, run):
     assert isinstance(model, DeterministicModel)
     assert not model.draws_samples
     checkpoint = run / "checkpoints/last.ckpt"
-    module, data = RunCheckpoint(checkpoint, [f"data.root={pipeline.toy}"], trust=True, sampler=None, seed=0, method=None).open()
+    module, data = RunCheckpoint(
+        checkpoint, [f"data.root={pipeline.toy}"], trust=True, sampler=None, seed=0, method=None
+    ).open()
     data.setup("test")
     batch = next(iter(data.test_dataloader()))
     with torch.no_grad():

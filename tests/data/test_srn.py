@@ -53,7 +53,8 @@ def test_a_point_in_the_world_is_where_the_images_show_it(archive):
     for view, (x, y) in enumerate(seen.tolist()):
         image = sequence.read(view).image
         row, column = divmod(int(image[0].argmin()), SIZE)
-        assert abs(column + 0.5 - x) <= 1 and abs(row + 0.5 - y) <= 1
+        assert abs(column + 0.5 - x) <= 1
+        assert abs(row + 0.5 - y) <= 1
     distances = sequence.cameras.centers.norm(dim=-1)
     torch.testing.assert_close(distances, torch.full_like(distances, DISTANCE))
     expected = torch.tensor([DISTANCE - 0.5, DISTANCE + 0.5])
@@ -90,7 +91,7 @@ def test_the_reference_is_the_chosen_view_and_all_others_are_targets(archive):
 
 
 def test_an_object_of_white_images_alone_is_kept(archive):
-    """Of the cars of the test, 876d92ce6a0e4bf399588eee976baae has white images alone, and published scores count it."""
+    """Car 876d92ce6a0e4bf399588eee976baae of the test has white images alone, and published scores count it."""
     for path in (archive / "cars_test/e/rgb").glob("*.png"):
         Image.new("RGBA", (SIZE, SIZE), "white").save(path)
     data = module(archive)
@@ -109,7 +110,9 @@ def test_prepared_objects_give_the_same_scenes(archive, tmp_path):
 
 
 def test_a_missing_split_is_named(tmp_path):
-    with pytest.raises(MissingFile, match="cars_test: no objects with intrinsics.txt; give the folder of the unpacked"):
+    with pytest.raises(
+        MissingFile, match=r"cars_test: no objects with intrinsics\.txt; give the folder of the unpacked"
+    ):
         module(tmp_path).source("test")
 
 

@@ -30,7 +30,12 @@ LOGGED = [
     ("number", (STAGE2,), "train/loss_t* samples/psnr samples/psnr_of_mean samples/diversity"),
     ("number", (STAGE2,), "latents/std_* latents/mean_*"),
     ("image", (STAGE2,), "samples"),
-    ("number", TESTED, "test/full/* test/object/* test/mean_image/* test/copy_reference/* test/mirrored_reference/* test/flat_reference/*"),
+    (
+        "number",
+        TESTED,
+        "test/full/* test/object/* test/mean_image/* test/copy_reference/* test/mirrored_reference/* "
+        "test/flat_reference/*",
+    ),
     ("number", (TEST,), "test/best_of_k/* test/best_of_k_by_metric/* test/mean_of_k/*"),
     ("number", (MODES,), "hidden_modes/*"),
 ]

@@ -19,6 +19,7 @@ from completesplat.data.rendered.random_scenes import (
     draw_cameras,
     draw_light,
     draw_surface,
+    fixed_cameras,
     room_size,
     textures_of,
 )
@@ -61,6 +62,30 @@ def test_a_turn_goes_once_around_and_a_hemisphere_covers_all_heights():
             [0.265, 0.5, 0.735], abs=0.05
         )
         assert sines.max() < 0.98
+
+
+def test_fixed_cameras_depend_on_nothing_but_their_number_and_see_the_whole_ball():
+    first, *others = draw_cameras(np.random.default_rng(0), "fixed", 24, [36, 55], 64)
+    again = draw_cameras(np.random.default_rng(1), "fixed", 24, [20, 30], 64)
+    assert all(torch.equal(a.world_to_camera, b.world_to_camera) for a, b in zip([first, *others], again, strict=True))
+    x, y, z = (first.centers / first.centers.norm()).tolist()
+    assert math.degrees(math.asin(z)) == pytest.approx(20)
+    assert math.degrees(math.atan2(y, x)) == pytest.approx(30)
+    elevations = [math.degrees(math.asin(camera.centers[2] / camera.centers.norm())) for camera in others]
+    assert 0 <= min(elevations) < 5
+    assert 55 < max(elevations) <= 60
+    for camera in (first, *others):
+        away = camera.centers / camera.centers.norm()
+        across = torch.linalg.cross(away, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        # The ball's outline, as seen from this distance, lies nearer to the camera than its centre.
+        tangent = away / camera.centers.norm() + (1 - 1 / camera.centers.norm() ** 2).sqrt() * across / across.norm()
+        seen, _ = project(camera, tangent[None])
+        assert seen[0].tolist() == pytest.approx([0, 32], abs=0.01) or seen[0].tolist() == pytest.approx(
+            [64, 32], abs=0.01
+        )
+    with pytest.raises(CompleteSplatError, match="front=0: has no effect on cameras=fixed"):
+        draw_cameras(np.random.default_rng(0), "fixed", 24, [36, 55], 64, front=0)
+    assert len(fixed_cameras(5, 64)) == 5
 
 
 def test_light_and_surfaces_are_values_that_json_holds_and_depend_on_the_generator_alone():
@@ -125,7 +150,7 @@ def test_the_first_camera_stands_before_the_front(kind, tmp_path):
     assert min(aside) == pytest.approx(-45, abs=8)
     assert max(aside) == pytest.approx(45, abs=8)
     assert all(-45 <= degrees <= 45 for degrees in aside)
-    with pytest.raises(CompleteSplatError, match="front=0: has no effect on the cameras of a file"):
+    with pytest.raises(CompleteSplatError, match="front=0: has no effect on cameras="):
         draw_cameras(rng, str(tmp_path / "transforms.json"), 8, [40, 50], 64, 0)
 
 

@@ -10,7 +10,7 @@ from support import refused, strict_json
 
 from completesplat.data.rendered.blender import VARIABLE
 from completesplat.data.rendered.rendering import RenderedDataModule, render
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import CompleteSplatError, DataError, MissingFile
 
 trimesh = pytest.importorskip("trimesh")
 QUICK = meshes.SETTINGS | {"renderer": "mesh", "views": 4, "size": 32, "samples": 4}
@@ -86,3 +86,14 @@ def test_the_command_draws_a_folder_and_refuses_one_without_meshes(command, fold
     (tmp_path / "empty").mkdir()
     line = refused("data", "data_task=render", f"meshes={tmp_path / 'empty'}", *settings, f"out={tmp_path / 'more'}")
     assert "no meshes there" in line
+
+
+def test_the_meshes_of_a_list_alone_are_drawn(folder, tmp_path):
+    trimesh.creation.box().export(folder / "box.stl")  # would need Blender
+    (tmp_path / "list.txt").write_text("ball\n")
+    render(str(folder), out=tmp_path / "data", objects=str(tmp_path / "list.txt"), **QUICK)
+    data = RenderedDataModule(root=str(tmp_path / "data"), image_size=32, test_fraction=1, val_fraction=0.0)
+    assert data.source("test").names == ["ball"]
+    (tmp_path / "list.txt").write_text("ball\ncone\n")
+    with pytest.raises(MissingFile, match=r"1 of 2 meshes of objects=.*list\.txt: cone"):
+        render(str(folder), out=tmp_path / "data", objects=str(tmp_path / "list.txt"), **QUICK)
