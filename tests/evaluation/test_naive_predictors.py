@@ -47,9 +47,11 @@ def test_a_camera_that_moves_aside_sees_the_plane_move_by_its_parallax() -> None
 def test_the_plane_lies_where_the_optical_axes_meet(degrees: float) -> None:
     """Half a turn around shows the plane from behind: the input, flipped left to right."""
     center = torch.tensor([0.0, 0.0, DISTANCE])
-    angle = math.radians(degrees)
-    eye = center + DISTANCE * torch.tensor([math.sin(angle), 0.0, -math.cos(angle)])
-    scenes = scene([look_at(eye, center, UP)], (50.0, 60.0))  # a depth range that says nothing of it
+    matrices = []
+    for angle in (math.radians(degrees), math.radians(60)):
+        eye = center + DISTANCE * torch.tensor([math.sin(angle), 0.0, -math.cos(angle)])
+        matrices.append(look_at(eye, center, UP))
+    scenes = scene(matrices, (50.0, 60.0))  # a depth range that says nothing of it
     predicted = flat_reference(scenes)[0]
     reference = scenes.reference.images[0]
     middle = slice(SIZE // 2 - 1, SIZE // 2 + 1)
