@@ -13,11 +13,10 @@ from typing import Any
 import numba.np.arraymath  # else the first kernel imports it, and scipy with it  # noqa: F401
 import torch
 from hydra.utils import instantiate
-from jaxtyping import Float
 from omegaconf import DictConfig
-from torch import Tensor
 
 from completesplat.commands.inputs import find_images, left_out
+from completesplat.commands.predict_views import object_mask, predict_from_views
 from completesplat.commands.trained import open_generator, shown_background
 from completesplat.data.sequences import first_names
 from completesplat.data.validation.processes import map_in_processes, share_of
@@ -44,7 +43,6 @@ from completesplat.wording import counted, folder_names, printable, safe_name
 logger = logging.getLogger(__name__)
 
 OF_RUNS = ("image", "out", "shard", "shards", "devices")  # settings on which no single prediction depends
-OF_OBJECT = 0.1  # difference of a channel from the background of weights, from which a pixel is the object's
 sha256_of_weights = cache(sha256_of)  # a process has one model, of up to gigabytes
 
 
@@ -219,14 +217,6 @@ def placed_samples(
     return [PlacedScene(scene.to("cpu"), camera, model.up.cpu(), None, mask, own, depth) for scene in scenes]
 
 
-def object_mask(photograph: Photograph, background: float | None) -> Float[Tensor, "1 size size"] | None:
-    """Return where the object of a photo is: what was cut out, or what differs from the background of the weights."""
-    if photograph.cut_out is not None or background is None:
-        return photograph.cut_out
-    different = (photograph.image - background).abs().amax(0, keepdim=True) > OF_OBJECT
-    return different.float()
-
-
 def facts_of_photo(config: DictConfig, model: SceneModel, image: Path, photograph: Photograph) -> dict[str, Any]:
     """Return what `scene.json` records of a photo and the weights, beside the settings of generation."""
     facts: dict[str, Any] = {}
@@ -274,44 +264,6 @@ def report_failure(error: Exception, image: Path, is_only: bool) -> None:
     if is_fault:
         logger.error("a fault of the program, not of the image", exc_info=error)
     print(f"error: {message}", file=sys.stderr, flush=True)
-
-
-def predict_from_views(config: DictConfig, images: Sequence[Path], outputs: OutputFiles, out: Path) -> None:
-    """Write the files of one scene that all images show, into a folder with the name of the first image.
-
-    Raises:
-        CompleteSplatError: one image alone, or a mask, box, crop, field of view or removed background with the cameras.
-        DataError, WeightsError: as `read_photographs`, `CompleteSplat.reconstruct`.
-    """
-    from completesplat.data.captures.transforms_json import read_photographs
-
-    if len(images) < 2:
-        raise CompleteSplatError("cameras=FILE goes with two images or more: image=[A,B]")
-    others = [name for name in ("mask", "box", "fov") if config[name] is not None]
-    if config.background == REMOVE:
-        others.append("background=remove")
-    if config.crop != "whole":
-        others.append("crop")
-    if others:
-        raise CompleteSplatError(f"{others[0]} does not go with cameras=FILE")
-    model = open_generator(config, images)
-    views = read_photographs(images, Path(config.cameras), model.image_size)
-    views = replace(views, cameras=model.in_model_units(views.cameras))
-    scene = PlacedScene(model.reconstruct(views).to("cpu"), views.cameras[0], model.up.cpu())
-    recorded = {
-        "seed": config.seed,
-        "image": printable(images[0].name),
-        "images": [printable(image.name) for image in images],
-        "cameras": printable(Path(config.cameras).name),
-        "weights": printable(Path(config.weights).name),
-        "screen_space_dilation": config.screen_space_dilation,
-        "depth_range": model.depth_range.tolist(),
-    }
-    outputs = replace(outputs, background=shown_background(config.background, model))
-    rasterizer = instantiate(config.rasterizer, _convert_="all")
-    folder = out / safe_name(images[0].stem)
-    write_prediction(folder, views.images[0], [scene], rasterizer, outputs, recorded, partial(print, flush=True))
-    print(f"one scene of {len(images)} images, at the posterior's mean: {folder.name}/")
 
 
 def output_files(config: DictConfig) -> OutputFiles:

@@ -30,6 +30,9 @@ KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "
 Precision = Literal["32-true", "bf16-mixed", "16-mixed", 32, "bf16", 16]
 """Lightning's precisions with weights in float32, which Gaussians and cameras need."""
 
+Elevation = Annotated[float, Range(-85, 85)]
+"""Degrees above the horizon."""
+
 
 class TrainerSettings(TypedDict):
     """Settings whose ranges Lightning does not check."""
@@ -92,7 +95,8 @@ class PredictSettings(SceneSettings):
     batch: Positive | None
     mask: str | None
     box: Sequence[float] | None
-    cameras: str | None
+    cameras: str | Sequence[float] | None
+    elevation: Elevation | Sequence[Elevation]
     screen_space_dilation: bool
     maps: bool
     spz_version: Literal[3, 4]
@@ -299,18 +303,10 @@ def _in_choice(choices: Sequence[object], value: object) -> list[Violation]:
 
 
 def _in_union(members: Sequence[object], value: object) -> list[Violation]:
-    if all(typing.get_origin(member) is Literal or member is NoneType for member in members):
-        choices: list[object] = []
-        for member in members:
-            choices.extend([None] if member is NoneType else typing.get_args(member))
+    choices = _choices(members)
+    if choices is not None:
         return _in_choice(choices, value)
-    # Of `float | Tensor` only float counts, because no setting is a tensor. Classes without numbers accept everything.
-    if {int, float} & set(members) and isinstance(value, str | int | float | Sequence):
-        members = [member for member in members if not isinstance(member, type) or member in KINDS]
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        # Lists first, because the message gives the first reason.
-        lists = [member for member in members if typing.get_origin(member) is Sequence]
-        members = lists + [member for member in members if member not in lists]
+    members = _likely_first(members, value)
     attempts = [violations(member, value) for member in members]
     if [] in attempts:
         return []
@@ -321,6 +317,33 @@ def _in_union(members: Sequence[object], value: object) -> list[Violation]:
         elif typing.get_origin(member) is Literal:
             alternatives.append(", ".join(map(str, typing.get_args(member))))
     return [unfit._replace(reason=", or ".join([unfit.reason, *alternatives])) for unfit in attempts[0]]
+
+
+def _choices(members: Sequence[object]) -> list[object] | None:
+    """Return the values that a union allows if it has nothing but choices and null, else None."""
+    choices: list[object] = []
+    for member in members:
+        if member is NoneType:
+            choices.append(None)
+        elif typing.get_origin(member) is Literal:
+            choices.extend(typing.get_args(member))
+        else:
+            return None
+    return choices
+
+
+def _likely_first(members: Sequence[object], value: object) -> list[object]:
+    """Return the members of a union that a value is compared with, the one whose reason the message gives first.
+
+    Of `float | Tensor` only float counts, because no setting is a tensor. Classes without numbers accept everything.
+    """
+    counted = list(members)
+    if {int, float} & set(counted) and isinstance(value, str | int | float | Sequence):
+        counted = [member for member in counted if not isinstance(member, type) or member in KINDS]
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        return counted
+    lists = [member for member in counted if typing.get_origin(member) is Sequence]
+    return lists + [member for member in counted if member not in lists]
 
 
 def _in_list(kind: object, value: object) -> list[Violation]:

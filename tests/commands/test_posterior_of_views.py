@@ -1,5 +1,7 @@
 """`posterior=views` through both stages: training, cache, tests, predictions and reports."""
 
+import math
+
 import numpy as np
 import pytest
 from conftest import made
@@ -107,6 +109,27 @@ def test_several_images_with_their_cameras_give_one_scene(runs, command, tmp_pat
     assert np.abs(predict(1, 2, 3) - first).max() > 1e-3
 
 
+def test_angles_around_the_object_are_cameras_that_look_at_it(runs, command, tmp_path):
+    """The capture's cameras stand on a circle, each 60 degrees to the right of the one before."""
+    write_capture(tmp_path, 6)
+    images = ",".join(str(tmp_path / f"frame{number}.png") for number in (1, 2, 4))
+    given = [f"image=[{images}]", f"weights={runs / 'diffusion/weights'}", "video=false"]
+    angles = ["cameras=[60,120,240]", f"fov={math.degrees(0.7)}", "crop=center"]
+
+    def predict(name: str, *settings: str) -> np.ndarray:
+        command.succeeds("predict", *given, *settings, f"out={tmp_path / name}")
+        (splats,) = (tmp_path / name).rglob("*.ply")
+        return np.stack([PlyData.read(splats)["vertex"][name] for name in ("x", "y", "z", "f_dc_0", "opacity")])
+
+    by_file = predict("file", f"cameras={tmp_path / 'transforms.json'}")
+    np.testing.assert_allclose(predict("angles", *angles), by_file, atol=1e-3)
+    assert np.abs(predict("left", "cameras=[-60,-120,-240]", *angles[1:]) - by_file).max() > 1e-2
+    recorded = strict_json(tmp_path / "angles/frame1/scene.json")["settings"]
+    assert recorded["cameras"] == [60, 120, 240]
+    assert recorded["elevation"] == [0, 0, 0]
+    assert recorded["distances"] == [1, 1, 1]
+
+
 def test_images_that_cannot_be_taken_together_are_refused(runs, tiny_weights, tmp_path):
     write_capture(tmp_path, 6)
     one, two = (",".join(str(tmp_path / f"frame{number}.png") for number in range(count)) for count in (1, 2))
@@ -117,6 +140,24 @@ def test_images_that_cannot_be_taken_together_are_refused(runs, tiny_weights, tm
     ):
         given = [f"image=[{images}]", f"cameras={tmp_path / 'transforms.json'}", f"weights={weights}", f"box={box}"]
         assert message in refused("predict", *given)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["cameras=[0,90,180]"], "cameras: 3 angles for 2 images"),
+        (["cameras=[0,90]", "elevation=[10]"], "elevation: 1 elevation for 2 images"),
+        (["cameras=[0,360]"], "two photos are from the same angle and elevation"),
+        (["cameras=[0,90]", "elevation=90"], "elevation=90: must lie between -85 and 85"),
+        (["cameras=[0,90]", "box=[0,0,1,0.5]"], "box does not go with cameras=[ANGLES]"),
+        (["cameras=[0,left]"], "left"),
+        (["cameras=transforms.json", "elevation=10"], "elevation does not go with cameras=FILE"),
+    ],
+)
+def test_angles_that_say_nothing_are_refused(runs, tmp_path, settings, message):
+    write_capture(tmp_path, 6)
+    images = ",".join(str(tmp_path / f"frame{number}.png") for number in (1, 2))
+    assert message in refused("predict", f"image=[{images}]", f"weights={runs / 'diffusion/weights'}", *settings)
 
 
 @pytest.mark.parametrize(
