@@ -63,7 +63,7 @@ NEED_BLENDER = ("RENDERS", "ASSET", "RUN40", "RUN41")
 NEEDS_MORE = ["IMAGES", "SOFA", "COUCH", "SPLATS", "PART1", "TABLE_OF_A", "PHOTOS", "FOX", "MOUSE", "CUP", "FRUITS"]
 NEEDS_MORE += ["FRUIT_TURNS", "ETH80_FRUIT", "RUN7", "evaluation=co3d", "trainer.devices=8", "splatter_image:"]
 NEEDS_MORE += ["model_hydrants.pth", "SHAPES", "MIX", "STORE", "RUN90", "TOYS_TEST", "=CAN", "=TRACTOR"]
-NEEDS_MORE += ["SCANS", "gpu_weights"]
+NEEDS_MORE += ["SCANS", "gpu_weights", "RESULT"]
 TAKES_MINUTES = ["completesplat bench"]
 
 
@@ -104,10 +104,11 @@ def test_each_folder_that_a_command_needs_is_made_here():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A photograph, a folder of three with cameras, a capture, CO3D's hydrants, six turns, three meshes."""
+    """Photographs, a folder of three with cameras, a capture, CO3D's hydrants, six turns, three meshes."""
     place = tmp_path_factory.mktemp("readme")
     rng = np.random.default_rng(0)
-    Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)).save(place / "photo.jpg")
+    for name in ("photo", "front", "side", "back"):
+        Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)).save(place / f"{name}.jpg")
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(co3d_trees, "CATEGORY", "hydrant")
         names = [f"{index}_2_3" for index in range(4)]

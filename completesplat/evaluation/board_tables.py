@@ -28,7 +28,7 @@ from completesplat.settings.composition import compose
 from completesplat.settings.options import options
 
 BOARD = Path(__file__).parent / "board"
-"""Folder of the results in the package: `PROTOCOL/METHOD.json`, and perhaps `PROTOCOL/METHOD.jpg` beside it."""
+"""Folder of the results in the package: `PROTOCOL/NAME.json`, and perhaps `PROTOCOL/NAME.jpg` beside it."""
 ALL = "all pixels"
 OBJECT = "object pixels"
 INPUT = "input view"
@@ -142,8 +142,8 @@ def board_table(section: BoardSection) -> Table:
             mean, error = row.scores.get(name, (None, None))
             cells.append(score_cell(form, mean, error, mark[name][i] if row.competes else UNMARKED))
         table_rows.append(TableRow(row.source, [*cells, Cell(row.measured)]))
-    remarks = [ERRORS_NOTE] if table_rows else []
-    if table_rows and not modes:
+    remarks = [ERRORS_NOTE] if section.results else []
+    if section.results and not modes:
         remarks += [SSIM_NOTE, SHARPNESS_NOTE]
     title = f"{section.board['title']} (evaluation={section.name})"
     return Table(section.name, title, headings, table_rows, remarks)
@@ -199,7 +199,7 @@ def write_page() -> None:
 def board_markdown(sections: Sequence[BoardSection], folder: Path) -> str:
     """Return the board as Markdown, with links to pictures relative to `folder`, in which it will lie."""
     parts = ["# Board", INTRODUCTION]
-    for section in sections:
+    for section in sorted(sections, key=lambda section: not section.results):
         table = as_markdown(board_table(section))
         heading, _, rest = table.partition("\n")
         about = markdown(" ".join(str(section.board["about"]).split()))
@@ -210,7 +210,7 @@ def board_markdown(sections: Sequence[BoardSection], folder: Path) -> str:
         for result in section.results:
             if result.picture is not None:
                 link = os.path.relpath(result.picture, folder)
-                parts.append(f"![{markdown(result.method)}: input, then pairs of a true view and its render]({link})")
+                parts.append(f"![Renders of {markdown(result.method)}]({link})")
                 parts.append(f"{markdown(result.method)}: the input, then pairs of a true view and its render.")
     return "\n\n".join(parts) + "\n"
 
