@@ -39,6 +39,7 @@ from support import some_gaussians
 from completesplat.data.captures.captured_frames import CapturedFrame, Lens
 from completesplat.data.co3d.depth_maps import read_depth
 from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.srn.module import read_intrinsics, read_pose
 from completesplat.data.validation import read_points
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import read_ply, write_ply
@@ -114,6 +115,20 @@ def test_images(tmp_path):
     for content in (content for several in files.values() for content in several):
         read_images(content)
     fuzz(every, read_images, examples=60, most_memory=MOST_MEMORY_OF_A_PHOTO)
+
+
+def test_lenses_and_poses_in_text(tmp_path):
+    path = tmp_path / "a.txt"
+    lens = b"131.250000 64.000000 64.000000 0.\n0. 0. 0.\n1.\n128 128\n"
+    pose = b"1 0 0 0 0 -1 0 0 0 0 -1 1.3 0 0 0 1\n"
+
+    def read_texts(content: bytes) -> None:
+        path.write_bytes(content)
+        each(partial(read_intrinsics, path), partial(read_pose, path))
+
+    words = [*lens.split(), *pose.split(), b"1e309", b"-1e308", b"nan", b"0", b"\n", b"inf", b"x", b"1_0"]
+    spelled = st.lists(st.sampled_from(words), max_size=24).map(b" ".join)
+    fuzz(st.one_of(damaged([lens, pose]), spelled), read_texts)
 
 
 HEADER = b"""ply
