@@ -56,12 +56,6 @@ export class SceneView {
     this.upload();
   }
 
-  /** Remove the scene. */
-  clear() {
-    this.gaussians = null;
-    this.request();
-  }
-
   /** Glide to the photo's view, and stay. */
   toPhoto() {
     this.isTurning = false;
