@@ -145,7 +145,7 @@ def refusal(error: BaseException) -> str | None:
     if message is None:
         return None
     for extension in extensions():
-        if str(extension.conf) in message:
+        if f"{extension.conf}/" in message:
             message = f"{message} (a file of {extension}; update or uninstall it)"
     return " ".join(message.split())
 

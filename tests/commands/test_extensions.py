@@ -205,6 +205,14 @@ def test_an_extension_that_fails_is_refused_in_one_line_that_names_its_distribut
     assert command.succeeds("fit", "--help").err == ""
 
 
+def test_an_extension_is_not_blamed_for_the_users_own_options(command, method, tmp_path):
+    """Hydra's message lists all folders of options."""
+    put(tmp_path / "conf/experiment/mine.yaml", "# @package _global_\ndefaults:\n  - /nothing: here\n")
+    refused = command.refuses("fit", "experiment=mine")
+    assert str(method.folder) in refused
+    assert "uninstall" not in refused
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
