@@ -226,6 +226,18 @@ def test_a_package_whose_name_is_taken_is_not_begun(command, tmp_path, name, mes
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_package_may_be_begun_in_an_empty_clone_of_its_name(command, tmp_path):
+    (tmp_path / OWN / ".git").mkdir(parents=True)
+    printed = command.succeeds("new", "package", OWN).out.splitlines()
+    assert printed[-3:] == [
+        f"first: {sys.executable} -m pip install --editable {OWN}",
+        f"next: {sys.executable} -m pytest {OWN}",
+        f"then: completesplat fit experiment={OWN} data.root=DATA out=RUN",
+    ]
+    assert all((tmp_path / name).is_file() for name in printed[:-3])
+    assert "exists already" in command.refuses("new", "package", OWN)
+
+
 @pytest.mark.slow
 def test_a_package_that_is_begun_is_installed_beside_the_wheel_and_used_from_an_empty_folder(
     installed, toy_root, tmp_path
