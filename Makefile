@@ -152,6 +152,7 @@ notebooks: $(READY) ## Run every notebook from top to bottom, and store what it 
 
 # The same commit gives the same bytes: hatchling takes all times from SOURCE_DATE_EPOCH, and sets the files' modes. The
 # bill of materials has the versions of requirements.lock, and of torch, which is not in it, the range that is allowed.
+SHA256 = $(shell which sha256sum || echo shasum -a 256)# which macOS has
 release: export SOURCE_DATE_EPOCH = $(shell git log -1 --format=%ct)
 release: ## Wheel, sdist, checksums and a bill of materials (CycloneDX), in dist; nothing is uploaded
 	rm -rf dist build/release
@@ -162,7 +163,7 @@ release: ## Wheel, sdist, checksums and a bill of materials (CycloneDX), in dist
 	{ cat requirements.lock; sed -n 's/^  "\(torch>.*\)",/\1/p' pyproject.toml; } > build/release/requirements.txt
 	build/release/bin/cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible \
 	  --output-file `ls dist/*.whl | sed 's/-py3.*/.cdx.json/'` build/release/requirements.txt
-	cd dist && sha256sum * > SHA256SUMS && cat SHA256SUMS
+	cd dist && $(SHA256) * > SHA256SUMS && cat SHA256SUMS
 
 clean: ## Remove everything that can be made again, the environment included
 	rm -rf .venv outputs multirun build dist .hypothesis .pytest_cache .mypy_cache .ruff_cache *.egg-info

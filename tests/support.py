@@ -40,6 +40,8 @@ SMALL += [f"trainer.{s}" for s in ("max_steps=2", "accelerator=cpu", "val_check_
 
 GROUPS = {"hydra", *groups()}
 
+only_with_byte_names = pytest.mark.skipif(sys.platform == "darwin", reason="macOS has only names in UTF-8")
+
 LIMIT = 900.0
 """Seconds that a test waits for a state: a busy machine may take minutes for the work of a second."""
 

@@ -113,6 +113,18 @@ def test_the_weights_that_the_readme_names_are_in_the_package():
     assert set(named) == set(shipped())
 
 
+def test_the_matrix_has_each_python_and_system_of_the_classifiers_and_one_row_has_all_tests():
+    workflow = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
+    rows = workflow["jobs"]["test"]["strategy"]["matrix"]["include"]
+    versions = re.findall(r"Programming Language :: Python :: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
+    assert PROJECT["requires-python"] == f">={versions[0]}"
+    systems = ("ubuntu-latest", "macos-latest")
+    assert {(row["system"], row["python"]) for row in rows} == {(s, version) for s in systems for version in versions}
+    assert sorted(row["command"] for row in rows) == [".ci/run", *["make test"] * (len(rows) - 1)]
+    (step,) = [step for step in workflow["jobs"]["test"]["steps"] if "run" in step]
+    assert step["run"] == "${{ matrix.command }}"
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / ".github/workflows").iterdir()), ids=lambda path: path.name)
 def test_workflows_may_only_read_the_repository_and_run_githubs_own_actions(path):
     workflow = yaml.safe_load(path.read_text())

@@ -23,10 +23,12 @@ from completesplat.evaluation.records import CONFIG
 from completesplat.files import file_refusal
 from completesplat.settings import composition, help
 from completesplat.settings.arguments import SWEEP, for_hydra
+from completesplat.settings.extensions import extension_of, extensions
 from completesplat.settings.options import conf_folder
 from completesplat.settings.sweeps import check_sweep
 from completesplat.signals import end_with, ended_by_signals
 
+LOADED = re.compile(r"Error loading '([\w.]+)'")  # begins Hydra's message on what cannot be imported
 CALLED = re.compile(r"Error in call to target '(torch|lightning|diffusers|torchmetrics)\.")
 UNHELPFUL_WARNINGS = (
     ".*does not have many workers.*",
@@ -128,7 +130,10 @@ def refusal(error: BaseException) -> str | None:
     """Return one line for an error that the user can put right, None for a fault of the program."""
     message: str | None = None
     own_error = _own_error(error)
-    if own_error is not None:
+    broken = _of_an_extension(error)
+    if broken is not None:
+        message = broken
+    elif own_error is not None:
         message = str(own_error)
     elif isinstance(error, MissingMandatoryValue | InterpolationToMissingValueError):
         key = _missing_key(error)
@@ -137,7 +142,12 @@ def refusal(error: BaseException) -> str | None:
         message = _of_a_part(error)
     elif isinstance(error, HydraException | OmegaConfBaseException | YAMLError):
         message = str(error)
-    return None if message is None else " ".join(message.split())
+    if message is None:
+        return None
+    for extension in extensions():
+        if f"{extension.conf}/" in message:
+            message = f"{message} (a file of {extension}; update or uninstall it)"
+    return " ".join(message.split())
 
 
 def _missing_key(error: MissingMandatoryValue | InterpolationToMissingValueError) -> str:
@@ -149,6 +159,17 @@ def _missing_key(error: MissingMandatoryValue | InterpolationToMissingValueError
     if isinstance(error, InterpolationToMissingValueError):  # whose key is that of the setting that refers to it
         key = str(error).partition("Missing mandatory value: ")[2].split()[0]
     return key.removeprefix("task.")
+
+
+def _of_an_extension(error: BaseException | None) -> str | None:
+    """Return a message if the chain of causes has an extension's module, class or function that cannot be imported."""
+    while error is not None:
+        loaded = LOADED.match(str(error))
+        extension = None if loaded is None else extension_of(loaded[1])
+        if loaded is not None and extension is not None:
+            return f"{loaded[1]}: cannot be imported ({error.__cause__!r}); update or uninstall {extension}"
+        error = error.__cause__
+    return None
 
 
 def _of_a_part(error: InstantiationException) -> str | None:

@@ -14,6 +14,7 @@ from completesplat.data.rendered.blender import find_blender
 from completesplat.errors import CompleteSplatError
 from completesplat.files import write_json
 from completesplat.installation import install_command
+from completesplat.settings.extensions import installed
 from completesplat.version import __version__
 
 EXTRAS = {
@@ -34,7 +35,7 @@ LIBRARIES = ("torch", "lightning", "hydra-core", "diffusers", "numpy", "numba")
 def run(config: DictConfig, out: Path) -> None:
     """Print all lines, and write them to `doctor.json`."""
     lines: dict[str, str] = {}
-    for check in (versions, devices, rasterizers, extras, programs):
+    for check in (versions, devices, rasterizers, extras, extensions, programs):
         lines.update(findings(check))
     write_json(out / "doctor.json", lines)
     for name, text in lines.items():
@@ -102,6 +103,15 @@ def extras() -> Iterator[tuple[str, str]]:
             yield f"extra {extra}", f"missing, {purpose}: {install_command(extra)}"
         else:
             yield f"extra {extra}", ", ".join(f"{name} {_version(name)}" for name in names)
+
+
+def extensions() -> Iterator[tuple[str, str]]:
+    """Yield each extension with its options."""
+    for extension in installed().extensions:
+        listed = [f"{file.parent.name}={file.stem}" for file in sorted(extension.conf.glob("*/[!_]*.yaml"))]
+        yield f"extension {extension.name}", f"{extension.version}: {', '.join(listed)}"
+    for name, reason in installed().broken.items():
+        yield f"extension {name}", f"broken: {reason}"
 
 
 def programs() -> Iterator[tuple[str, str]]:

@@ -5,7 +5,7 @@ import logging
 import os
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
@@ -25,7 +25,8 @@ from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.records import SCORES, job_entries, read_mapping
 from completesplat.settings.checks import check_parts_of_verb, check_values
 from completesplat.settings.composition import shard_folder, typed_keys, use_working_folder
-from completesplat.settings.options import did_you_mean
+from completesplat.settings.extensions import versions_of
+from completesplat.settings.options import did_you_mean, source_of
 from completesplat.signals import Interrupted, ended_by_signals
 from completesplat.weights import RUN_CHECKPOINT
 
@@ -83,6 +84,7 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
         return optimized(config.get("optimized_metric"), out)
     keeps_record = is_first_process()
     entries = job_entries(verb, given, folder) | {"unchanged": idle is not None}
+    entries["extensions"] = used_extensions(resolved, hydra_config.runtime.choices)
     record = recorded(folder, entries, resolved) if keeps_record else nullcontext()
     others = _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{folder}"])
     try:
@@ -98,6 +100,27 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     if isinstance(result, str):
         print(result)
     return optimized(config.get("optimized_metric"), out)
+
+
+def used_extensions(config: object, choices: Mapping[str, object]) -> dict[str, str]:
+    """Return the extensions whose code a config names, or whose options were chosen: versions by name."""
+    versions = versions_of(_targets(config))
+    for group, option in choices.items():
+        source = source_of(f"{group.partition('@')[0]}/{option}")
+        if source is not None:
+            versions[source.name] = source.version
+    return versions
+
+
+def _targets(config: object) -> Iterator[str]:
+    """Yield each `_target_` in a plain config."""
+    if isinstance(config, dict):
+        if "_target_" in config:
+            yield str(config["_target_"])
+        config = list(config.values())
+    if isinstance(config, list):
+        for part in config:
+            yield from _targets(part)
 
 
 def resolve_start_weights(config: DictConfig) -> None:

@@ -1,4 +1,4 @@
-"""`completesplat new`: a first version of a user's own part in the working folder, with settings and a passing test."""
+"""`completesplat new`: a first version of a user's own part or package, with settings and a passing test."""
 
 import keyword
 import re
@@ -14,7 +14,7 @@ from completesplat.files import write_text
 from completesplat.settings.options import conf_folder
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
-KINDS = ("loss", "metric", "rasterizer", "encoder", "callback", "dataset", "ablation", "experiment")
+KINDS = ("loss", "metric", "rasterizer", "encoder", "callback", "dataset", "ablation", "experiment", "package")
 # Command in a template that uses the new part: `completesplat VERB WORDS KEY=VALUE ...`.
 USE = re.compile(r"completesplat \w+[\w ]*( [+\w.]+=[\w.]*\w)+")
 FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)  # line of a template that names the file which follows
@@ -34,7 +34,11 @@ def run(config: DictConfig) -> None:
         print(path)
     first_use = next(USE.finditer("".join(files.values())))[0]
     needed = "" if find_spec("pytest") else " (needs pip install pytest)"
-    print("next:", shlex.join([sys.executable, "-m", "pytest", f"test_{kind}_{name}.py"]) + needed)
+    tests = f"test_{kind}_{name}.py"
+    if kind == "package":
+        tests = name
+        print("first:", shlex.join([sys.executable, "-m", "pip", "install", "--editable", name]))
+    print("next:", shlex.join([sys.executable, "-m", "pytest", tests]) + needed)
     print("then:", first_use)
 
 
@@ -52,12 +56,19 @@ def new_files(kind: str, name: str) -> dict[Path, str]:
     for path in files:
         if path.exists():
             raise CompleteSplatError(f"{path}: exists already; choose another name")
-        if path.parts[0] == "conf" and (conf_folder().parent / path).is_file():
-            raise CompleteSplatError(f"name={name}: the package has {path}; choose another name")
+        _, conf, option = path.as_posix().rpartition("conf/")
+        if conf and (conf_folder() / option).is_file():
+            raise CompleteSplatError(f"name={name}: the package has conf/{option}; choose another name")
     # Python searches the working folder last, so it would import the other module of this name.
-    if Path(f"{name}.py") in files and find_spec(name) is not None:
+    if (kind == "package" or Path(f"{name}.py") in files) and _is_module(name):
         raise CompleteSplatError(f"name={name}: a module has this name; choose another name")
     return files
+
+
+def _is_module(name: str) -> bool:
+    """Return whether Python finds a module of this name. A folder without modules, such as a new clone, is none."""
+    spec = find_spec(name)
+    return spec is not None and spec.origin is not None
 
 
 def filled_template(kind: str, name: str) -> dict[Path, str]:

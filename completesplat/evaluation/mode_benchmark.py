@@ -226,7 +226,7 @@ def describe_mode_test(
     described |= sampler_settings(module)
     described["scenes"] = measured.names
     described["skipped"] = measured.skipped
-    return described | provenance(data, out)
+    return described | provenance(module, data, out)
 
 
 def write_modes(measured: ModeMeasurements, samples: int, out: Path) -> None:

@@ -126,7 +126,7 @@ def describe_test(
         metrics |= set_metric.settings()
     described["metrics"] = metrics
     described["missing"] = scores.missing
-    return described | provenance(data, out)
+    return described | provenance(module, data, out)
 
 
 def metric_settings(config: Mapping[str, object], metric_format: MetricFormat) -> Mapping[str, object]:

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from completesplat.evaluation.records import read_record
+from completesplat.settings.extensions import versions_of
 from completesplat.version import __version__
 
 if TYPE_CHECKING:
     from completesplat.data.loading.data_module import SceneDataModule
+    from completesplat.evaluation.scorer import Scorer
 
 
 def git_commit() -> str | None:
@@ -60,13 +62,16 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def provenance(data: "SceneDataModule", out: Path) -> dict[str, object]:
-    """Return the test data's fingerprint, and program, command (that of `run.json` in `out`) and machine."""
+def provenance(module: "Scorer", data: "SceneDataModule", out: Path) -> dict[str, object]:
+    """Return the test data's fingerprint, program, command (that of `run.json` in `out`), extensions and machine."""
+    record = read_record(out)
+    parts = [type(part).__module__ for part in (*module.modules(), data)]
     return {
         "data_fingerprint": data.source("test").fingerprint(),
         "version": __version__,
         "commit": git_commit(),
-        "command": shell_command(read_record(out).get("command", [])),
+        "command": shell_command(record.get("command", [])),
+        "extensions": record.get("extensions", {}) | versions_of(parts),
         "machine": machine(),
     }
 

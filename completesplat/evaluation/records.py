@@ -47,8 +47,9 @@ class SweepPlace(TypedDict):
 class Record(TypedDict, total=False):
     """Entries of `run.json` that are read here. Records of earlier versions have no `verb`, `groups` and `sweep`.
 
-    `groups` are the chosen options of config groups. `sweep` is None for a job that is none of a sweep. `unchanged`
-    says that the job's ablation changes nothing, and `diverged` why a training has no weights.
+    `groups` are the chosen options of config groups, `extensions` the versions of used ones by name. `sweep` is None
+    for a job that is none of a sweep. `unchanged` says that the job's ablation changes nothing, and `diverged` why a
+    training has no weights.
     """
 
     command: list[str]
@@ -57,6 +58,7 @@ class Record(TypedDict, total=False):
     verb: str
     groups: dict[str, str | None]
     sweep: SweepPlace | None
+    extensions: dict[str, str]
     unchanged: bool
     diverged: str
 

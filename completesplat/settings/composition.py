@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.arguments import for_hydra
-from completesplat.settings.options import conf_folder, did_you_mean, groups, options
+from completesplat.settings.options import conf_folder, did_you_mean, folders, groups, options
 from completesplat.settings.sweeps import swept_overrides
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
@@ -30,28 +30,28 @@ UNKNOWN_KEY = re.compile(r"Could not override '([^']+)'\.\s*(?:To append to your
 LONGEST_NAME = 120
 
 
-class SettingsOfWorkingFolder(SearchPathPlugin):
-    """Hydra plugin that finds further options of the config groups in `./conf`.
+class FurtherOptions(SearchPathPlugin):
+    """Hydra plugin that finds further options of the config groups, in extensions and in `./conf`.
 
     The package's own come first.
     """
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Append `./conf`, if it exists, to the search path (Hydra calls this method)."""
-        folder = Path.cwd() / "conf"
-        if folder.is_dir() and not folder.samefile(conf_folder()):
-            search_path.append("working-folder", f"file://{folder}")
+        """Append all other folders of options to the search path (Hydra calls this method)."""
+        for folder in folders():
+            if not folder.samefile(conf_folder()):
+                search_path.append("further-options", f"file://{folder}")
 
 
 def use_working_folder() -> None:
-    """Append the working folder to `sys.path`, and its `conf` to Hydra's search path.
+    """Append the working folder to `sys.path`, and its `conf` and those of extensions to Hydra's search path.
 
     Each process must call this.
     """
     folder = str(Path.cwd())
     if not {"", folder} & set(sys.path):
         sys.path.append(folder)
-    Plugins.instance().register(SettingsOfWorkingFolder)
+    Plugins.instance().register(FurtherOptions)
 
 
 def compose(verb: str, *overrides: str) -> DictConfig:

@@ -5,7 +5,7 @@ from functools import cache
 from typing import Any
 
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.options import LOADER, TASKS, conf_folder, conf_text, did_you_mean, options
+from completesplat.settings.options import LOADER, TASKS, conf_folder, conf_text, did_you_mean, options, source_of
 
 HELP_FLAGS = ("--help", "-h")
 NO_SETTINGS = ("defaults", "verb", "description", "hydra", "task")
@@ -47,7 +47,7 @@ def task_list(verb: str) -> Iterator[str]:
         lines = [f"Tasks (completesplat {verb} TASK --help shows the settings of one):"]
         for task in options(f"{verb}_task"):
             _, _, purpose = first_comment(f"{verb}_task/{task}").splitlines()[0].partition(": ")
-            lines.append(f"  {task:12} {purpose}")
+            lines.append(f"  {task:12} {purpose}{from_extension(f'{verb}_task/{task}')}")
         yield "\n".join(lines)
 
 
@@ -61,9 +61,16 @@ def settings_and_parts(name: str) -> Iterator[str]:
         lines = [f"Parts (group=option), with their settings in {conf_folder()}/GROUP/OPTION.yaml:"]
         for place, (group, option) in choices.items():
             default = "null" if option is None else option
-            lines.append(f"  {place}={default}  [{', '.join(options(group))}]")
+            listed = [name + from_extension(f"{group}/{name}") for name in options(group)]
+            lines.append(f"  {place}={default}  [{', '.join(listed)}]")
         yield "\n".join(lines)
     yield "A sweep over values: -m key=a,b. Lists and values with spaces want the shell's quotes: 'key=[a,b]'."
+
+
+def from_extension(name: str) -> str:
+    """Return an ending for an option (`GROUP/OPTION`) that tells its extension, empty for all other options."""
+    extension = source_of(name)
+    return "" if extension is None else f" (from {extension})"
 
 
 def defaults(name: str) -> tuple[list[str], dict[str, tuple[str, str | None]]]:

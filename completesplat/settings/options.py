@@ -1,11 +1,13 @@
 """Files of `conf/`: config groups, their options, and the nearest name to one that does not exist."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import yaml
+
+from completesplat.settings.extensions import Extension, extensions
 
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """The faster of PyYAML's loaders that build plain values only."""
@@ -20,10 +22,17 @@ def conf_folder() -> Path:
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
-def folders() -> list[Path]:
-    """Return the folders of configs: the package's, and `conf` in the working folder if it exists."""
+def folders() -> Iterator[Path]:
+    """Yield the folders of configs, where the first one with an option counts.
+
+    They are the package's, those of extensions, and `conf` in the working folder if it exists.
+    """
+    yield conf_folder()
+    for extension in extensions():
+        yield extension.conf
     local = Path.cwd() / "conf"
-    return [conf_folder(), local] if local.is_dir() else [conf_folder()]
+    if local.is_dir():
+        yield local
 
 
 def groups() -> list[str]:
@@ -39,11 +48,16 @@ def options(group: str) -> list[str]:
     return sorted({file.stem for folder in folders() for file in (folder / group).glob("[!_]*.yaml")})
 
 
-def conf_text(name: str) -> str:
-    """Return the text of a file by its name without suffix (`data/toy_objects`).
+def source_of(name: str) -> Extension | None:
+    """Return the extension that has the option `GROUP/OPTION`; None for the package's and the working folder's."""
+    for folder, extension in [(conf_folder(), None), *((extension.conf, extension) for extension in extensions())]:
+        if (folder / f"{name}.yaml").is_file():
+            return extension
+    return None
 
-    The package's own come first.
-    """
+
+def conf_text(name: str) -> str:
+    """Return the text of a file by its name without suffix (`data/toy_objects`)."""
     for folder in folders():
         path = folder / f"{name}.yaml"
         if path.is_file():

@@ -2,7 +2,7 @@
 
 Anyone can publish weights and runs, so nothing that their configs name is imported or called before it is found here.
 The list is the package's `conf/`: a run may name what it names for models and data, weights what it names for networks
-and samplers. The user's own modules may be named, too, if the file is the user's or trusted.
+and samplers. The user's own modules and extensions may be named, too, if the file is the user's or trusted.
 
 Only the last part of a path counts, the name of a class or function: a path in this package or diffusers stands for
 what has this name today, so weights and runs of earlier versions open when something has moved. Weights store the name
@@ -28,6 +28,7 @@ from omegaconf import OmegaConf
 from completesplat.errors import WeightsError
 from completesplat.quantities import Entries, Range, Share
 from completesplat.settings.checks import HYDRA_KEYS, START_WEIGHTS, unfit_image_size
+from completesplat.settings.extensions import extension_of
 from completesplat.settings.options import LOADER, conf_folder
 from completesplat.settings.schema import hints_of, violations
 from completesplat.wording import SHORT, printable
@@ -194,8 +195,8 @@ class ConfigOrigin:
 def check_names(config: Any, origin: ConfigOrigin, setting: object = "") -> Any:
     """Return a plain config with the present paths of parts that it names by name or old path.
 
-    A config may name what is listed, and optimizers of torch. What the user's modules define may be named if the origin
-    allows it; such modules are imported here.
+    A config may name what is listed, and optimizers of torch. What extensions and the user's modules define may be
+    named if the origin allows it; such modules are imported here.
 
     Args:
         setting: the setting that has the value `config`.
@@ -221,15 +222,19 @@ def check_names(config: Any, origin: ConfigOrigin, setting: object = "") -> Any:
         return listed_parts()[name].path
     refusal = f"{origin.file} names {printable(value, SHORT)}, which is no part of models or data in this package"
     if not origin.may_name_own_modules():
-        raise WeightsError(f"{refusal}; if it is a module of your own, and you trust who made the file: trust=true")
+        yours = "a module of your own or of a package that you installed for this"
+        raise WeightsError(f"{refusal}; if it is {yours}, and you trust who made the file: trust=true")
     if own_part(value) is None:
-        places = "which lies in the working folder or in one of PYTHONPATH"
+        places = "which lies in the working folder, in one of PYTHONPATH or in an installed extension"
         raise WeightsError(f"{refusal}, and not defined in a module of your own, {places} (SECURITY.md)")
     return value
 
 
 def own_part(target: str) -> Any:
-    """Import what a path names, and return it if a module that is neither installed nor this package's defines it."""
+    """Import what a path names, and return it if it is the user's own: None for this package's and other libraries'.
+
+    A module is the user's own if it is not installed, or belongs to an extension, which the user chose to install.
+    """
     top = target.partition(".")[0]
     try:
         spec = find_spec(top)  # imports nothing, because the name has no dot
@@ -238,7 +243,8 @@ def own_part(target: str) -> Any:
     if spec is None or top == "completesplat":
         return None
     places = [spec.origin] if spec.has_location else spec.submodule_search_locations or []
-    if not places or any(_is_installed(Path(str(place)).resolve()) for place in places):
+    installed = not places or any(_is_installed(Path(str(place)).resolve()) for place in places)
+    if installed and extension_of(top) is None:
         return None
     try:
         part = get_object(target)

@@ -14,7 +14,7 @@ from completesplat.installation import install_command
 def test_each_thing_has_a_line_and_stands_in_the_file(command, tmp_path):
     finished = command.succeeds("doctor", f"out={tmp_path / 'out'}")
     lines = strict_json(tmp_path / "out/doctor.json")
-    assert lines["torch"] == torch.__version__
+    assert torch.__version__.startswith(lines["torch"])  # PyPI's metadata leave +cu130 out
     assert {"python", "cpu", "used device", "rasterizer tiled", "extra view", "ffmpeg", "node", "blender"} <= set(lines)
     printed = finished.out.splitlines()
     assert [line[:24].rstrip() for line in printed[:-1]] == list(lines)

@@ -41,6 +41,7 @@ CHOSEN |= {"metric": "test ckpt=RUN +evaluation.metrics.{0}._target_={0}.{1}"}
 CHOSEN |= {"encoder": "fit experiment=toy_var autoreconstructor.encoder._target_={0}.{1}"}
 CHOSEN |= {"callback": "fit experiment=toy_var +callbacks.{0}._target_={0}.{1}"}
 CHOSEN |= {"dataset": "data check data={} data.root=DIR", "experiment": "fit experiment={} data.root=DATA out=RUN"}
+assert set(KINDS) - {"package"} == set(CHOSEN)  # `test_extensions` begins a package
 OWN_METRIC = "+evaluation.metrics.my_bias._target_=mymetric.Bias"
 
 
@@ -114,7 +115,7 @@ def test_modules_of_the_working_folder_stand_in_for_no_others(own, name):
 @pytest.mark.processes
 def test_what_is_begun_runs_as_it_is_written(command, own):
     assert all(f" {kind}" in command.succeeds("new", "--help").out for kind in KINDS)
-    for kind in KINDS:
+    for kind in CHOSEN:
         *written, following, chosen = command.succeeds("new", kind, f"my_{kind}").out.splitlines()
         assert all((own / name).is_file() for name in written)
         assert following == f"next: {sys.executable} -m pytest test_{kind}_my_{kind}.py"

@@ -13,7 +13,7 @@ import torch
 from fake_converter import calls, install
 from PIL import Image
 from rich.progress import Progress
-from support import compose_config, some_gaussians, strict_json
+from support import compose_config, only_with_byte_names, some_gaussians, strict_json
 
 from completesplat.commands import trained
 from completesplat.commands.inputs import find_images
@@ -94,6 +94,7 @@ def test_a_folders_photos_may_have_any_suffix_of_jpeg(predict, tmp_path):
 ODD_NAMES = [b"...png", b"\xff.png", b"[red].png", b"new\nline.png", b"a" * 250 + b".png", b"\x1b[31m.png", b"a\\b.png"]
 
 
+@only_with_byte_names
 def test_images_of_any_name_are_written_below_out(predict, tmp_path, monkeypatch):
     monkeypatch.setenv("TTY_COMPATIBLE", "1")  # which rich takes for a terminal
     content = save(tmp_path / "x.png").read_bytes()
@@ -129,6 +130,7 @@ def test_each_scene_file_and_video_is_announced_in_a_line_or_on_a_terminals_bar(
     assert [new["completed"] for _, new in steps if "completed" in new] == [5, 10]
 
 
+@only_with_byte_names
 @pytest.mark.processes
 def test_names_that_are_no_utf_8_are_printed_by_a_process_that_prints_utf_8(tmp_path, tiny_weights):
     """A new process is needed, because pytest's own streams print any name."""

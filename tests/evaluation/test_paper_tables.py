@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from readers import put
+from support import only_with_byte_names
 
 from completesplat.errors import CompleteSplatError
 from completesplat.evaluation import paper_tables
@@ -251,6 +252,7 @@ def test_a_test_in_a_sweeps_folder_has_a_table_of_its_own(runs, job, run) -> Non
     assert "33.33" in row.values()
 
 
+@only_with_byte_names
 def test_names_that_are_no_text_are_escaped(runs, run) -> None:
     run("bad", 20.0).parent.rename(os.fsdecode(os.fsencode(runs) + b"/bad\xff\n"))
     assert any(line.startswith("[1] bad\\udcff\\n: ") for line in made(runs)["own_1"].below())
