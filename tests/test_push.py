@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import huggingface_hub.constants as hub_constants
+import jaxtyping
 import pytest
 import torch
 from hub_server import TOKEN, Repositories, hub_with
@@ -156,13 +157,21 @@ def test_no_score_comes_from_a_test_of_other_weights(hub, pipeline, tmp_path):
 def test_the_card_beside_the_weights_keeps_its_text_and_licence(hub, tmp_path):
     folder = tmp_path / "fruits"
     shutil.copytree(shipped()["fruits"], folder)
-    CompleteSplat.from_pretrained(folder).push_to_hub(REPOSITORY, confirm=True, datasets=["fruits-360"])
+    model = CompleteSplat.from_pretrained(folder)
+    model.push_to_hub(REPOSITORY, confirm=True, datasets=["fruits-360"])
     sent = hub.folder(REPOSITORY)
     assert {"LICENSE.txt", "held_out.jpg"} <= names(sent)
     card, before = ModelCard.load(sent / "README.md"), ModelCard.load(folder / "README.md")
     assert card.data.to_dict() == {**before.data.to_dict(), "datasets": ["fruits-360"]}
     assert card.text.strip() == before.text.strip()
     assert (sent / "model.safetensors").read_bytes() == (folder / "model.safetensors").read_bytes()  # still in float16
+
+    Image.new("RGB", (8, 8), "blue").save(tmp_path / "mine.png")
+    model.push_to_hub(REPOSITORY, confirm=True, license="cc-by-sa-4.0", pictures=[str(tmp_path / "mine.png")])
+    text = ModelCard.load(sent / "README.md").text.strip()
+    assert text == before.text.strip() + "\n\n![mine](mine.png)"
+    with pytest.raises(WeightsError, match=r"license=mit: README.md beside the weights says cc-by-sa-4.0"):
+        model.push_to_hub(REPOSITORY, confirm=True, license="mit")
 
 
 def test_graphs_go_to_try_and_those_of_earlier_weights_are_removed(hub, tiny_weights, tmp_path):
@@ -259,3 +268,28 @@ def test_weights_that_need_a_module_of_the_user_say_so(tiny_weights):
     }
     assert list(own_modules(part)) == ["mine.Encoder", "mine.Layer"]
     assert list(own_modules(CompleteSplat.from_pretrained(tiny_weights).architecture)) == []
+
+
+def test_export_pushes_on_the_command_line(hub, command, tiny_weights):
+    given = ["export", f"weights={tiny_weights}", f"push={REPOSITORY}", "graphs=false"]
+    assert "nothing was sent, because that needs a yes: confirm=true" in command.refuses(*given)
+    assert hub.folder(REPOSITORY) is None
+    done = command.succeeds(*given, "confirm=true", "private=true", "license=mit", "datasets=[a,b]")
+    assert f"{hub_constants.ENDPOINT}/{REPOSITORY}" in done.out
+    assert hub.private[REPOSITORY]
+    card = ModelCard.load(hub.folder(REPOSITORY) / "README.md")
+    assert (card.data.license, card.data.datasets) == ("mit", ["a", "b"])
+    assert "graphs=false: writes nothing" in command.refuses("export", f"weights={tiny_weights}", "graphs=false")
+
+
+@pytest.mark.slow
+def test_export_sends_the_graphs_that_it_writes(hub, command, tiny_weights, tmp_path, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch cannot trace through the checks of shapes
+    graphs = tmp_path / "graphs"
+    command.succeeds("export", f"weights={tiny_weights}", f"push={REPOSITORY}", "confirm=true", f"out={graphs}")
+    sent = hub.folder(REPOSITORY)
+    assert names(sent) == FILES | {
+        f"try/{name}" for name in ("image.onnx", "step.onnx", "decode.onnx", "pipeline.json")
+    }
+    assert (sent / "try/step.onnx").read_bytes() == (graphs / "step.onnx").read_bytes()
+    assert "`try/` has the networks as ONNX graphs" in (sent / "README.md").read_text()

@@ -126,30 +126,33 @@ class Card(NamedTuple):
         name = self.repository.rpartition("/")[2]
         size = self.architecture["image_size"]
         shown = (self.architecture.get("training") or {}).get("content")
-        lines = [f"# {name}", ""]
         kind = "several complete 3D scenes" if "denoiser" in self.architecture else "one complete 3D scene"
-        lines += [f"Weights of completesplat: one photo in, {kind} of Gaussian splats out."]
-        lines += [f"They have {self.parameters / 1e6:.1f} million parameters and see images of {size} x {size} pixels."]
+        lines = [f"# {name}", ""]
+        lines.append(f"Weights of completesplat: one photo in, {kind} of Gaussian splats out.")
+        lines.append(
+            f"They have {self.parameters / 1e6:.1f} million parameters and see images of {size} x {size} pixels."
+        )
         if shown:
-            lines += [f"The training images show {shown}."]
-        lines += [
-            "",
-            "```",
-            "pip install completesplat",
-            f"completesplat predict image=photo.jpg weights={self.repository}",
-        ]
-        lines += ["```", ""]
+            lines.append(f"The training images show {shown}.")
+        lines += ["", "```", "pip install completesplat"]
+        lines += [f"completesplat predict image=photo.jpg weights={self.repository}", "```", ""]
         own = sorted(set(own_modules(self.architecture)))
         if own:
             lines += [f"They need {', '.join(own)}, of a module that is not here; `trust=true` allows it.", ""]
-        for picture in self.pictures:
-            lines += [f"![{Path(picture).stem}]({picture})", ""]
-        if self.graphs:
-            lines += [f"`{GRAPHS}/` has the networks as ONNX graphs, for programs without torch, and `pipeline.json`, "]
-            lines += ["which says how they are run.", ""]
         for test in self.scores:
             lines += _table(test)
-        return "\n".join(lines).rstrip() + "\n"
+        return self.with_additions("\n".join(lines))
+
+    def with_additions(self, text: str) -> str:
+        """Return a text with the pictures and the note on graphs that it does not have yet."""
+        parts = [text.strip()]
+        for picture in self.pictures:
+            if picture not in text:
+                parts.append(f"![{Path(picture).stem}]({picture})")
+        if self.graphs and f"`{GRAPHS}/`" not in text:
+            graphs = f"`{GRAPHS}/` has the networks as ONNX graphs, for programs without torch"
+            parts.append(f"{graphs}, and `pipeline.json`, which says how they are run.")
+        return "\n\n".join(parts) + "\n"
 
 
 def own_modules(part: object) -> Iterator[str]:
@@ -195,31 +198,36 @@ def _table(test: ModelScores) -> list[str]:
     return [*lines, ""]
 
 
-def card_text(card: Card, before: str | None, keep_text: bool) -> str:
+def card_text(card: Card, before: str | None, unchanged: bool) -> str:
     """Return a card's file.
 
     Args:
-        before: the card that lies beside the weights, if there is one, whose metadata is kept where nothing newer is.
-        keep_text: keep its text, too.
+        before: the card that lies beside the weights, if there is one. Its metadata stays where nothing newer is known.
+        unchanged: the weights are those that lie beside it, so its text, scores and licence are theirs.
 
     Raises:
-        WeightsError: the metadata of the card beside the weights cannot be read.
+        WeightsError: the metadata of the card beside the weights cannot be read, or has another licence.
     """
     from huggingface_hub import ModelCard
 
-    metadata: dict[str, Any] = {}
-    text = card.text()
-    if before is not None:
+    if before is None:
+        metadata: dict[str, Any] = {}
+        text = card.text()
+    else:
         try:
             old = ModelCard(before)
         except Exception as error:  # of YAML, or the hub's own
-            raise WeightsError(
-                f"{CARD_FILE} beside the weights: its metadata cannot be read ({first_line(error)})"
-            ) from error
+            reason = f"its metadata cannot be read ({first_line(error)})"
+            raise WeightsError(f"{CARD_FILE} beside the weights: {reason}") from error
         metadata = old.data.to_dict()
-        if keep_text:
-            text = old.text.lstrip("\n")
-        else:
+        text = card.with_additions(old.text) if unchanged else card.text()
+        stated = metadata.get("license")
+        wanted = card.said.get("license")
+        if unchanged and None not in (stated, wanted) and stated != wanted:
+            raise WeightsError(
+                f"license={wanted}: {CARD_FILE} beside the weights says {stated}; change it there, if you may"
+            )
+        if not unchanged:
             metadata.pop("model-index", None)
     front = yaml.safe_dump(card.metadata(metadata), sort_keys=False, allow_unicode=True)
     return f"---\n{front}---\n\n{text}"
