@@ -208,13 +208,16 @@ def test_nothing_is_sent_without_a_token_or_without_a_yes(hub, tiny_weights, tmp
     assert not [request for request in hub.requests if not request.startswith("GET")]
     printed = capsys.readouterr().out
     assert "Files: README.md, config.json, model.safetensors, SHA256SUMS" in printed
-    assert "me/things is made, for everybody to see." in printed
+    assert "me/things is made, public." in printed
     assert "Send 4 files (" in printed
     assert ") to me/things? [y/N]" in printed
 
     monkeypatch.setattr("sys.stdin", Terminal("y\n"))
     model.push_to_hub(REPOSITORY)
     assert names(hub.folder(REPOSITORY)) == FILES
+    with pytest.raises(CompleteSplatError, match=r"^me/things: nothing was sent$"):
+        model.push_to_hub(REPOSITORY)  # the answer was given once
+    assert "me/things exists, public; its files of these names are replaced." in capsys.readouterr().out
 
     monkeypatch.delenv("HF_TOKEN")
     asked = len(hub.requests)

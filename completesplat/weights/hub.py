@@ -1,7 +1,7 @@
 """Sending of files to a repository on the Hugging Face hub, with a token and after a yes."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,7 @@ from completesplat.weights import HUB_ID, first_line
 from completesplat.wording import SHORT, counted, printable
 
 if TYPE_CHECKING:
-    from huggingface_hub import HfApi
+    from huggingface_hub import HfApi, ModelInfo
 
 GRAPHS = "try"  # folder of ONNX graphs in a repository
 Files = Mapping[str, Path | bytes]
@@ -59,18 +59,19 @@ def send(repository: str, files: Files, private: bool, confirm: bool) -> str:
 
     check_destination(repository)
     api = HfApi()
-    try:
-        before = _files_there(api, repository, private)
-    except CompleteSplatError:
-        raise
-    except Exception as error:  # from the hub or its HTTP library
-        raise _refused(repository, error) from error
+    before = _repository(api, repository)
+    if before is not None and private and not before.private:
+        advice = "make it private in its settings on the hub, or choose another name"
+        raise CompleteSplatError(f"{repository}: is public already, which private=true does not change; {advice}")
     if not confirm:
-        _ask(repository, files, private, before)
+        seen = "private" if private or (before is not None and before.private) else "public"
+        state = f"is made, {seen}" if before is None else f"exists, {seen}; its files of these names are replaced"
+        _ask(repository, files, state)
     operations: list[CommitOperationAdd | CommitOperationDelete] = []
     for path, content in files.items():
         operations.append(CommitOperationAdd(path, content))
-    for path in before or ():
+    there = [] if before is None else [sibling.rfilename for sibling in before.siblings or ()]
+    for path in there:
         if path.startswith(f"{GRAPHS}/") and path not in files:
             operations.append(CommitOperationDelete(path))
     try:
@@ -82,36 +83,30 @@ def send(repository: str, files: Files, private: bool, confirm: bool) -> str:
     return f"{api.endpoint}/{repository}"
 
 
-def _files_there(api: "HfApi", repository: str, private: bool) -> list[str] | None:
-    """Return the names of a repository's files, or None if it does not exist.
-
-    Raises:
-        CompleteSplatError: it is public although `private` is asked for.
-    """
+def _repository(api: "HfApi", repository: str) -> "ModelInfo | None":
+    """Return what the hub knows of a repository, or None if it does not exist."""
     from huggingface_hub.errors import RepositoryNotFoundError
 
     try:
-        info = api.model_info(repository)
+        return api.model_info(repository)
     except RepositoryNotFoundError:
         return None
-    if private and not info.private:
-        advice = "make it private in its settings on the hub, or choose another name"
-        raise CompleteSplatError(f"{repository}: is public already, which private=true does not change; {advice}")
-    return [sibling.rfilename for sibling in info.siblings or ()]
+    except Exception as error:  # from the hub or its HTTP library
+        raise _refused(repository, error) from error
 
 
-def _ask(repository: str, files: Files, private: bool, before: Sequence[str] | None) -> None:
-    """Ask on the terminal whether to send; raise CompleteSplatError without a yes, or if there is no terminal."""
+def _ask(repository: str, files: Files, state: str) -> None:
+    """Ask on the terminal whether to send; raise CompleteSplatError without a yes, or if there is no terminal.
+
+    Args:
+        state: whether the repository exists, and who sees it.
+    """
     names = ", ".join(files)
     if not sys.stdin.isatty():
         reason = "nothing was sent, because that needs a yes: confirm=true says it"
         raise CompleteSplatError(f"{repository}: {reason} for {names}")
     size = sum(len(content) if isinstance(content, bytes) else content.stat().st_size for content in files.values())
-    print(f"Files: {names}")
-    if before is None:
-        print(f"{repository} is made, {'private' if private else 'for everybody to see'}.")
-    else:
-        print(f"{repository} exists; its files of these names are replaced.")
+    print(f"Files: {names}\n{repository} {state}.")
     try:
         answer = input(f"Send {counted(len(files), 'file')} ({decimal(size)}) to {repository}? [y/N] ")
     except EOFError:
