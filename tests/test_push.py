@@ -64,7 +64,11 @@ def test_what_is_pushed_is_read_back_from_the_hub(hub, tiny_weights, tmp_path):
     (folder / "LICENSE.txt").write_text("Do as you like.")
     Image.new("RGB", (8, 8), "blue").save(tmp_path / "sheet.png")
     address = model.push_to_hub(
-        REPOSITORY, confirm=True, license="mit", datasets=["my_things"], pictures=[str(tmp_path / "sheet.png")]
+        REPOSITORY,
+        confirm=True,
+        license="mit",
+        datasets=["my_things"],
+        pictures=[str(folder / "held_out.jpg"), str(tmp_path / "sheet.png")],
     )
     assert address == f"{hub_constants.ENDPOINT}/{REPOSITORY}"
     sent = hub.folder(REPOSITORY)

@@ -134,8 +134,7 @@ class Card(NamedTuple):
         )
         if shown:
             lines.append(f"The training images show {shown}.")
-        lines += ["", "```", "pip install completesplat"]
-        lines += [f"completesplat predict image=photo.jpg weights={self.repository}", "```", ""]
+        lines += ["", "```", f"completesplat predict image=photo.jpg weights={self.repository}", "```", ""]
         own = sorted(set(own_modules(self.architecture)))
         if own:
             lines += [f"They need {', '.join(own)}, of a module that is not here; `trust=true` allows it.", ""]

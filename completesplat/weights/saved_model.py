@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -15,7 +16,6 @@ from completesplat.files import home_path, make_folder, write_bytes
 from completesplat.weights import (
     CONFIG_FILE,
     RUN_CHECKPOINT,
-    RUN_CONFIG_FILE,
     RUN_WEIGHTS,
     SUMS_FILE,
     WEIGHTS_FILE,
@@ -25,7 +25,7 @@ from completesplat.weights import (
 )
 from completesplat.weights.hub import GRAPHS, check_destination, send
 from completesplat.weights.model_card import CARD_FILE, Card, CardContents, ModelScores, card_text, read_scores
-from completesplat.weights.opening import read_model
+from completesplat.weights.opening import StoredModel, read_model
 
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
 LICENSE_FILES = "LICENSE*"
@@ -103,7 +103,10 @@ class SavedModel(nn.Module):
     def _files_to_send(self, repository: str, graphs: Path | None, said: CardContents) -> dict[str, Path | bytes]:
         """Return all files of a repository by their paths in it. The card comes first."""
         folder = None if self.file is None else self.file.parent
-        unchanged = self.file is not None and self.file.is_file() and self._is_in(self.file)
+        unchanged = False
+        if self.file is not None and self.file.is_file():
+            # It was opened before, with as much trust as it needs.
+            unchanged = self._is(read_model(self.file, trust=True))
         as_stored = unchanged and self.file is not None and self.file.name == WEIGHTS_FILE
         files: dict[str, Path | bytes] = {}
         pictures: list[Path] = []
@@ -115,7 +118,10 @@ class SavedModel(nn.Module):
             pictures = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
         else:
             files.update(self.weight_files())
-        pictures += [_picture(name) for name in said.get("pictures", ())]
+        for name in said.get("pictures", ()):
+            picture = _picture(name)
+            if picture.resolve() not in [path.resolve() for path in pictures]:
+                pictures.append(picture)
         for path in [*_licenses(folder), *pictures]:
             if path.name in files:
                 raise CompleteSplatError(f"{path}: there are two files of this name; rename one")
@@ -135,9 +141,8 @@ class SavedModel(nn.Module):
         text = before.read_text(encoding="utf-8") if before is not None and before.is_file() else None
         return {CARD_FILE: card_text(written, text, as_stored).encode(), **files}
 
-    def _is_in(self, file: Path, but: str = "") -> bool:
-        """Return whether a file holds this model's tensors and config, but for one of its settings."""
-        stored = read_model(file, trust=True)  # its author is trusted, or it is in the same run
+    def _is(self, stored: StoredModel, but: str = "") -> bool:
+        """Return whether a stored model has this model's tensors and config, but for one setting."""
         state = self.state_dict()
         if stored.tensors.keys() != state.keys():
             return False
@@ -157,9 +162,10 @@ class SavedModel(nn.Module):
             return []
         run = self.file.parent.parent
         tested = {sha256_of(self.file)}
-        for file in (run / RUN_CHECKPOINT, run / RUN_WEIGHTS / WEIGHTS_FILE):
-            if (run / RUN_CONFIG_FILE).is_file() and file.is_file() and self._is_in(file, but="training"):
-                tested.add(sha256_of(file))
+        for file in (run / RUN_CHECKPOINT, run / RUN_WEIGHTS / WEIGHTS_FILE):  # of one run, with the same weights
+            with suppress(WeightsError):
+                if file.is_file() and self._is(read_model(file, trust=False), but="training"):
+                    tested.add(sha256_of(file))
         tests = []
         if (run / METRICS_FILE).is_file():
             test = read_scores(run / METRICS_FILE)
