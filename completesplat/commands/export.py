@@ -1,6 +1,7 @@
 """`completesplat export`: a model as ONNX graphs, and a model that is sent to the Hugging Face hub."""
 
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -30,6 +31,6 @@ def run(config: DictConfig, out: Path) -> None:
         for file in sorted(out.glob("*.onnx")):
             print(f"{file.name}: {file.stat().st_size / 1e6:.1f} MB")
     if config.push is not None:
-        card = OmegaConf.to_container(OmegaConf.masked_copy(config, list(OF_CARD)))
+        card: Any = OmegaConf.to_container(OmegaConf.masked_copy(config, list(OF_CARD)))
         graphs = out if config.graphs else None
         print(model.push_to_hub(config.push, config.private, config.confirm, graphs, **card))
