@@ -1,6 +1,5 @@
 """Base class of all models that make scenes from photos: inputs, cameras, units and files."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,14 +9,12 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from safetensors.torch import save
-from torch import Tensor, nn
+from torch import Tensor
 
 from completesplat.autoreconstructor.encoder import Images
 from completesplat.autoreconstructor.model import DepthRange, Reconstruction, ReconstructionModel
 from completesplat.data.placement import SMALLEST_NEAR
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.files import make_folder, write_bytes, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
 from completesplat.onnx_graphs import Graph, Precision, write_graphs
@@ -34,13 +31,13 @@ from completesplat.settings.composition import has_bfloat16
 from completesplat.settings.schema import check_settings, check_value
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import concatenate, in_float32
-from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
+from completesplat.weights.saved_model import SavedModel
 
 OBJECT_SHARE = 0.9  # of the image's side that an object on a background fills, as on imported turntables
 _rasterizer = cache(auto)
 
 
-class SceneModel(nn.Module):
+class SceneModel(SavedModel):
     """Base class of models from photos to scenes: `CompleteSplat` (samples), `DeterministicModel`, `PublishedModel`.
 
     Args:
@@ -48,7 +45,6 @@ class SceneModel(nn.Module):
 
     Attributes:
         background: grey value behind the objects in all its training images; None if they show whole scenes.
-        file: file of tensors that it was read from, if it was.
     """
 
     network: ReconstructionModel
@@ -63,10 +59,8 @@ class SceneModel(nn.Module):
     """Advice to users about the photos that it needs."""
 
     def __init__(self, architecture: dict[str, Any]) -> None:
-        super().__init__()
-        self.architecture = architecture
+        super().__init__(architecture)
         self.image_size: int = architecture["image_size"]
-        self.file: Path | None = None
         self.background: float | None = (architecture.get("training") or {}).get("background")
         # These are measured on the training set and serve photos of unknown cameras.
         self.register_buffer("fov_degrees", torch.tensor(50.0))
@@ -329,20 +323,6 @@ class SceneModel(nn.Module):
         intrinsics = pinhole(photograph.fov_degrees, size)
         intrinsics[:2, 2] = size * torch.tensor(photograph.axis)
         return Cameras(torch.eye(4, device=device), intrinsics.to(device), (size, size))
-
-    def save_pretrained(self, path: Path | str) -> None:
-        """Write `config.json`, `model.safetensors` and their checksums into a folder, ready for the Hugging Face hub.
-
-        Raises:
-            CompleteSplatError, DiskError: see `make_folder`.
-        """
-        folder = Path(path)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        make_folder(folder)
-        weights = {key: value.contiguous().cpu() for key, value in self.state_dict().items()}
-        write_bytes(folder / WEIGHTS_FILE, save(weights))  # safetensors' own files are readable by their owner alone
-        write_text(folder / CONFIG_FILE, json.dumps(self.architecture, indent=2) + "\n")
-        write_sums(folder)
 
     def description(self) -> dict[str, Any]:
         """Return what a program needs beside the networks: sizes, cameras, units (`export/README.md` explains them)."""

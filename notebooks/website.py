@@ -25,7 +25,8 @@ LINK = re.compile(r"(?<=\]\()(?!#|\w+:)([^)\s#]+)(#[^)\s]*)?(?=\))")
 CONTENTS = {
     "Start": ["gallery", "weights", *(f"notebooks/{path.stem}" for path in sorted(ROOT.glob("notebooks/*.ipynb")))],
     "Use": [f"completesplat/{name}/index" for name in ("export", "viewer", "data", "training")] + ["conf/index"],
-    "Measure": [f"completesplat/{name}/index" for name in ("evaluation", "evaluation/board", "rasterizers")] + ["notebooks/experiments"],
+    "Measure": [f"completesplat/{name}/index" for name in ("evaluation", "evaluation/board", "rasterizers")]
+    + ["notebooks/experiments"],
     "Build on it": ["api", "CONTRIBUTING", "SECURITY", "CHANGELOG"],
 }
 # Notebooks run commands in a shell, which is no Python.

@@ -1,59 +1,18 @@
 """Weights from the Hugging Face hub: huggingface_hub's own download, from a server that answers as the hub does."""
 
-import json
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from hashlib import sha256
-from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
-from support import serving
-
-COMMIT = "a" * 40
-MODEL = "someone/model"
-
-
-class Hub(BaseHTTPRequestHandler):
-    """Answers for one repository, `MODEL`, whose files are in the folder `files`; the rest is not found."""
-
-    files: Path
-
-    def do_HEAD(self) -> None:
-        self.answer()
-
-    def do_GET(self) -> None:
-        self.wfile.write(self.answer())
-
-    def answer(self) -> bytes:
-        """Send the status and headers of an answer, and return its body."""
-        path, listed = self.path.partition("?")[0], sorted(self.files.iterdir())
-        kind, _, name = path.removeprefix(f"/{MODEL}/resolve/{COMMIT}").rpartition("/")
-        headers, body = {}, b""
-        if path == f"/api/models/{MODEL}/revision/main":
-            body = json.dumps(
-                {"id": MODEL, "sha": COMMIT, "siblings": [{"rfilename": x.name} for x in listed]}
-            ).encode()
-        elif path == f"/api/models/{MODEL}/tree/{COMMIT}":
-            sizes = [{"type": "file", "path": x.name, "size": x.stat().st_size, "oid": x.name} for x in listed]
-            body = json.dumps(sizes).encode()
-        elif kind == "" and (self.files / name).is_file():
-            body = (self.files / name).read_bytes()
-            headers = {"ETag": f'"{sha256(body).hexdigest()}"', "X-Repo-Commit": COMMIT}
-        self.send_response(200 if body else 404)
-        for header, value in {**headers, "Content-Length": str(len(body))}.items():
-            self.send_header(header, value)
-        self.end_headers()
-        return body
-
-    def log_message(self, *_: object) -> None: ...
+from hub_server import MODEL, hub_with
 
 
 @pytest.fixture
-def address(tiny_weights: Path) -> Iterator[str]:
-    with serving(type("TinyHub", (Hub,), {"files": tiny_weights})) as address:
+def address(tiny_weights: Path, tmp_path: Path) -> Iterator[str]:
+    with hub_with(tmp_path / "hub", tiny_weights) as (address, _):
         yield address
 
 

@@ -63,7 +63,7 @@ NEED_BLENDER = ("RENDERS", "ASSET", "RUN40", "RUN41")
 NEEDS_MORE = ["IMAGES", "SOFA", "COUCH", "SPLATS", "PART1", "TABLE_OF_A", "PHOTOS", "FOX", "MOUSE", "CUP", "FRUITS"]
 NEEDS_MORE += ["FRUIT_TURNS", "ETH80_FRUIT", "RUN7", "evaluation=co3d", "trainer.devices=8", "splatter_image:"]
 NEEDS_MORE += ["model_hydrants.pth", "SHAPES", "MIX", "STORE", "RUN90", "TOYS_TEST", "=CAN", "=TRACTOR"]
-NEEDS_MORE += ["SCANS", "gpu_weights", "RESULT"]
+NEEDS_MORE += ["SCANS", "gpu_weights", "RESULT", "push=me/", "weights=me/"]  # a hub: `test_push`
 TAKES_MINUTES = ["completesplat bench"]
 
 

@@ -118,6 +118,14 @@ class ExportSettings(TypedDict):
 
     precision: Literal["float32", "float16"]
     trust: bool
+    graphs: bool
+    push: str | None
+    private: bool
+    confirm: bool
+    license: str | None
+    datasets: Sequence[str]
+    pictures: Sequence[str]
+    scores: Sequence[str]
 
 
 class ModelSettings(TypedDict):

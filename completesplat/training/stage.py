@@ -27,7 +27,7 @@ from completesplat.rasterizers import Rasterizer
 from completesplat.scene import Batch, SceneBatch
 from completesplat.settings import schema
 from completesplat.weights.checkpoint_reading import load_tensors, read_checkpoint
-from completesplat.weights.runs import CONFIG, config_of_checkpoint, without_training
+from completesplat.weights.runs import CONFIG, config_of_checkpoint, with_overrides, without_training
 
 # "cudagraphs" also records a call's operations on a GPU, to start them at once.
 Compile = Literal[False, True, "cudagraphs"]
@@ -95,25 +95,46 @@ class Stage(Scorer):
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]
-        cls, checkpoint_path: str | Path, map_location: torch.device | str | None = None, trust: bool = False
+        cls,
+        checkpoint_path: str | Path,
+        map_location: torch.device | str | None = None,
+        hparams_file: str | Path | None = None,
+        strict: bool | None = None,
+        weights_only: bool | None = None,
+        trust: bool = False,
+        **overrides: Any,
     ) -> Any:
         """Build the model of a checkpoint from the config in it (`hyper_parameters`), with its weights.
 
         Args:
+            hparams_file: YAML file whose `model` replaces the config in the checkpoint, such as a run's `config.yaml`.
+            strict: refuse tensors that only the checkpoint has or only the model; None: as `strict_loading` says, which
+                is true by default. If false, tensors that the checkpoint lacks keep their initial values. Tensors of
+                another size are always refused.
+            weights_only: always true here.
             trust: the checkpoint names your own modules, and you trust its author; not needed below the working folder.
+            **overrides: changes of the config, as the options `model.NAME` of `fit`: `background=0.0`,
+                `optimizer={"lr": 1e-5}` or `**{"loss.terms.ssim.weight": 0.5}`. Mappings change only what they name.
 
         Raises:
             WeightsError: the checkpoint is missing, damaged or of another class, or `config_of_checkpoint` refuses it.
+            CompleteSplatError: an override does not fit.
         """
+        if weights_only is False:
+            raise WeightsError(
+                "weights_only=False: only tensors and plain values are read from checkpoints; leave it out"
+            )
         path = Path(checkpoint_path)
         contents = read_checkpoint(path)
-        config = config_of_checkpoint(path, contents, trust)
+        hparams = None if hparams_file is None else Path(hparams_file)
+        config = OmegaConf.create(config_of_checkpoint(path, contents, trust, hparams))
+        model = with_overrides(without_training(config).model, overrides)
         with own_errors():
-            module = instantiate(without_training(OmegaConf.create(config)).model, _convert_="all")
+            module = instantiate(model, _convert_="all")
         if not isinstance(module, cls):
             raise WeightsError(f"{path}: holds a {type(module).__name__}, which is no {cls.__name__}")
-        load_tensors(module, contents["state_dict"], path)
-        module.config = config
+        load_tensors(module, contents["state_dict"], path, module.strict_loading if strict is None else strict)
+        module.keep_config(model)
         return module if map_location is None else module.to(map_location)
 
     def setup(self, stage: str) -> None:

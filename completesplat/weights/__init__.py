@@ -117,8 +117,12 @@ def is_pointer(file: Path) -> bool:
 
 def write_sums(folder: Path) -> None:
     """Write the checksums of the two files of a model."""
-    lines = [f"{sha256_of(folder / name)}  {name}\n" for name in (CONFIG_FILE, WEIGHTS_FILE)]
-    write_text(folder / SUMS_FILE, "".join(lines))
+    write_text(folder / SUMS_FILE, sums_of(folder))
+
+
+def sums_of(folder: Path) -> str:
+    """Return the checksums of the two files of a model, as lines of `sha256sum`."""
+    return "".join(f"{sha256_of(folder / name)}  {name}\n" for name in (CONFIG_FILE, WEIGHTS_FILE))
 
 
 def read_small(path: Path) -> str:

@@ -6,6 +6,7 @@ tensors would repeat. None of this needs Lightning.
 """
 
 import io
+import logging
 import math
 import pickle
 import pickletools
@@ -34,6 +35,9 @@ PLAIN = re.compile(
     r"|collections (OrderedDict|Counter)|_codecs encode"
 )
 """Names that build tensors, containers and bytes. torch allows more, such as byte arrays of any length."""
+MOST_NAMED = 5  # tensors in a message
+
+logger = logging.getLogger(__name__)
 
 
 def read_tensor_file(path: Path, mmap: bool = False) -> Any:
@@ -214,9 +218,34 @@ def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:
     load_tensors(module, part, path)
 
 
-def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | Path) -> None:
-    """Load the tensors of a file into a module; raise WeightsError, naming the file, unless all are present and fit."""
-    difference = mismatch(module.state_dict(), tensors)
+def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | Path, strict: bool = True) -> None:
+    """Load the tensors of a file into a module.
+
+    Args:
+        path: the file, for messages.
+        strict: refuse tensors that only the file has or only the module; false: log their names.
+
+    Raises:
+        WeightsError: a tensor has another size or type, or only one of the two has it.
+    """
+    network = module.state_dict()
+    if not strict:
+        _log_difference(network, tensors, path)
+        tensors = {name: tensor for name, tensor in tensors.items() if name in network}
+        network = {name: tensor for name, tensor in network.items() if name in tensors}
+    difference = mismatch(network, tensors)
     if difference is not None:
         raise WeightsError(f"{path}: weights of another architecture: {difference}")
-    module.load_state_dict(tensors)
+    module.load_state_dict(tensors, strict=strict)
+
+
+def _log_difference(network: Mapping[str, Tensor], weights: Mapping[str, Tensor], path: str | Path) -> None:
+    """Warn of tensors that only a network has, or only a file."""
+    missing = [name for name in network if name not in weights]
+    needless = [name for name in weights if name not in network]
+    if missing:
+        named = ", ".join(missing[:MOST_NAMED])
+        logger.warning("%s: %d tensors are missing there and keep initial values: %s", path, len(missing), named)
+    if needless:
+        named = ", ".join(needless[:MOST_NAMED])
+        logger.warning("%s: %d tensors have no place here: %s", path, len(needless), named)

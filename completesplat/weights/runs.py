@@ -1,10 +1,11 @@
 """Configs of runs of `fit`, read from their folders and checkpoints. `check_names` checks the names in them."""
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
@@ -36,17 +37,28 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
     return without_training(_changed(allowed, overrides))
 
 
-def config_of_checkpoint(checkpoint: Path, contents: Mapping[str, Any], trust: bool) -> dict[str, Any]:
-    """Return the config of the model in the contents of a checkpoint; raise WeightsError if `check_names` refuses it.
+def config_of_checkpoint(
+    checkpoint: Path, contents: Mapping[str, Any], trust: bool, hparams_file: Path | None = None
+) -> dict[str, Any]:
+    """Return the config of the model in the contents of a checkpoint, or in `hparams_file` in its place.
 
-    The run's folder is the one above the checkpoint's. Links are followed, because the config is in the file itself:
-    a link in the user's folder does not make another person's file the user's own.
+    The run's folder is the one above the checkpoint's, or that of `hparams_file`. Links are followed, because the
+    config is in the file itself: a link in the user's folder does not make another person's file the user's own.
+
+    Raises:
+        WeightsError: there is no config, or `check_names` refuses it.
     """
-    config = contents.get(CONFIG)
+    if hparams_file is None:
+        config = contents.get(CONFIG)
+        origin = ConfigOrigin(checkpoint, checkpoint.resolve().parent.parent, trust)
+        advice = "train with `fit`, or with what completesplat.instantiate gives"
+    else:
+        config = _read_sections(hparams_file, ["model"])
+        origin = ConfigOrigin(hparams_file, hparams_file.resolve().parent, trust)
+        advice = "a run of fit writes one, config.yaml"
     if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
-        reason = "has no config; train with `fit`, or with what completesplat.instantiate gives"
-        raise WeightsError(f"{checkpoint}: {reason}")
-    allowed: dict[str, Any] = check_names(config, ConfigOrigin(checkpoint, checkpoint.resolve().parent.parent, trust))
+        raise WeightsError(f"{origin.file}: has no config; {advice}")
+    allowed: dict[str, Any] = check_names(config, origin)
     return allowed
 
 
@@ -61,15 +73,43 @@ def read_run_config(checkpoint: Path) -> tuple[Path, dict[str, Any]]:
     path = checkpoint.absolute().parent.parent / RUN_CONFIG_FILE
     if not path.is_file():
         raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
-    text = read_small(path)
-    try:
-        config = OmegaConf.masked_copy(OmegaConf.create(text), SECTIONS)  # type: ignore[arg-type]
-    except Exception as error:  # YAML and OmegaConf raise errors of many types
-        raise WeightsError(f"{path}: not a run's configuration ({type(error).__name__})") from error
-    plain = dict(OmegaConf.to_container(config, resolve=False))  # type: ignore[arg-type]
+    plain = _read_sections(path, SECTIONS)
     if not all(isinstance(plain.get(section), Mapping) for section in SECTIONS):
         raise WeightsError(f"{path}: not the configuration of a run of fit, which has {' and '.join(SECTIONS)}")
     return path, plain
+
+
+def _read_sections(path: Path, sections: list[str]) -> dict[str, Any]:
+    """Return sections of a YAML file as plain containers; raise WeightsError if it is missing or cannot be read."""
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such file")
+    text = read_small(path)
+    try:
+        config = OmegaConf.masked_copy(OmegaConf.create(text), sections)  # type: ignore[arg-type]
+        return dict(OmegaConf.to_container(config, resolve=False))  # type: ignore[arg-type]
+    except Exception as error:  # YAML and OmegaConf raise errors of many types
+        raise WeightsError(f"{path}: not a run's configuration ({type(error).__name__})") from error
+
+
+def with_overrides(model: DictConfig, overrides: Mapping[str, object]) -> DictConfig:
+    """Return a model's config with changes: names of settings, `.` between the levels, and values.
+
+    Mappings change only what they name. The changes come from the user and may name anything.
+
+    Raises:
+        CompleteSplatError: there is no such setting, or a value does not fit or is an object.
+    """
+    changed = copy.deepcopy(model)
+    for name, value in overrides.items():
+        try:
+            OmegaConf.update(changed, name, value, merge=True, force_add=True)
+        except (OmegaConfBaseException, AssertionError) as error:
+            advice = "give numbers, texts, lists or mappings, as in the config; set other objects on the loaded module"
+            raise CompleteSplatError(f"{name}: cannot be overridden with {type(value).__name__}; {advice}") from error
+    if overrides:
+        checks.check_parts(changed)
+        checks.check_optimizer(changed.get("optimizer"))
+    return changed
 
 
 def _changed(config: Any, overrides: list[str]) -> Any:

@@ -90,6 +90,100 @@ def test_a_checkpoint_is_held_to_the_rules_of_a_run(pipeline, tmp_path):
         completesplat.ReconstructionModule.load_from_checkpoint(tmp_path / "other.ckpt")
 
 
+def saved(contents: dict, path: Path) -> Path:
+    torch.save(contents, path)
+    return path
+
+
+def test_a_checkpoint_loads_with_changed_settings_which_its_next_checkpoint_keeps(pipeline, tmp_path):
+    path = pipeline.var / "checkpoints/last.ckpt"
+    load = completesplat.ReconstructionModule.load_from_checkpoint
+    module = load(path, background=0.25, optimizer={"lr": 3e-4}, **{"loss.terms.ssim.weight": 0.5})
+    assert module.background == 0.25
+    assert module.optimizer.keywords["lr"] == 3e-4
+    assert module.loss.terms["ssim"]["weight"] == 0.5
+    before = load(path)
+    assert before.optimizer.keywords["lr"] != 3e-4
+    assert module.optimizer.keywords["adam_lr"] == before.optimizer.keywords["adam_lr"]
+    assert module.loss.terms["mse"]["weight"] == before.loss.terms["mse"]["weight"]
+    assert all(torch.equal(value, module.state_dict()[name]) for name, value in before.state_dict().items())
+
+    data, _ = opened(pipeline.toy)
+    trainer = quiet_trainer(max_steps=1, default_root_dir=tmp_path)
+    trainer.fit(module, data)
+    assert module.lr_schedulers().base_lrs[0] == 3e-4
+    trainer.save_checkpoint(tmp_path / "next.ckpt")
+    assert load(tmp_path / "next.ckpt", trust=True).background == 0.25
+
+    diffusion = completesplat.LatentDiffusion.load_from_checkpoint(
+        pipeline.diffusion / "checkpoints/last.ckpt", guidance_weight=0.5, **{"completesplat.sampler.steps": 3}
+    )
+    assert diffusion.guidance_weight == 0.5
+    assert diffusion.completesplat.sampler.steps == 3
+
+
+def test_a_changed_setting_that_does_not_fit_is_one_clear_line(pipeline):
+    load = partial(completesplat.ReconstructionModule.load_from_checkpoint, pipeline.var / "checkpoints/last.ckpt")
+    for given, match in [
+        ({"backgruond": 0.25}, r"has no setting backgruond \(backgruond\); did you mean background"),
+        ({"background": 2.0}, r"^background=2.0: must lie between 0 and 1$"),
+        ({"optimizer": {"lrr": 1.0}}, r"has no setting lrr \(optimizer.lrr\)"),
+        ({"optimizer": {"lr": -1.0}}, r"^optimizer.lr=-1.0: must be at least 0"),
+        ({"loss": {"terms": {"lpips": {"weight": 1.0}}}}, r"^loss.terms.lpips: give weight, term"),
+        (
+            {"rasterizer": ReferenceRasterizer()},
+            r"^rasterizer: cannot be overridden with ReferenceRasterizer; give num",
+        ),
+        ({"weights_only": False}, r"^weights_only=False: only tensors and plain values"),
+    ]:
+        with pytest.raises(CompleteSplatError, match=match) as caught:
+            load(**given)
+        assert "\n" not in str(caught.value)
+
+
+def test_strict_false_takes_the_tensors_that_fit_and_names_the_others(pipeline, tmp_path, caplog):
+    contents = torch.load(pipeline.var / "checkpoints/last.ckpt", weights_only=True)
+    tensors = contents["state_dict"]
+    name = next(name for name in tensors if name.endswith("weight"))
+    kept = next(other for other in tensors if other != name)
+    removed = tensors.pop(name)
+    tensors["model.more"] = torch.zeros(2)
+    other = saved(contents, tmp_path / "other.ckpt")
+    load = completesplat.ReconstructionModule.load_from_checkpoint
+    with pytest.raises(WeightsError, match=f"{name} is missing there"):
+        load(other)
+    module = load(other, strict=False)
+    assert torch.equal(module.state_dict()[kept], tensors[kept])
+    assert module.state_dict()[name].shape == removed.shape
+    assert not torch.equal(module.state_dict()[name], removed)
+    assert f"1 tensors are missing there and keep initial values: {name}" in caplog.text
+    assert "1 tensors have no place here: model.more" in caplog.text
+    tensors[name] = torch.zeros(3)
+    with pytest.raises(WeightsError, match=rf"{name} is \[3\] there and "):
+        load(saved(contents, tmp_path / "other.ckpt"), strict=False)
+
+
+def test_hparams_file_stands_in_for_the_config_of_a_checkpoint_by_the_same_rules(pipeline, tmp_path):
+    contents = torch.load(pipeline.var / "checkpoints/last.ckpt", weights_only=True)
+    config = contents.pop("hyper_parameters")
+    bare = saved(contents, tmp_path / "bare.ckpt")
+    load = completesplat.ReconstructionModule.load_from_checkpoint
+    module = load(bare, hparams_file=pipeline.var / "config.yaml")
+    assert torch.equal(next(module.parameters()), next(load(pipeline.var / "checkpoints/last.ckpt").parameters()))
+    stranger = tmp_path / "hparams.yaml"
+    config["model"]["loss"]["_target_"] = "os.system"
+    for text, match in [
+        (json.dumps(config), "names os.system, which is no part"),
+        ("lr: 1", "has no config; a run of fit writes one"),
+        ("[", "not a run's configuration"),
+    ]:
+        stranger.write_text(text)
+        with pytest.raises(WeightsError, match=match):
+            load(bare, hparams_file=stranger)
+    with pytest.raises(WeightsError, match=r"none.yaml: no such file"):
+        load(bare, hparams_file=tmp_path / "none.yaml")
+
+
 def test_an_override_that_does_not_fit_is_refused_as_on_the_command_line(toy_root):
     with pytest.raises(CompleteSplatError, match=r"(?s)Could not override 'optimzer\.lr'.*did you mean optimizer\.lr"):
         completesplat.compose("fit", "optimzer.lr=1")

@@ -264,7 +264,7 @@ class PublishedModel(SceneModel):
         known = torch.tensor([0.0, distance + self.network.depths.far], device=self.up.device)
         return self.network.depths.range(known)
 
-    def save_pretrained(self, path: Path | str) -> None:
+    def weight_files(self) -> dict[str, bytes]:
         """Raise WeightsError, because published weights stay in their authors' files."""
         raise WeightsError("published weights are kept as their authors' files: copy these")
 

@@ -1,8 +1,8 @@
-"""Splits of a CO3D category into training, validation and test, with the sequences that are left out."""
+"""Splits of CO3D categories into training, validation and test, with the sequences that are left out."""
 
 import logging
 import os
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +20,9 @@ from completesplat.data.validation import field, path_below, read_json
 from completesplat.errors import BadAnnotation, DataError, SharedSequences, errors_at, refused_to
 
 logger = logging.getLogger(__name__)
+
+FRAMES_FILE = "frame_annotations.jgz"
+VIDEOS_FILE = "sequence_annotations.jgz"
 
 
 def set_list_path(category: Path, subset: str | None) -> Path | None:
@@ -104,12 +107,14 @@ class SplitMembers(NamedTuple):
     Attributes:
         listed: number of sequences in the split's list, usable or not.
         captured: all frames of the same sequences, also those of other splits; the up direction is estimated from them.
+        annotations: file that annotates the frames of each sequence.
     """
 
     listed: int
     frames: dict[str, list[CO3DFrame]]
     captured: dict[str, list[CO3DFrame]]
     point_clouds: dict[str, Path | None]
+    annotations: dict[str, Path]
     left_out: dict[str, list[str]]
 
     def without(self, names: Collection[str], reason: str) -> "SplitMembers":
@@ -120,13 +125,65 @@ class SplitMembers(NamedTuple):
         frames = {name: frames for name, frames in self.frames.items() if name not in names}
         return self._replace(frames=frames, left_out=self.left_out | {reason: lost})
 
+    def below(self, category: str) -> "SplitMembers":
+        """Return the split with the category before each name."""
+        return SplitMembers(
+            listed=self.listed,
+            frames={f"{category}/{name}": value for name, value in self.frames.items()},
+            captured={f"{category}/{name}": value for name, value in self.captured.items()},
+            point_clouds={f"{category}/{name}": value for name, value in self.point_clouds.items()},
+            annotations={f"{category}/{name}": value for name, value in self.annotations.items()},
+            left_out={reason: [f"{category}/{name}" for name in names] for reason, names in self.left_out.items()},
+        )
+
+
+def joined(parts: Sequence[SplitMembers]) -> SplitMembers:
+    """Return the split that has the sequences of several, which have different names."""
+    whole = SplitMembers(0, {}, {}, {}, {}, {})
+    for part in parts:
+        whole.frames.update(part.frames)
+        whole.captured.update(part.captured)
+        whole.point_clouds.update(part.point_clouds)
+        whole.annotations.update(part.annotations)
+        for reason, names in part.left_out.items():
+            whole.left_out.setdefault(reason, []).extend(names)
+    return whole._replace(listed=sum(part.listed for part in parts))
+
 
 class Category(NamedTuple):
-    """Splits of a category, the files that define them, and the errors in these files."""
+    """Splits of a category or of several, the files that define them, and the errors in these files."""
 
     splits: dict[str, SplitMembers]
     files: list[Path]
     refused: list[DataError]
+
+
+def read_categories(
+    root: Path,
+    categories: Sequence[str],
+    subset: str | None,
+    seeded: SeededSplit,
+    filters: Filters,
+    allow_shared: bool = False,
+) -> Category:
+    """Read a category, or several as one, whose sequences are then named CATEGORY/NAME.
+
+    Each category is split and filtered for itself. The arguments and errors are those of `read_category`.
+    """
+    if len(categories) == 1:
+        return read_category(root, categories[0], subset, seeded, filters, allow_shared)
+    files = list[Path]()
+    refused = list[DataError]()
+    parts: dict[str, list[SplitMembers]] = {split: [] for split in SPLITS}
+    for name in categories:
+        category = read_category(root, name, subset, seeded, filters, allow_shared)
+        files += category.files
+        for error in category.refused:
+            sequence = None if error.sequence is None else f"{name}/{error.sequence}"
+            refused.append(type(error)(error.reason, error.file, sequence, error.frame))
+        for split, members in category.splits.items():
+            parts[split].append(members.below(name))
+    return Category({split: joined(members) for split, members in parts.items()}, files, refused)
 
 
 def read_category(
@@ -142,9 +199,9 @@ def read_category(
     """
     folder = path_below(root, category)
     if not os.path.isdir(folder):
-        raise DataError("no such CO3D category", str(folder))
-    frames_file = folder / "frame_annotations.jgz"
-    videos_file = folder / "sequence_annotations.jgz"
+        raise DataError(f"no such CO3D category; {_existing_categories(root)}", str(folder))
+    frames_file = folder / FRAMES_FILE
+    videos_file = folder / VIDEOS_FILE
     set_list = set_list_path(folder, subset)
     refused = list[DataError]()
     listed = None
@@ -160,10 +217,18 @@ def read_category(
     if wanted is not None:
         _refuse_missing_frames(frames, wanted, set_list, refused)
     listed = split_by_seed(frames, seeded) if listed is None else listed
-    splits = {split: _members(split, listed[split], frames, videos, filters) for split in SPLITS}
+    splits = {split: _members(split, listed[split], frames, frames_file, videos, filters) for split in SPLITS}
     if lost:
         splits["val"].left_out["in training too"] = lost
     return Category(splits, [file for file in (frames_file, videos_file, set_list) if file is not None], refused)
+
+
+def _existing_categories(root: Path) -> str:
+    """Return which categories there are, for a message."""
+    names = sorted(path.parent.name for path in root.glob(f"*/{FRAMES_FILE}"))
+    if not names:
+        return f"no folder there has {FRAMES_FILE}: is data.root right?"
+    return f"there are {', '.join(names)}"
 
 
 def _refuse_unannotated(frames: Frames, videos: Collection[str], file: Path, refused: list[DataError]) -> None:
@@ -186,7 +251,12 @@ def _refuse_missing_frames(
 
 
 def _members(
-    split: str, listed: Iterable[tuple[str, int]], frames: Frames, videos: dict[str, CO3DVideo], filters: Filters
+    split: str,
+    listed: Iterable[tuple[str, int]],
+    frames: Frames,
+    frames_file: Path,
+    videos: dict[str, CO3DVideo],
+    filters: Filters,
 ) -> SplitMembers:
     members: dict[str, list[CO3DFrame]] = {}
     for name, number in sorted(listed):
@@ -210,6 +280,7 @@ def _members(
         frames={name: members[name] for name in names},
         captured={name: list(frames[name].values()) for name in names},
         point_clouds={name: videos[name].point_cloud for name in names},
+        annotations=dict.fromkeys(names, frames_file),
         left_out=left_out,
     )
 

@@ -1,29 +1,30 @@
-"""Data module for one category of CO3D v2 (Reizenstein et al., ICCV 2021), or of data in its layout."""
+"""Data module for categories of CO3D v2 (Reizenstein et al., ICCV 2021), or of data in its layout."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from completesplat.data.co3d.category import Filters, read_category
+from completesplat.data.co3d.category import Filters, read_categories
 from completesplat.data.co3d.category_writers import in_mode
 from completesplat.data.co3d.source import CO3DSource
 from completesplat.data.loading.hidden_modes import HiddenModeScenes
 from completesplat.data.loading.object_data_module import ObjectDataModule
 from completesplat.data.packed.manifest import Scalar
 from completesplat.data.splits import SeededSplit
-from completesplat.errors import DataError, MissingFile
+from completesplat.errors import CompleteSplatError, DataError, MissingFile
 from completesplat.quantities import Natural, Positive, Range, Share
 
 
 class CO3DDataModule(ObjectDataModule):
-    """Scenes of one category, read without PyTorch3D and without the `co3d` package.
+    """Scenes of one category or several, read without PyTorch3D and without the `co3d` package.
 
     Args:
-        root: folder of the categories, or a prepared category.
-        category: a folder below `root`, such as "hydrant".
+        root: folder of the categories, or a folder of prepared data.
+        category: a folder below `root`, such as "hydrant", or several, which are one data set. Then each is split and
+            filtered for itself, and scenes are named CATEGORY/NAME. The order of categories changes nothing.
         subset: name of the set list that splits the frames (Splatter Image: `fewview_dev`); None: split by seed.
         allow_shared_sequences: accept a set list that tests on sequences of training or validation. CO3D's
             `fewview_train` does, and so do all lists that divide the frames of a sequence (`manyview_...`).
@@ -43,7 +44,7 @@ class CO3DDataModule(ObjectDataModule):
     def __init__(
         self,
         root: str,
-        category: str,
+        category: str | Sequence[str],
         subset: str | None = "fewview_dev",
         allow_shared_sequences: bool = False,
         val_fraction: Share = 0.05,
@@ -58,7 +59,10 @@ class CO3DDataModule(ObjectDataModule):
         **settings: Any,
     ) -> None:
         super().__init__(root, depth_before=depth_before, depth_after=depth_after, **settings)
-        self.category = category
+        self.categories = [category] if isinstance(category, str) else sorted(category)
+        if not self.categories or len(set(self.categories)) < len(self.categories):
+            raise CompleteSplatError(f"data.category=[{','.join(self.categories)}]: must name each category once")
+        self.category = ",".join(self.categories)
         self.subset = subset
         self.allow_shared_sequences = allow_shared_sequences
         self.seeded = SeededSplit(val_fraction, test_fraction, split_seed)
@@ -95,17 +99,18 @@ class CO3DDataModule(ObjectDataModule):
         """Open all splits at once, because they share the annotations. Sequences without images are left out.
 
         Raises:
-            DataError: more sequences have no images than `max_bad_fraction` allows; else as `read_category`.
+            DataError: more sequences have no images than `max_bad_fraction` allows; else as `read_categories`.
         """
-        splits, files, refused = read_category(
-            self.root, self.category, self.subset, self.seeded, self.filters, self.allow_shared_sequences
+        splits, files, refused = read_categories(
+            self.root, self.categories, self.subset, self.seeded, self.filters, self.allow_shared_sequences
         )
         first = {name: frames[0].image for split in splits.values() for name, frames in split.frames.items()}
         absent = {name for name, image in first.items() if not os.path.isdir(image.parent)}
         most = 0.0 if self.tolerance.on_bad == "raise" else self.tolerance.max_bad_fraction
         if len(absent) > most * len(first):
             counted = f"{len(absent)} of {len(first)} sequences have no images, as after a partial download"
-            raise DataError(f"{counted}; data.max_bad_fraction=1 uses the others", str(self.root / self.category))
+            folder = self.root / self.categories[0] if len(self.categories) == 1 else self.root
+            raise DataError(f"{counted}; data.max_bad_fraction=1 uses the others", str(folder))
         splits = {split: members.without(absent, "not downloaded") for split, members in splits.items()}
         return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}
 

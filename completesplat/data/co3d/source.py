@@ -99,7 +99,7 @@ def _foreground(frame: CO3DFrame) -> np.ndarray:
 
 
 class CO3DSource(SequenceSource):
-    """Sequences of one split of a category."""
+    """Sequences of one split of a category, or of several."""
 
     def __init__(
         self, members: SplitMembers, framing: ObjectFraming, files: Sequence[Path], refused: list[DataError]
@@ -138,7 +138,7 @@ class CO3DSource(SequenceSource):
         placement = object_placement(members.point_clouds[name], frames, members.captured[name])
         numbers = [frame.number for frame in frames]
         cameras = [frame.camera for frame in frames]
-        with errors_at(self._files[0]):
+        with errors_at(members.annotations[name]):
             read = partial(_read, name, frames, self.framing)
             sequence = placed_sequence(name, numbers, cameras, placement, self.framing, read)
         if not any(frame.depth for frame in frames):
