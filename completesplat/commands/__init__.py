@@ -24,7 +24,7 @@ from completesplat.files import file_refusal
 from completesplat.settings import composition, help
 from completesplat.settings.arguments import SWEEP, for_hydra
 from completesplat.settings.options import conf_folder
-from completesplat.settings.sweeps import check_sweep
+from completesplat.settings.sweeps import check_sweep, starts_search
 from completesplat.signals import end_with, ended_by_signals
 
 CALLED = re.compile(r"Error in call to target '(torch|lightning|diffusers|torchmetrics)\.")
@@ -55,6 +55,8 @@ def launch(verb: str, arguments: list[str]) -> None:
     logging.raiseExceptions = False
     program = sys.argv[0]
     overrides = for_hydra(verb, arguments)
+    if verb == "fit" and starts_search(overrides) and not is_sweep(overrides) and not shows_config(overrides):
+        overrides = [SWEEP[0], *overrides]
     _check_start(overrides)
     if is_sweep(overrides):
         check_sweep(overrides)
@@ -65,7 +67,7 @@ def launch(verb: str, arguments: list[str]) -> None:
     def job(config: DictConfig) -> float | None:
         try:
             with hold_job_lock(*jobs.job_folders(config)):
-                return jobs.run_job(verb, config, program, arguments)
+                return jobs.run_trial(verb, config, program, arguments)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # Hydra names the job, runs the others, and raises at the end
@@ -83,12 +85,17 @@ def is_sweep(overrides: Sequence[str]) -> bool:
     return any(flag in overrides for flag in SWEEP)
 
 
+def shows_config(overrides: Sequence[str]) -> bool:
+    """Return whether Hydra only prints the config."""
+    return any(argument.startswith("--cfg=") for argument in overrides)
+
+
 def _check_start(overrides: Sequence[str]) -> None:
     """Raise CompleteSplatError for an empty `out`, and if a sweep or several processes do not go with the arguments."""
     for empty in ("out=", "out=''", "out=null"):
         if empty in overrides:
             raise CompleteSplatError(f"{empty}: names no folder; give out=DIR")
-    if is_sweep(overrides) and any(argument.startswith("--cfg=") for argument in overrides):
+    if is_sweep(overrides) and shows_config(overrides):
         raise CompleteSplatError("--cfg shows the settings of one run: leave out -m")
     if not one_of_several():
         return

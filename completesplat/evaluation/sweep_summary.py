@@ -22,10 +22,8 @@ from completesplat.wording import printable
 # Hydra imports this file for every run, even to print the help. So torch and rich are imported when a job has ended.
 log = logging.getLogger(__name__)
 
-CAPTION = (
-    "Mean ± sample standard deviation over seeds; PSNR in dB. "
-    f"The best of our rows is in bold, the second best underlined. {tables.SSIM_NOTE}"
-)
+CAPTION = "Mean ± sample standard deviation over seeds; PSNR in dB."
+TEST_NOTE = f"The best of our rows is in bold, the second best underlined. {tables.SSIM_NOTE}"
 OF_VALIDATION = "validation, not a test"
 VALIDATION_NOTE = (
     "Jobs without a test have the last figures of their validation, on a fixed part of the validation set; "
@@ -202,7 +200,10 @@ def _validation_cell(row: Entry, name: str) -> tables.Cell:
 
 def _table_remarks(rows: Sequence[Entry], alike: bool) -> list[str]:
     """Return remarks on what the table shows."""
-    remarks = [CAPTION if rows else "No job of this sweep has finished."]
+    if not rows:
+        return ["No job of this sweep has finished."]
+    tested = any(row.scenes is not None for row in rows)
+    remarks = [f"{CAPTION} {TEST_NOTE}" if tested else CAPTION]
     if _validated(rows):
         remarks.append(VALIDATION_NOTE)
     if not alike:

@@ -1,6 +1,7 @@
 """`completesplat --help` and `completesplat VERB --help`: what `conf/` says of a verb and its settings."""
 
-from collections.abc import Iterator, Sequence
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -10,6 +11,9 @@ from completesplat.settings.options import LOADER, TASKS, conf_folder, conf_text
 HELP_FLAGS = ("--help", "-h")
 NO_SETTINGS = ("defaults", "verb", "description", "hydra", "task")
 """Keys of a file that are no settings of its verb."""
+CHANGING_SEVERAL = ("debug", "hparams_search")
+"""Config groups whose options change settings of several parts, which the pages show."""
+WIDTH = 120
 
 
 def help_page(verb: str, arguments: Sequence[str] = ()) -> str:
@@ -63,7 +67,34 @@ def settings_and_parts(name: str) -> Iterator[str]:
             default = "null" if option is None else option
             lines.append(f"  {place}={default}  [{', '.join(options(group))}]")
         yield "\n".join(lines)
+    for group, _ in choices.values():
+        if group in CHANGING_SEVERAL:
+            yield "\n".join(option_changes(group))
     yield "A sweep over values: -m key=a,b. Lists and values with spaces want the shell's quotes: 'key=[a,b]'."
+
+
+def option_changes(group: str) -> Iterator[str]:
+    """Yield lines with the purpose of each option of a config group, and the settings that it changes."""
+    for option in options(group):
+        name = f"{group}/{option}"
+        purpose = " ".join(first_comment(name).partition("\n  completesplat ")[0].split())
+        yield from textwrap.wrap(f"{group}={option}: {purpose}", WIDTH, break_on_hyphens=False)
+        changes = " ".join(flat_settings(contents(name)))
+        yield from textwrap.wrap(changes, WIDTH, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False)
+
+
+def flat_settings(config: Mapping[str, Any], place: str = "") -> Iterator[str]:
+    """Yield the settings of a file as `key=value`, with the options that it overrides."""
+    for name, value in config.items():
+        key = f"{place}{name}"
+        if key == "defaults":
+            for entry in value:
+                ((group, option),) = entry.items()
+                yield f"{group.removeprefix('override ').removeprefix('/')}={option}"
+        elif isinstance(value, dict):
+            yield from flat_settings(value, f"{key}.")
+        else:
+            yield f"{key}={'null' if value is None else str(value).lower() if isinstance(value, bool) else value}"
 
 
 def defaults(name: str) -> tuple[list[str], dict[str, tuple[str, str | None]]]:
