@@ -231,16 +231,16 @@ def test_a_search_by_optuna_goes_on_where_it_stopped_and_over_runs_that_diverge(
     assert best.best_params["model.background"] == 1.0
     assert all("test" not in score for score in scores)
     summary = (tmp_path / "SEARCH/summary.md").read_text()
-    assert "validation, not a test: psnr\\_novel" in summary or "validation, not a test: psnr_novel" in summary
+    assert "validation, not a test: psnr_novel" in summary
     again = command.succeeds("fit", "-m", *given[1:], "hydra.sweeper.n_trials=4")
     assert again.out.count("finished before, not repeated") == len(scores)
     assert len(list(tmp_path.glob("SEARCH/*/run.json"))) == 4
 
 
 def test_optuna_is_an_extra(command):
-    with pytest.raises(CompleteSplatError, match=r"by Optuna needs the extra optuna: pip install .*\[optuna\]"):
-        with nearest_names("fit"):
-            raise MissingConfigException("", missing_cfg_file="hydra/sweeper/optuna")
+    needed = r"by Optuna needs the extra optuna: pip install .*\[optuna\]"
+    with pytest.raises(CompleteSplatError, match=needed), nearest_names("fit"):
+        raise MissingConfigException("", missing_cfg_file="hydra/sweeper/optuna")
     if find_spec("hydra_plugins.hydra_optuna_sweeper") is None:
         assert command.refuses(*SEARCH).startswith("a search by Optuna needs the extra optuna: pip install ")
 
