@@ -40,7 +40,7 @@ TURN_FRAMES = 48  # two seconds
 
 
 @dataclass(frozen=True)
-class Drawing:
+class DrawnScenes:
     """Image of a model's results for fixed scenes, figures to log, and a scene that Weights & Biases shows turning."""
 
     sheet: Image.Image
@@ -68,7 +68,7 @@ class DrawsFixedScenes(Callback):
         self.last_step = 0
 
     @abstractmethod
-    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> Drawing:
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> DrawnScenes:
         """Draw the model's results for the scenes [view], which are on the CPU."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -104,7 +104,7 @@ class DrawsFixedScenes(Callback):
             elif isinstance(logger, TensorBoardLogger):
                 logger.experiment.add_image(self.folder.name, np.asarray(drawing.sheet), row, dataformats="HWC")
 
-    def _media(self, module: Stage, drawing: Drawing) -> dict[str, Any]:
+    def _media(self, module: Stage, drawing: DrawnScenes) -> dict[str, Any]:
         """Return the image, and the video if a scene turns, as Weights & Biases takes them."""
         import wandb
 
@@ -157,7 +157,7 @@ class FixedScenes(DrawsFixedScenes):
     def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Positive = 4) -> None:
         super().__init__(folder, every_n_steps, scenes, views=1)
 
-    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> Drawing:
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> DrawnScenes:
         batch = stack(scenes).to(module.device)
         with trainer.precision_plugin.forward_context():
             gaussians = module.reconstruct(batch, seed=0)
@@ -173,8 +173,10 @@ class FixedScenes(DrawsFixedScenes):
         first = gaussians[0].map(Tensor.float)
         selected = first[storable(first)]
         if not selected.count:
-            return Drawing(sheet, figures)
-        return Drawing(sheet, figures, PlacedScene(selected, batch.reference.cameras[0], module.up.to(module.device)))
+            return DrawnScenes(sheet, figures)
+        return DrawnScenes(
+            sheet, figures, PlacedScene(selected, batch.reference.cameras[0], module.up.to(module.device))
+        )
 
 
 def write_turn(path: Path, scene: PlacedScene, rasterizer: Rasterizer, background: float) -> None:
@@ -299,7 +301,7 @@ class Samples(DrawsFixedScenes):
         super().__init__(folder, every_n_steps, scenes, views)
         self.samples = samples
 
-    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> Drawing:
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> DrawnScenes:
         drawings = []
         for scene in scenes:
             batch = stack([scene]).to(module.device)
@@ -313,7 +315,7 @@ class Samples(DrawsFixedScenes):
         means = {}
         for name in scores[0]:
             means[f"samples/{name}"] = sum(values[name] for values in scores) / len(scores)
-        return Drawing(samples_sheet(drawings), means)
+        return DrawnScenes(samples_sheet(drawings), means)
 
 
 @dataclass(frozen=True)
