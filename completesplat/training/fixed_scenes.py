@@ -174,9 +174,8 @@ class FixedScenes(DrawsFixedScenes):
         selected = first[storable(first)]
         if not selected.count:
             return DrawnScenes(sheet, figures)
-        return DrawnScenes(
-            sheet, figures, PlacedScene(selected, batch.reference.cameras[0], module.up.to(module.device))
-        )
+        turning = PlacedScene(selected, batch.reference.cameras[0], module.up.to(module.device))
+        return DrawnScenes(sheet, figures, turning)
 
 
 def write_turn(path: Path, scene: PlacedScene, rasterizer: Rasterizer, background: float) -> None:
