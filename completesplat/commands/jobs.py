@@ -56,7 +56,7 @@ def run_trial(verb: str, config: DictConfig, program: str, given: list[str]) -> 
 
     Searches such as Optuna's stop at a job that fails. A job that diverges only has bad settings.
     """
-    direction = OmegaConf.select(HydraConfig.get(), "sweeper.direction")
+    direction = OmegaConf.select(HydraConfig.get().sweeper, "direction")
     searches = HydraConfig.get().mode == RunMode.MULTIRUN and direction is not None
     try:
         value = run_job(verb, config, program, given)

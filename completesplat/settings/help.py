@@ -94,7 +94,14 @@ def flat_settings(config: Mapping[str, Any], place: str = "") -> Iterator[str]:
         elif isinstance(value, dict):
             yield from flat_settings(value, f"{key}.")
         else:
-            yield f"{key}={'null' if value is None else str(value).lower() if isinstance(value, bool) else value}"
+            yield f"{key}={_written(value)}"
+
+
+def _written(value: object) -> str:
+    """Return a value as the command line takes it."""
+    if value is None:
+        return "null"
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def defaults(name: str) -> tuple[list[str], dict[str, tuple[str, str | None]]]:
