@@ -55,7 +55,7 @@ def launch(verb: str, arguments: list[str]) -> None:
     logging.raiseExceptions = False
     program = sys.argv[0]
     overrides = for_hydra(verb, arguments)
-    if verb == "fit" and starts_search(overrides) and not is_sweep(overrides) and not shows_config(overrides):
+    if _is_lone_search(verb, overrides):
         overrides = [SWEEP[0], *overrides]
     _check_start(overrides)
     if is_sweep(overrides):
@@ -83,6 +83,11 @@ def launch(verb: str, arguments: list[str]) -> None:
 def is_sweep(overrides: Sequence[str]) -> bool:
     """Return whether Hydra's flag for several jobs is among the arguments."""
     return any(flag in overrides for flag in SWEEP)
+
+
+def _is_lone_search(verb: str, overrides: Sequence[str]) -> bool:
+    """Return whether a search for good settings is to be run, without Hydra's flag for several jobs."""
+    return verb == "fit" and starts_search(overrides) and not is_sweep(overrides) and not shows_config(overrides)
 
 
 def shows_config(overrides: Sequence[str]) -> bool:

@@ -154,36 +154,49 @@ def summarize(*folders: Path) -> tuple[list[Entry], tables.Table]:
     """
     jobs = collect(*folders)
     finished = [job for job in jobs if job.finished]
-    waiting = [job for folder in folders for job in not_started(folder, jobs)]
     alike = len(group_by_protocol((job, job.protocol) for job in finished if job.protocol)) < 2
-    rows = [row for row in sweep_rows(finished) if alike or row.seeds is not None]
-    formats = formats_of(rows)
-    tested = _present(tables.shown_scores(formats), rows)
-    validated = _validated(rows)
-    headings = [tables.Heading("ablation", figures=False), tables.Heading("seeds"), tables.Heading("scenes")]
-    headings += [tables.score_heading(name, formats[tables.metric_of(name)]) for name in tested]
-    headings += [tables.Heading(name.removeprefix(VALIDATION), OF_VALIDATION) for name in validated]
-    columns = [(name, None) for name in tested]
-    body = score_rows(rows, ("method", "seeds", "scenes"), columns, tables.Notes(), marked=alike)
-    for row, line in zip(rows, body, strict=True):
-        line.cells.extend(_validation_cell(row, name) for name in validated)
+    rows = sweep_rows(finished)
+    if not alike:
+        rows = [row for row in rows if row.seeds is not None]
+    headings, body = _columns(rows, alike)
+    waiting: list[str] = []
+    for folder in folders:
+        waiting += not_started(folder, jobs)
     remarks = [
         *_table_remarks(rows, alike),
         *_progress_remarks(jobs, waiting),
         *_program_remarks([job.record for job in jobs if job.record]),
     ]
-    scenes = "Validation scenes" if validated and not tested else "Test scenes"
+    scenes = "Test scenes" if _tested(rows) or not _validated(rows) else "Validation scenes"
     return rows, tables.Table("summary", f"{scenes}, mean ± deviation over seeds", headings, body, remarks)
 
 
-def _present(names: Iterable[str], rows: Sequence[Entry]) -> list[str]:
-    """Return the names of scores that a row has."""
-    return [name for name in names if any(name in row.scores for row in rows)]
+def _columns(rows: Sequence[Entry], alike: bool) -> tuple[list[tables.Heading], list[tables.TableRow]]:
+    """Return headings and rows of cells: labels, then scores of tests, then figures of validation."""
+    formats = formats_of(rows)
+    tested = _tested(rows)
+    validated = _validated(rows)
+    headings = [tables.Heading("ablation", figures=False), tables.Heading("seeds"), tables.Heading("scenes")]
+    for name in tested:
+        headings.append(tables.score_heading(name, formats[tables.metric_of(name)]))
+    for name in validated:
+        headings.append(tables.Heading(name.removeprefix(VALIDATION), OF_VALIDATION))
+    columns = [(name, None) for name in tested]
+    body = score_rows(rows, ("method", "seeds", "scenes"), columns, tables.Notes(), marked=alike)
+    for row, line in zip(rows, body, strict=True):
+        line.cells.extend(_validation_cell(row, name) for name in validated)
+    return headings, body
+
+
+def _tested(rows: Sequence[Entry]) -> list[str]:
+    """Return the names of the scores of tests that the table shows."""
+    names = {name for row in rows for name in row.scores}
+    return [name for name in tables.shown_scores(formats_of(rows)) if name in names]
 
 
 def _validated(rows: Sequence[Entry]) -> list[str]:
-    """Return the names of the figures of validation that a row has, each once."""
-    names = dict.fromkeys(name for row in rows for name in row.scores)
+    """Return the names of the figures of validation that a row has."""
+    names = {name for row in rows for name in row.scores}
     return sorted(name for name in names if name.startswith(VALIDATION))
 
 
@@ -202,8 +215,7 @@ def _table_remarks(rows: Sequence[Entry], alike: bool) -> list[str]:
     """Return remarks on what the table shows."""
     if not rows:
         return ["No job of this sweep has finished."]
-    tested = any(row.scenes is not None for row in rows)
-    remarks = [f"{CAPTION} {TEST_NOTE}" if tested else CAPTION]
+    remarks = [f"{CAPTION} {TEST_NOTE}" if _tested(rows) else CAPTION]
     if _validated(rows):
         remarks.append(VALIDATION_NOTE)
     if not alike:

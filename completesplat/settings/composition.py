@@ -152,8 +152,9 @@ def job_name(*keys: str, _root_: DictConfig) -> str:
     values = dict(override.lstrip("+~").split("=", 1) for override in _root_.hydra.overrides.task if "=" in override)
     shared = shard_folder(_root_)
     searched = OmegaConf.select(_root_, "hydra.sweeper.params") or {}
-    named = [key for key in dict.fromkeys([*keys, *searched]) if key in values and not (shared and key == "shard")]
-    full = "+".join(f"{key}-{values[key]}" for key in named)
+    unnamed = {"shard"} if shared else set()
+    parts = [f"{key}-{values[key]}" for key in dict.fromkeys([*keys, *searched]) if key in values.keys() - unnamed]
+    full = "+".join(parts)
     name = re.sub(r"[^\w.+-]+", "_", full, flags=re.ASCII) or "."  # file systems limit bytes, not characters
     if name in (full, ".") and len(name) <= LONGEST_NAME:
         return name
