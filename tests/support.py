@@ -169,7 +169,8 @@ def _composed_once(verb: str, *choices: str) -> bytes:
 def compose_config(verb: str, *overrides: str) -> DictConfig:
     """Return the config of a verb, as the command line would compose it; a choice of options is composed only once."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))
-    chosen = [entry.key_or_group.partition("/")[0] in GROUPS for entry in parsed]
+    keys = [entry.key_or_group for entry in parsed]
+    chosen = [key.partition("/")[0] in GROUPS or key.startswith("hydra.") for key in keys]
     choices = [text for text, choice in zip(overrides, chosen, strict=True) if choice]
     config = pickle.loads(_composed_once(verb, *choices))
     values = [entry for entry, choice in zip(parsed, chosen, strict=True) if not choice]

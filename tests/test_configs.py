@@ -33,7 +33,7 @@ def test_nothing_in_the_tree_is_forgotten_here():
 
 
 # Options of other groups differ in one part of a run only, so that one configuration has one of each group.
-DELTAS = ["experiment", "ablation", "posterior", "objective"]
+DELTAS = ["experiment", "ablation", "posterior", "objective", "debug", "hparams_search"]
 PARTS = [group for group in TRAINING_GROUPS if group not in DELTAS]
 WHOLES = ["model", "evaluation"]
 
@@ -53,6 +53,8 @@ def complete(chosen: dict[str, str], *more: str):
 
 @pytest.mark.parametrize(("group", "option"), [(group, option) for group in DELTAS for option in options(group)])
 def test_every_option_that_changes_several_parts_composes_and_fits_the_checks(group, option):
+    if option == "optuna":
+        pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="hydra-optuna-sweeper is not installed")
     complete({group: option})
 
 

@@ -22,6 +22,7 @@ DISTRIBUTIONS = packages_distributions()
 NEVER_IMPORTED = {
     "beartype": "checks the types of jaxtyping in all tests (pytest's options)",
     "furo": "`make site`",
+    "hydra-optuna-sweeper": "found by hydra: hydra/sweeper=optuna",
     "hydra-submitit-launcher": "found by hydra: hydra/launcher=submitit_slurm",
     "ipykernel": "runs the notebooks",
     "pdoc": "`make docs`",
@@ -146,8 +147,9 @@ def licences(name: str) -> set[str]:
     expression = metadata.get("License-Expression")
     given = expression or metadata.get("License") or "UNKNOWN"
     if given == "UNKNOWN" or (not expression and ("\n" in given.strip() or len(given) > 100)):  # the licence's text
-        classifiers = metadata.get_all("Classifier") or []
-        given = " AND ".join(line.split(" :: ")[-1] for line in classifiers if line.startswith("License ::"))
+        lines = [line.split(" :: ") for line in metadata.get_all("Classifier") or []]
+        # Two words alone name no licence.
+        given = " AND ".join(words[-1] for words in lines if words[0] == "License" and len(words) > 2)
     given = given or READ_IN_THEIR_FILES.get(name, "UNKNOWN")
     if given in OLD_NAMES:
         return {OLD_NAMES[given]}

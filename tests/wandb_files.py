@@ -11,7 +11,7 @@ from typing import Any
 from support import waited_for
 
 BLOCK, FILE_HEADER, CHUNK_HEADER = 2**15, 7, 7
-TYPES = {"image": "image-file"}
+TYPES = {"image": "image-file", "video": "video-file"}
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from completesplat.settings import composition, help
 from completesplat.settings.arguments import SWEEP, for_hydra
 from completesplat.settings.extensions import extension_of, extensions
 from completesplat.settings.options import conf_folder
-from completesplat.settings.sweeps import check_sweep
+from completesplat.settings.sweeps import check_sweep, starts_search
 from completesplat.signals import end_with, ended_by_signals
 
 LOADED = re.compile(r"Error loading '([\w.]+)'")  # begins Hydra's message on what cannot be imported
@@ -57,6 +57,8 @@ def launch(verb: str, arguments: list[str]) -> None:
     logging.raiseExceptions = False
     program = sys.argv[0]
     overrides = for_hydra(verb, arguments)
+    if _is_lone_search(verb, overrides):
+        overrides = [SWEEP[0], *overrides]
     _check_start(overrides)
     if is_sweep(overrides):
         check_sweep(overrides)
@@ -67,7 +69,7 @@ def launch(verb: str, arguments: list[str]) -> None:
     def job(config: DictConfig) -> float | None:
         try:
             with hold_job_lock(*jobs.job_folders(config)):
-                return jobs.run_job(verb, config, program, arguments)
+                return jobs.run_trial(verb, config, program, arguments)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # Hydra names the job, runs the others, and raises at the end
@@ -85,12 +87,22 @@ def is_sweep(overrides: Sequence[str]) -> bool:
     return any(flag in overrides for flag in SWEEP)
 
 
+def _is_lone_search(verb: str, overrides: Sequence[str]) -> bool:
+    """Return whether a search for good settings is to be run, without Hydra's flag for several jobs."""
+    return verb == "fit" and starts_search(overrides) and not is_sweep(overrides) and not shows_config(overrides)
+
+
+def shows_config(overrides: Sequence[str]) -> bool:
+    """Return whether Hydra only prints the config."""
+    return any(argument.startswith("--cfg=") for argument in overrides)
+
+
 def _check_start(overrides: Sequence[str]) -> None:
     """Raise CompleteSplatError for an empty `out`, and if a sweep or several processes do not go with the arguments."""
     for empty in ("out=", "out=''", "out=null"):
         if empty in overrides:
             raise CompleteSplatError(f"{empty}: names no folder; give out=DIR")
-    if is_sweep(overrides) and any(argument.startswith("--cfg=") for argument in overrides):
+    if is_sweep(overrides) and shows_config(overrides):
         raise CompleteSplatError("--cfg shows the settings of one run: leave out -m")
     if not one_of_several():
         return

@@ -27,6 +27,8 @@ EXTRAS = {
     "render": "to render meshes without Blender",
     "colmap": "to find cameras of photos, to read captures whose lens distorts",
     "slurm": "to spread sweeps over a cluster",
+    "optuna": "to search for good settings",
+    "tensorboard": "to log to TensorBoard",
     "perceptual": "to train on perceptual features without a download",
 }
 LIBRARIES = ("torch", "lightning", "hydra-core", "diffusers", "numpy", "numba")

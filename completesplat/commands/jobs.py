@@ -2,6 +2,7 @@
 
 import gc
 import logging
+import math
 import os
 import shlex
 import sys
@@ -21,7 +22,7 @@ from completesplat.commands.continuing import is_finished, recorded
 from completesplat.commands.earlier_stage import start_checkpoint, take_architecture
 from completesplat.commands.inputs import check_inputs
 from completesplat.commands.locks import is_first_process
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, DivergenceError
 from completesplat.evaluation.records import SCORES, job_entries, read_mapping
 from completesplat.settings.checks import check_parts_of_verb, check_values
 from completesplat.settings.composition import shard_folder, typed_keys, use_working_folder
@@ -49,6 +50,25 @@ def job_folders(config: DictConfig) -> tuple[Path, Path]:
     """Return the folder of a job's record, and that of its results, which jobs that are its shards share."""
     folder = HydraConfig.get().runtime.output_dir
     return Path(folder), Path(folder.removesuffix(shard_folder(config)))
+
+
+def run_trial(verb: str, config: DictConfig, program: str, given: list[str]) -> float | None:
+    """Run one job (`run_job`), and return its metric for a search: the worst value if it diverged or is not finite.
+
+    Searches such as Optuna's stop at a job that fails. A job that diverges only has bad settings.
+    """
+    direction = OmegaConf.select(HydraConfig.get().sweeper, "direction")
+    searches = HydraConfig.get().mode == RunMode.MULTIRUN and direction is not None
+    try:
+        value = run_job(verb, config, program, given)
+    except DivergenceError as error:
+        if not searches:
+            raise
+        log.warning("%s: %s; the search goes on", job_folders(config)[1], error)
+        value = math.nan
+    if searches and value is not None and math.isnan(value):
+        return -math.inf if str(direction).endswith("maximize") else math.inf
+    return value
 
 
 def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> float | None:

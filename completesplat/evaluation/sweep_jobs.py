@@ -29,6 +29,8 @@ from completesplat.evaluation.records import (
 from completesplat.settings.sweeps import swept_values
 
 SEED = "seed"
+VALIDATION = "val/"
+"""Beginning of the names of figures of validation, which no score of a test has."""
 MULTIRUN = "multirun.yaml"
 MOST_JOBS = 10_000
 
@@ -37,7 +39,9 @@ MOST_JOBS = 10_000
 class Job:
     """Job of a sweep: the name of its folder in the sweep's, its record, its config and its results.
 
-    `test` and `protocol` are empty where nothing was tested. `label` tells the job from the others of its sweep.
+    `test` and `protocol` are empty where nothing was tested. `validation` has the last figures of a training's
+    validation, by the names under which they were logged (`val/psnr_novel`). `label` tells the job from the others of
+    its sweep.
     """
 
     name: str
@@ -49,6 +53,7 @@ class Job:
     bad_steps: int = 0
     test: dict[str, FlatScores] = field(default_factory=dict)
     protocol: Protocol = field(default_factory=Protocol)
+    validation: FlatScores = field(default_factory=dict)
     label: str = ""
 
 
@@ -119,7 +124,16 @@ def _job(folder: Path, sweep: Path) -> Job:
         bad_steps=bad_steps_of(metrics),
         test=test,
         protocol=protocol,
+        validation=_validation_figures(metrics),
     )
+
+
+def _validation_figures(metrics: Mapping[str, object]) -> FlatScores:
+    figures = {}
+    for name, value in metrics.items():
+        if name.startswith(VALIDATION) and isinstance(value, float):
+            figures[name] = value
+    return figures
 
 
 def _read_config(folder: Path) -> Mapping[str, object]:

@@ -14,17 +14,20 @@ from hydra.types import RunMode
 
 from completesplat.evaluation import table_writers, tables
 from completesplat.evaluation.provenance import machine, shell_command
-from completesplat.evaluation.records import MODEL, UPPER_BOUND, Record
+from completesplat.evaluation.records import MODEL, UPPER_BOUND, FlatScores, Record
 from completesplat.evaluation.score_tables import Entry, formats_of, group_by_protocol, score_rows
-from completesplat.evaluation.sweep_jobs import SEED, Job, collect, not_started
+from completesplat.evaluation.sweep_jobs import SEED, VALIDATION, Job, collect, not_started
 from completesplat.wording import printable
 
 # Hydra imports this file for every run, even to print the help. So torch and rich are imported when a job has ended.
 log = logging.getLogger(__name__)
 
-CAPTION = (
-    "Mean ± sample standard deviation over seeds; PSNR in dB. "
-    f"The best of our rows is in bold, the second best underlined. {tables.SSIM_NOTE}"
+CAPTION = "Mean ± sample standard deviation over seeds; PSNR in dB."
+TEST_NOTE = f"The best of our rows is in bold, the second best underlined. {tables.SSIM_NOTE}"
+OF_VALIDATION = "validation, not a test"
+VALIDATION_NOTE = (
+    "Jobs without a test have the last figures of their validation, on a fixed part of the validation set; "
+    "they are no scores of a test and are not ranked."
 )
 MOST_NAMED = 20  # jobs in a remark
 PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
@@ -63,21 +66,26 @@ def sweep_rows(finished: Sequence[Job]) -> list[Entry]:
     """Return means over seeds for each setting, sorted by label, and then for the naive predictors.
 
     A score that was not measured in all jobs is left out, because a mean over fewer seeds than the row states would
-    mislead.
+    mislead. A setting without a test has the means of its last validation, under names that no test has
+    (`val/psnr_novel`).
     """
+    rows = [_setting_row(jobs) for jobs in _jobs_by_setting(finished)]
+    rows.sort(key=_order)
+    naive = dict.fromkeys(predictor for job in finished for predictor in job.test if predictor != MODEL)
+    for name in naive:
+        rows.append(_row(name, [job for job in finished if name in job.test], name))
+    return rows
+
+
+def _jobs_by_setting(finished: Sequence[Job]) -> list[list[Job]]:
+    """Return the jobs of each setting, one for each seed."""
     settings: dict[frozenset[tuple[str, str]], dict[object, Job]] = {}
     for job in finished:
         shared = frozenset((key, value) for key, value in job.overrides.items() if key != SEED)
         # An extended sweep may repeat the default seed as seed=N.
         seed = job.overrides.get(SEED, str(job.config.get(SEED)))
         settings.setdefault(shared, {})[seed] = job
-    ours = []
-    for by_seed in settings.values():
-        jobs = list(by_seed.values())
-        ours.append(_row(jobs[0].label, jobs))
-    naive = dict.fromkeys(predictor for job in finished for predictor in job.test if predictor != MODEL)
-    rows = sorted(ours, key=_order)
-    return [*rows, *(_row(name, [job for job in finished if name in job.test], name) for name in naive)]
+    return [list(by_seed.values()) for by_seed in settings.values()]
 
 
 def _order(row: Entry) -> list[tuple[bool, str]]:
@@ -85,29 +93,47 @@ def _order(row: Entry) -> list[tuple[bool, str]]:
     return [(part == PROPOSED, part) for part in row.label.split(", ")]
 
 
-def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> Entry:
-    by_job = [job.test.get(predictor, {}) for job in jobs]
-    names = [name for name in by_job[0] if "_novel_" in name or "_reference_" in name]  # of views, not of the run
-    scores = {name: [x[name] for x in by_job] for name in names if all(name in x for x in by_job)}
-    row = Entry(
+def _row(label: str, jobs: Sequence[Job], predictor: str) -> Entry:
+    """Return the means of a predictor over jobs."""
+    tested = [job.test.get(predictor, {}) for job in jobs]
+    return Entry(
         label,
-        {name: fmean(values) for name, values in scores.items()},
-        _common(int(table["scenes"]) for table in by_job if table),
+        {name: fmean(values) for name, values in _shared_values(jobs, predictor).items()},
+        _common(int(scores["scenes"]) for scores in tested if scores),
         predictor,
-        upper_bound=any(table.get(UPPER_BOUND) for table in by_job),
+        upper_bound=any(scores.get(UPPER_BOUND) for scores in tested),
         protocol=jobs[0].protocol,
     )
-    if predictor != MODEL:
-        return row
-    deviations = {name: _deviation(values) for name, values in scores.items()} if len(jobs) > 1 else {}
+
+
+def _setting_row(jobs: Sequence[Job]) -> Entry:
+    """Return the row of a setting: means and deviations over its seeds."""
+    deviations = {}
+    if len(jobs) > 1:
+        deviations = {name: _deviation(values) for name, values in _shared_values(jobs, MODEL).items()}
     return replace(
-        row,
+        _row(jobs[0].label, jobs, MODEL),
         seeds=len(jobs),
         steps=_common(job.steps for job in jobs),
         deviations=deviations,
         unchanged=all(job.record.get("unchanged", False) for job in jobs),
         bad_steps=sum(job.bad_steps for job in jobs),
     )
+
+
+def _shared_values(jobs: Sequence[Job], predictor: str) -> dict[str, list[float]]:
+    """Return a value for each job of each score that all jobs have; figures of validation, if no job has a test."""
+    if any(job.test for job in jobs):
+        by_job = [_scores_of_views(job.test.get(predictor, {})) for job in jobs]
+    else:
+        by_job = [job.validation for job in jobs]
+    shared = set.intersection(*map(set, by_job))
+    return {name: [scores[name] for scores in by_job] for name in by_job[0] if name in shared}
+
+
+def _scores_of_views(scores: FlatScores) -> FlatScores:
+    """Return the scores of images, without facts of the run such as its time."""
+    return {name: value for name, value in scores.items() if "_novel_" in name or "_reference_" in name}
 
 
 def _deviation(values: Sequence[float]) -> float:
@@ -129,23 +155,75 @@ def summarize(*folders: Path) -> tuple[list[Entry], tables.Table]:
     jobs = collect(*folders)
     finished = [job for job in jobs if job.finished]
     alike = len(group_by_protocol((job, job.protocol) for job in finished if job.protocol)) < 2
-    rows = [row for row in sweep_rows(finished) if alike or row.seeds is not None]
+    rows = sweep_rows(finished)
+    if not alike:
+        rows = [row for row in rows if row.seeds is not None]
+    headings, body = _columns(rows, alike)
+    waiting: list[str] = []
+    for folder in folders:
+        waiting += not_started(folder, jobs)
+    remarks = [
+        *_table_remarks(rows, alike),
+        *_progress_remarks(jobs, waiting),
+        *_program_remarks([job.record for job in jobs if job.record]),
+    ]
+    scenes = "Test scenes" if _tested(rows) or not _validated(rows) else "Validation scenes"
+    return rows, tables.Table("summary", f"{scenes}, mean ± deviation over seeds", headings, body, remarks)
+
+
+def _columns(rows: Sequence[Entry], alike: bool) -> tuple[list[tables.Heading], list[tables.TableRow]]:
+    """Return headings and rows of cells: labels, then scores of tests, then figures of validation."""
     formats = formats_of(rows)
-    names = [name for name in tables.shown_scores(formats) if any(name in row.scores for row in rows)]
-    columns = [(name, None) for name in names]
-    body = score_rows(rows, ("method", "seeds", "scenes"), columns, tables.Notes(), marked=alike)
+    tested = _tested(rows)
+    validated = _validated(rows)
     headings = [tables.Heading("ablation", figures=False), tables.Heading("seeds"), tables.Heading("scenes")]
-    for name in names:
+    for name in tested:
         headings.append(tables.score_heading(name, formats[tables.metric_of(name)]))
-    waiting = [job for folder in folders for job in not_started(folder, jobs)]
-    remarks = [CAPTION if rows else "No job of this sweep has finished.", *_progress_remarks(jobs, waiting)]
+    for name in validated:
+        headings.append(tables.Heading(name.removeprefix(VALIDATION), OF_VALIDATION))
+    columns = [(name, None) for name in tested]
+    body = score_rows(rows, ("method", "seeds", "scenes"), columns, tables.Notes(), marked=alike)
+    for row, line in zip(rows, body, strict=True):
+        line.cells.extend(_validation_cell(row, name) for name in validated)
+    return headings, body
+
+
+def _tested(rows: Sequence[Entry]) -> list[str]:
+    """Return the names of the scores of tests that the table shows."""
+    names = {name for row in rows for name in row.scores}
+    return [name for name in tables.shown_scores(formats_of(rows)) if name in names]
+
+
+def _validated(rows: Sequence[Entry]) -> list[str]:
+    """Return the names of the figures of validation that a row has."""
+    names = {name for row in rows for name in row.scores}
+    return sorted(name for name in names if name.startswith(VALIDATION))
+
+
+def _validation_cell(row: Entry, name: str) -> tables.Cell:
+    """Return a cell with a figure of validation, which is not ranked."""
+    value = row.scores.get(name)
+    if value is None:
+        return tables.Cell("")
+    text = f"{value:.4g}"
+    if name in row.deviations:
+        text += f" ± {row.deviations[name]:.2g}"
+    return tables.Cell(text, value=value)
+
+
+def _table_remarks(rows: Sequence[Entry], alike: bool) -> list[str]:
+    """Return remarks on what the table shows."""
+    if not rows:
+        return ["No job of this sweep has finished."]
+    remarks = [f"{CAPTION} {TEST_NOTE}" if _tested(rows) else CAPTION]
+    if _validated(rows):
+        remarks.append(VALIDATION_NOTE)
     if not alike:
         remarks.append("Jobs were tested differently (data, resolution, scenes), so their scores cannot be compared.")
     for row in rows:
         if row.upper_bound:
             remarks.append(f"{row.label} has seen the views that it is scored on.")
-    remarks += _program_remarks([job.record for job in jobs if job.record])
-    return rows, tables.Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
+    return remarks
 
 
 def _progress_remarks(jobs: Sequence[Job], waiting: Sequence[str]) -> list[str]:

@@ -32,8 +32,8 @@ PATHS = (
     "export",
 )
 """Last parts of the names of settings for files and folders, whose names may look like numbers."""
-GROUPS_TO_LEAVE_OUT = ("logger", "callbacks")
-"""Config groups with a default that `group=null` leaves out."""
+GROUPS_TO_LEAVE_OUT = ("logger", "callbacks", "hparams_search", "debug")
+"""Config groups that `group=null` leaves out."""
 SWEEP = ("-m", "--multirun")
 HYDRA_FLAGS = (*SWEEP, "--resolve")
 FLAGS_WITH_VALUE = ("--cfg", "--config-dir")
@@ -54,7 +54,8 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
     """Return flags and settings as Hydra reads them, the flags first, because Hydra takes none between settings.
 
     `data import DIR` is short for `data_task=import folder=DIR`, `predict A B` for `image=[A,B]`, `view PATH` for
-    `path=PATH`, and `new KIND NAME` for `kind=KIND name=NAME`. `logger=null` and `callbacks=null` leave the group out.
+    `path=PATH`, and `new KIND NAME` for `kind=KIND name=NAME`. `logger=null`, and others in `GROUPS_TO_LEAVE_OUT`,
+    leave the group out.
 
     Raises:
         CompleteSplatError: Hydra has no such flag, a flag lacks its value, or there are too many words.

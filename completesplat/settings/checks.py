@@ -32,7 +32,7 @@ HYDRA_KEYS = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 
 def check_values(verb: str, config: DictConfig) -> None:
     """Raise CompleteSplatError for the first unfit setting of a verb itself, without importing torch."""
-    for group in ("experiment", "ablation"):
+    for group in ("experiment", "ablation", "hparams_search", "debug"):
         if group in config:
             message = "its file needs `# @package _global_` as its first line, to set anything"
             raise CompleteSplatError(f"{group}: {message}")

@@ -21,6 +21,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
 from completesplat.errors import CompleteSplatError
+from completesplat.installation import install_command
 from completesplat.settings.arguments import for_hydra
 from completesplat.settings.options import conf_folder, did_you_mean, folders, groups, options
 from completesplat.settings.sweeps import swept_overrides
@@ -87,6 +88,10 @@ def nearest_names(verb: str) -> Iterator[None]:
         yield
     except MissingConfigException as error:
         group, _, option = (error.missing_cfg_file or "").strip("/").rpartition("/")
+        if (group, option) == ("hydra/sweeper", "optuna"):
+            raise CompleteSplatError(
+                f"a search by Optuna needs the extra optuna: {install_command('optuna')}"
+            ) from error
         known = options(group)
         if not known:
             raise
@@ -141,11 +146,15 @@ def typed_keys(overrides: Sequence[str]) -> list[str]:
 def job_name(*keys: str, _root_: DictConfig) -> str:
     """Return the directory name for the job that Hydra is about to start: `ablation-no_skips+seed-0`.
 
+    It has the settings `keys`, and those that the sweeper's config searches over (`hydra.sweeper.params`).
     It has no equals signs and commas, so that paths into the directory need no quotes in Hydra's overrides.
     """
     values = dict(override.lstrip("+~").split("=", 1) for override in _root_.hydra.overrides.task if "=" in override)
     shared = shard_folder(_root_)
-    full = "+".join(f"{key}-{values[key]}" for key in keys if key in values and not (shared and key == "shard"))
+    searched = OmegaConf.select(_root_, "hydra.sweeper.params") or {}
+    unnamed = {"shard"} if shared else set()
+    parts = [f"{key}-{values[key]}" for key in dict.fromkeys([*keys, *searched]) if key in values.keys() - unnamed]
+    full = "+".join(parts)
     name = re.sub(r"[^\w.+-]+", "_", full, flags=re.ASCII) or "."  # file systems limit bytes, not characters
     if name in (full, ".") and len(name) <= LONGEST_NAME:
         return name

@@ -1,6 +1,7 @@
 """`completesplat --help` and `completesplat VERB --help`: what `conf/` says of a verb and its settings."""
 
-from collections.abc import Iterator, Sequence
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -10,6 +11,9 @@ from completesplat.settings.options import LOADER, TASKS, conf_folder, conf_text
 HELP_FLAGS = ("--help", "-h")
 NO_SETTINGS = ("defaults", "verb", "description", "hydra", "task")
 """Keys of a file that are no settings of its verb."""
+CHANGING_SEVERAL = ("debug", "hparams_search")
+"""Config groups whose options change settings of several parts, which the pages show."""
+WIDTH = 120
 
 
 def help_page(verb: str, arguments: Sequence[str] = ()) -> str:
@@ -64,6 +68,9 @@ def settings_and_parts(name: str) -> Iterator[str]:
             listed = [name + from_extension(f"{group}/{name}") for name in options(group)]
             lines.append(f"  {place}={default}  [{', '.join(listed)}]")
         yield "\n".join(lines)
+    for group, _ in choices.values():
+        if group in CHANGING_SEVERAL:
+            yield "\n".join(option_changes(group))
     yield "A sweep over values: -m key=a,b. Lists and values with spaces want the shell's quotes: 'key=[a,b]'."
 
 
@@ -71,6 +78,37 @@ def from_extension(name: str) -> str:
     """Return an ending for an option (`GROUP/OPTION`) that tells its extension, empty for all other options."""
     extension = source_of(name)
     return "" if extension is None else f" (from {extension})"
+
+
+def option_changes(group: str) -> Iterator[str]:
+    """Yield lines with the purpose of each option of a config group, and the settings that it changes."""
+    for option in options(group):
+        name = f"{group}/{option}"
+        purpose = " ".join(first_comment(name).partition("\n  completesplat ")[0].split())
+        yield from textwrap.wrap(f"{group}={option}: {purpose}", WIDTH, break_on_hyphens=False)
+        changes = " ".join(flat_settings(contents(name)))
+        yield from textwrap.wrap(changes, WIDTH, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False)
+
+
+def flat_settings(config: Mapping[str, Any], place: str = "") -> Iterator[str]:
+    """Yield the settings of a file as `key=value`, with the options that it overrides."""
+    for name, value in config.items():
+        key = f"{place}{name}"
+        if key == "defaults":
+            for entry in value:
+                ((group, option),) = entry.items()
+                yield f"{group.removeprefix('override ').removeprefix('/')}={option}"
+        elif isinstance(value, dict):
+            yield from flat_settings(value, f"{key}.")
+        else:
+            yield f"{key}={_written(value)}"
+
+
+def _written(value: object) -> str:
+    """Return a value as the command line takes it."""
+    if value is None:
+        return "null"
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def defaults(name: str) -> tuple[list[str], dict[str, tuple[str, str | None]]]:

@@ -8,12 +8,20 @@ from hydra.core.override_parser.types import Glob, Override
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.options import options
 
+SEARCH = "hparams_search"
+"""Config group of searches for good settings."""
+
 
 def swept_overrides(arguments: Sequence[str]) -> list[Override]:
     """Return the settings to which a command line gives several values (`seed=0,1`, `ablation=glob(*)`), in order."""
     overrides = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
     parsed = OverridesParser.create().parse_overrides(overrides)
     return [override for override in parsed if override.is_sweep_override()]
+
+
+def starts_search(arguments: Sequence[str]) -> bool:
+    """Return whether a search for good settings is chosen, which is a sweep also without `-m`."""
+    return any(argument.startswith(f"{SEARCH}=") for argument in arguments)
 
 
 def swept_values(arguments: Sequence[str]) -> dict[str, list[str]] | None:

@@ -19,9 +19,13 @@ from torch import Tensor
 from completesplat.export.cleaning import storable, with_screen_space_dilation
 from completesplat.export.description import plain_camera
 from completesplat.export.images import Sheet, SheetCell, color_depth, image_sheet, strip, write_png
+from completesplat.export.placed_scene import PlacedScene
 from completesplat.export.ply import write_ply
+from completesplat.export.subject import all_around, subject_of
+from completesplat.export.video import render_views, write_video
 from completesplat.files import make_folder, write_json
 from completesplat.gaussians import Gaussians
+from completesplat.geometry.trajectories import orbit
 from completesplat.metrics.images import psnr
 from completesplat.metrics.sample_scores import diversity
 from completesplat.quantities import Positive
@@ -32,6 +36,16 @@ from completesplat.training.callbacks import ExponentialMovingAverage
 from completesplat.training.stage import Stage
 
 ERROR_GAIN = 4
+TURN_FRAMES = 48  # two seconds
+
+
+@dataclass(frozen=True)
+class DrawnScenes:
+    """Image of a model's results for fixed scenes, figures to log, and a scene that Weights & Biases shows turning."""
+
+    sheet: Image.Image
+    figures: dict[str, float]
+    turning: PlacedScene | None = None
 
 
 class DrawsFixedScenes(Callback):
@@ -54,8 +68,8 @@ class DrawsFixedScenes(Callback):
         self.last_step = 0
 
     @abstractmethod
-    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> tuple[Image.Image, dict[str, float]]:
-        """Return an image of the model's results for the scenes [view], which are on the CPU, and figures to log."""
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> DrawnScenes:
+        """Draw the model's results for the scenes [view], which are on the CPU."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.scenes = []
@@ -80,18 +94,26 @@ class DrawsFixedScenes(Callback):
         with restored_afterwards(trainer, module):
             if not self.scenes:
                 self.scenes = fixed_scenes(module.data.val_dataloader(), self.count, self.views)
-            sheet, figures = self.draw(trainer, module, self.scenes)
-        write_png(self.folder / f"step_{self.last_step:06}.png", sheet)
+            drawing = self.draw(trainer, module, self.scenes)
+        write_png(self.folder / f"step_{self.last_step:06}.png", drawing.sheet)
         row = self.last_step - 1  # Lightning numbers a row by the optimizer steps before it
         for logger in trainer.loggers:
-            logger.log_metrics(figures, step=row)
+            logger.log_metrics(drawing.figures, step=row)
             if isinstance(logger, WandbLogger):
-                import wandb
-
-                media: dict[str, Any] = {self.folder.name: wandb.Image(sheet)}
-                logger.log_metrics(media, step=row)
+                logger.log_metrics(self._media(module, drawing), step=row)
             elif isinstance(logger, TensorBoardLogger):
-                logger.experiment.add_image(self.folder.name, np.asarray(sheet), row, dataformats="HWC")
+                logger.experiment.add_image(self.folder.name, np.asarray(drawing.sheet), row, dataformats="HWC")
+
+    def _media(self, module: Stage, drawing: DrawnScenes) -> dict[str, Any]:
+        """Return the image, and the video if a scene turns, as Weights & Biases takes them."""
+        import wandb
+
+        media: dict[str, Any] = {self.folder.name: wandb.Image(drawing.sheet)}
+        if drawing.turning is not None:
+            path = self.folder / "newest/turn.mp4"
+            write_turn(path, drawing.turning, module.rasterizer, module.background)
+            media["turn"] = wandb.Video(str(path), format="mp4")
+        return media
 
 
 @contextmanager
@@ -128,14 +150,14 @@ class FixedScenes(DrawsFixedScenes):
     """Callback that draws the first target of each scene and logs figures of its Gaussians (`DrawsFixedScenes`).
 
     `folder/step_000500.png` has a row for each scene (`scene_panels`); `folder/newest/` holds the scenes
-    themselves (`write_newest`). All loggers get `gaussian_figures`, `layer_figures` and the model's `latent_figures`;
-    Weights & Biases also gets the image.
+    themselves (`write_newest`). All loggers get `gaussian_figures`, `layer_figures` and the model's `latent_figures`.
+    Weights & Biases and TensorBoard get the image, Weights & Biases also a video of the first scene (`write_turn`).
     """
 
     def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Positive = 4) -> None:
         super().__init__(folder, every_n_steps, scenes, views=1)
 
-    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> tuple[Image.Image, dict[str, float]]:
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> DrawnScenes:
         batch = stack(scenes).to(module.device)
         with trainer.precision_plugin.forward_context():
             gaussians = module.reconstruct(batch, seed=0)
@@ -147,7 +169,21 @@ class FixedScenes(DrawsFixedScenes):
             rows.append([SheetCell(images[scene]) for images in panels.values()])
         sheet = image_sheet(list(panels), rows)
         write_newest(self.folder / "newest", trainer.global_step, gaussians, batch, module.up)
-        return sheet, gaussian_figures(gaussians) | layer_figures(gaussians, batch) | latents
+        figures = gaussian_figures(gaussians) | layer_figures(gaussians, batch) | latents
+        first = gaussians[0].map(Tensor.float)
+        selected = first[storable(first)]
+        if not selected.count:
+            return DrawnScenes(sheet, figures)
+        turning = PlacedScene(selected, batch.reference.cameras[0], module.up.to(module.device))
+        return DrawnScenes(sheet, figures, turning)
+
+
+def write_turn(path: Path, scene: PlacedScene, rasterizer: Rasterizer, background: float) -> None:
+    """Write a video of a scene that makes one turn around the object in its camera's image."""
+    subject = subject_of(scene, rasterizer)
+    cameras = orbit(all_around(scene.camera, subject), subject.center, scene.up, TURN_FRAMES)
+    frames, _ = render_views(rasterizer, scene.gaussians, cameras, background)
+    write_video(path, frames.clamp(0, 1))
 
 
 def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBatch, up: Float[Tensor, "3"]) -> None:
@@ -264,7 +300,7 @@ class Samples(DrawsFixedScenes):
         super().__init__(folder, every_n_steps, scenes, views)
         self.samples = samples
 
-    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> tuple[Image.Image, dict[str, float]]:
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> DrawnScenes:
         drawings = []
         for scene in scenes:
             batch = stack([scene]).to(module.device)
@@ -278,7 +314,7 @@ class Samples(DrawsFixedScenes):
         means = {}
         for name in scores[0]:
             means[f"samples/{name}"] = sum(values[name] for values in scores) / len(scores)
-        return samples_sheet(drawings), means
+        return DrawnScenes(samples_sheet(drawings), means)
 
 
 @dataclass(frozen=True)

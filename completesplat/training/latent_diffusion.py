@@ -225,11 +225,27 @@ class LatentDiffusion(DiffusionScorer, Stage):
         return bool(self.completesplat.denoiser(latent, timestep, conditioning).isfinite().all())
 
     def training_step(self, batch: Batch, index: int) -> Float[Tensor, ""]:
+        errors, timestep = self.denoising_errors(batch, self.unconditional_probability)
+        self.log_loss(errors.detach(), timestep)
+        return errors.mean()
+
+    def validation_step(self, scenes: SceneBatch, index: int) -> None:
+        """Score novel views, and log the loss of conditional denoising, with the same noise in each validation."""
+        super().validation_step(scenes, index)
+        with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
+            torch.manual_seed(index)
+            errors, _ = self.denoising_errors(scenes, unconditional_probability=0.0)
+        self.log("val/loss", errors.mean(), batch_size=len(errors))
+
+    def denoising_errors(
+        self, batch: Batch, unconditional_probability: float
+    ) -> tuple[Float[Tensor, " draw"], Int64[Tensor, " draw"]]:
+        """Return squared errors of the denoiser for random timesteps and noise, and these timesteps."""
         parts = self.completesplat
         latent, conditioning = self.inputs(batch)
         latent = latent.repeat_interleave(self.noise_draws, 0)
         conditioning = conditioning.repeat_interleave(self.noise_draws, 0)
-        conditioned = torch.rand(len(latent), device=self.device) >= self.unconditional_probability
+        conditioned = torch.rand(len(latent), device=self.device) >= unconditional_probability
         conditioning = conditioning * conditioned[:, None, None, None]
         noise = torch.randn(latent.shape, device=self.device)  # `randn_like` would depend on the memory layout
         timestep = parts.sampler.draw_timesteps(len(latent), self.device)
@@ -238,8 +254,7 @@ class LatentDiffusion(DiffusionScorer, Stage):
         conditioning = conditioning.contiguous(memory_format=self.memory_format)
         predicted = parts.denoiser(noisy, timestep, conditioning)
         errors: Tensor = (predicted - target(parts.sampler.scheduler, latent, noise, timestep)).square().mean((1, 2, 3))
-        self.log_loss(errors.detach(), timestep)
-        return errors.mean()
+        return errors, timestep
 
     def log_loss(self, errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"]) -> None:
         """Log the mean of the samples' losses, and that of each quarter of the timesteps that is among them."""

@@ -171,6 +171,12 @@ class ReconstructionModule(ReconstructionScorer, Stage):
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
         others = self.draw_others(scenes.targets.images.shape[1]) if self.sees_views else 0
+        total, figures = self.losses(scenes, others)
+        self.log_step({f"train/{name}": value for name, value in figures.items()}, batch_size=len(scenes.names))
+        return total
+
+    def losses(self, scenes: SceneBatch, others: int) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        """Return the loss of all views and figures of it, where the posterior sees a number of the targets."""
         reconstruction = self(scenes, others)
         with torch.autocast(self.device.type, enabled=False):
             gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
@@ -180,9 +186,7 @@ class ReconstructionModule(ReconstructionScorer, Stage):
             total, values = self.loss(prediction, truth, self.global_step)
             images = images.detach().clamp(0, 1)
             quality = psnr(images.flatten(0, 1), truth.images.flatten(0, 1)).mean()
-        logged = {f"train/{name}": value for name, value in values.items()}
-        self.log_step({"train/loss": total.detach(), "train/psnr": quality, **logged}, batch_size=len(scenes.names))
-        return total
+        return total, {"loss": total.detach(), "psnr": quality, **values}
 
     @torch.no_grad()
     def predicts_finite(self, batch: Batch) -> bool:
@@ -194,10 +198,13 @@ class ReconstructionModule(ReconstructionScorer, Stage):
     def validation_step(self, scenes: SceneBatch, index: int) -> None:
         """Score the reference image alone, and if the posterior sees views, also with every other target encoded.
 
+        `val/loss` is the loss of training, where such a posterior sees the first half of the targets.
         `val/psnr_posterior` scores the targets between, which the posterior has not seen: the best that stage 2 could
         reach. `val/posterior_gain` is its gain over the reference image alone for these targets.
         """
         super().validation_step(scenes, index)
+        total, _ = self.losses(scenes, scenes.targets.images.shape[1] // 2 if self.sees_views else 0)
+        self.log("val/loss", total, batch_size=len(scenes.names))
         if not self.sees_views or scenes.targets.images.shape[1] < 2:
             return
         encoded = replace(scenes, targets=scenes.targets[:, ::2])
@@ -251,6 +258,10 @@ class ReconstructorOnly(ReconstructionModule):
 
     def save_weights(self, folder: Path) -> None:
         """Write no weights, because a new photo has no code."""
+
+    def validation_step(self, scenes: SceneBatch, index: int) -> None:
+        """Score novel views alone, because each look at a scene takes a fit."""
+        Stage.validation_step(self, scenes, index)
 
     def forward(self, scenes: SceneBatch, others: int = 0) -> Reconstruction:
         """Reconstruct training images from their codes, and in evaluation any image from a new code."""

@@ -7,19 +7,24 @@ import os
 import stat
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import torch
+from hydra.errors import MissingConfigException
+from hydra.types import RunMode
 from omegaconf import OmegaConf
 from support import LIMIT, SMALL, call, script, strict_json
 from vgg_weights import blank, saved
 
+from completesplat.commands import jobs
 from completesplat.commands.continuing import is_finished
 from completesplat.commands.jobs import optimized
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, DivergenceError
 from completesplat.losses.lpips import load_vgg16
-from completesplat.settings.composition import LONGEST_NAME, job_name, shard_folder, swept_keys
+from completesplat.settings.composition import LONGEST_NAME, job_name, nearest_names, shard_folder, swept_keys
+from completesplat.settings.sweeps import starts_search
 
 LAST = "checkpoints/last.ckpt"
 
@@ -42,6 +47,8 @@ def test_a_job_is_named_by_what_is_swept_plainly_and_like_no_other():
     assert job_name("ablation", "seed", _root_=root) == "ablation-no_skips+seed-1"
     assert len(job_name("name", _root_=root_with(f"name={'写' * 105}")).encode()) <= LONGEST_NAME
     assert job_name("optimizer.lr", _root_=root_with("+optimizer.lr=1e-3")) == "optimizer.lr-1e-3"
+    search = OmegaConf.merge(root, {"hydra": {"sweeper": {"params": {"ablation": "choice(a)", "unused": "choice(1)"}}}})
+    assert job_name("seed", _root_=search) == "seed-1+ablation-no_skips"
     shards = OmegaConf.merge(root_with("shard=1", "shards=2", "seed=3"), {"shard": 1, "shards": 2})
     assert job_name("shard", "seed", _root_=shards) + shard_folder(shards) == "seed-3/shard-1"
     assert job_name("shard", _root_=shards) + shard_folder(shards) == "./shard-1"
@@ -52,6 +59,8 @@ def test_a_job_is_named_by_what_is_swept_plainly_and_like_no_other():
     assert all(not set(name) & set("/=,") and len(name) < LONGEST_NAME + 12 for name in names)
     given = ["-m", "experiment=toy_var", "ablation=glob(*)", "seed=0,1", "levels=[0,1]", "x=range(3)", "y=choice(1)"]
     assert swept_keys(given) == ["ablation", "seed", "x", "y"]
+    assert starts_search(["hparams_search=optuna"])
+    assert not starts_search(["~hparams_search", "experiment=toy_var"])
 
 
 @pytest.fixture(scope="module")
@@ -192,16 +201,68 @@ def test_a_finished_run_is_asked_for_its_metric(command, pipeline):
     assert "val/psnr_novel" in refused
 
 
+SEARCH = ["fit", "hparams_search=optuna", "experiment=toy_var", *SMALL, "callbacks.images=null", "logger=null"]
+SEARCH += ["hydra.sweeper.n_trials=3", "model.background=choice(0.0,1.0)", "out=SEARCH"]
+DIVERGES = '''
+from lightning import Callback
+
+class Diverges(Callback):
+    """The weights of runs with a dark background are not finite."""
+    def on_train_batch_end(self, trainer, module, *_):
+        if module.background == 0:
+            next(module.parameters()).data.fill_(float("nan"))
+'''
+
+
 @pytest.mark.slow
-def test_optuna_finds_the_better_of_two_settings(command, toy_root, tmp_path):
+def test_a_search_by_optuna_goes_on_where_it_stopped_and_over_runs_that_diverge(command, toy_root, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="hydra-optuna-sweeper is not installed")
-    settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "callbacks.images=null", "test=false"]
-    sweep = ["-m", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "hydra.sweeper.direction=maximize"]
-    sweep += ["optimized_metric=val/psnr_novel", "model.background=choice(0.0,1.0)", "hydra.sweeper.sampler.seed=1"]
-    command.succeeds("fit", *sweep, *settings, "out=SEARCH")
+    (tmp_path / "diverging.py").write_text(DIVERGES)
+    given = [*SEARCH, f"data.root={toy_root}", "+callbacks.diverges._target_=diverging.Diverges"]
+    command.succeeds(*given)
     best = OmegaConf.load(tmp_path / "SEARCH/optimization_results.yaml")
-    result = [strict_json(path)["val/psnr_novel"] for path in tmp_path.glob("SEARCH/*/metrics.json")]
-    assert best.best_value == max(result)
+    jobs = [path.parent for path in tmp_path.glob("SEARCH/*/run.json")]
+    assert len(jobs) == 3
+    assert all(job.name.startswith("model.background-") and "+optimizer.lr-0." in job.name for job in jobs)
+    scores = [strict_json(job / "metrics.json") for job in jobs if (job / "metrics.json").is_file()]
+    dark = [job for job in jobs if job.name.startswith("model.background-0.0")]
+    assert 0 < len(dark) == 3 - len(scores)
+    assert best.best_value == max(score["val/psnr_novel"] for score in scores)
+    assert best.best_params["model.background"] == 1.0
+    assert all("test" not in score for score in scores)
+    summary = (tmp_path / "SEARCH/summary.md").read_text()
+    assert "validation, not a test: psnr_novel" in summary
+    again = command.succeeds("fit", "-m", *given[1:], "hydra.sweeper.n_trials=4")
+    assert again.out.count("finished before, not repeated") == len(scores)
+    assert len(list(tmp_path.glob("SEARCH/*/run.json"))) == 4
+
+
+def test_optuna_is_an_extra(command):
+    needed = r"by Optuna needs the extra optuna: pip install .*\[optuna\]"
+    with pytest.raises(CompleteSplatError, match=needed), nearest_names("fit"):
+        raise MissingConfigException("", missing_cfg_file="hydra/sweeper/optuna")
+    if find_spec("hydra_plugins.hydra_optuna_sweeper") is None:
+        assert command.refuses(*SEARCH).startswith("a search by Optuna needs the extra optuna: pip install ")
+
+
+@pytest.mark.parametrize(("direction", "worst"), [("maximize", -math.inf), ("minimize", math.inf)])
+def test_a_run_that_diverges_is_the_worst_of_a_search(monkeypatch, direction, worst):
+    def diverges(*_):
+        raise DivergenceError("the weights are not finite")
+
+    search = OmegaConf.create({"mode": RunMode.MULTIRUN, "sweeper": {"direction": direction}})
+    monkeypatch.setattr(jobs.HydraConfig, "get", lambda: search)
+    monkeypatch.setattr(jobs, "job_folders", lambda config: (Path("a"), Path("a")))
+    for result in (diverges, lambda *_: math.nan):
+        monkeypatch.setattr(jobs, "run_job", result)
+        assert jobs.run_trial("fit", OmegaConf.create(), "", []) == worst
+    monkeypatch.setattr(jobs, "run_job", lambda *_: 20.5)
+    assert jobs.run_trial("fit", OmegaConf.create(), "", []) == 20.5
+    monkeypatch.setattr(jobs, "run_job", diverges)
+    for other in ({"mode": RunMode.RUN}, {"sweeper": {"direction": None}}):
+        search.merge_with(other)
+        with pytest.raises(DivergenceError):
+            jobs.run_trial("fit", OmegaConf.create(), "", [])
 
 
 PYTHON = f"#!{sys.executable}\n"

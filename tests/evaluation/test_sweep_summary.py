@@ -73,6 +73,35 @@ def test_one_seed_has_no_deviation_one_without_a_score_no_mean_and_one_that_dive
     assert ",nan,nan" in (sweep.folder / "summary.csv").read_text()
 
 
+def test_a_sweep_without_tests_has_validation_figures_that_no_test_has(sweep) -> None:
+    for ablation, psnr in {"full": 22.0, "m1": 20.0}.items():
+        for seed in range(2):
+            job = sweep.add(f"ablation={ablation}", f"seed={seed}", test={})
+            put("metrics.json", "val/psnr_novel", psnr + seed)(job)
+    (job / "metrics.json").write_text('{"steps": 9, "val/psnr_novel": null, "not_finite": ["val/psnr_novel: nan"]}')
+    head, _, m1, full = as_markdown(write_summary(sweep.folder)).splitlines()[2:6]
+    assert [text.strip() for text in head.split("|")[1:-1]][3:] == ["validation, not a test: psnr_novel"]
+    assert m1.split("|")[4].strip() == "nan ± nan"
+    assert full.split("|")[4].strip() == "22.5 ± 0.71"  # and is not marked as the best
+    table = read_back(sweep.folder)
+    assert list(table.columns[len(IDENTITY) - 1 :]) == ["val/psnr_novel_mean", "val/psnr_novel_deviation"]
+    assert table.loc["full", "val/psnr_novel_mean"] == 22.5
+    assert any("no scores of a test" in remark for remark in remarks(sweep))
+    assert summarize(sweep.folder)[1].title.startswith("Validation scenes")
+
+
+def test_where_some_jobs_were_tested_validation_stands_apart(sweep) -> None:
+    sweep.add("ablation=m1", "seed=0", test={})
+    sweep.scored("ablation=full", "seed=0", psnr=22.0)
+    rows, table = summarize(sweep.folder)
+    assert [row.label for row in rows] == ["m1", "full", "mean_image", "copy_reference"]
+    scores = {row.label: set(row.scores) for row in rows}
+    assert scores["m1"] == {"val/psnr_novel"}
+    assert "val/psnr_novel" not in scores["full"]
+    assert [row.cells[-1].text for row in table.rows] == ["20", "", "", ""]
+    assert table.title.startswith("Test scenes")
+
+
 def test_a_seed_of_an_extended_sweep_counts_once(sweep) -> None:
     sweep.scored("ablation=m1", psnr=20.0)  # the config's seed is 0
     for seed in range(2):

@@ -26,7 +26,11 @@ def test_a_page_has_its_settings_each_with_a_comment_and_its_parts(verb, task):
         assert block in text
     config = compose(verb, *([] if task is None else [f"{verb}_task={task}"]))
     parts = {place.partition(".")[0] for place in choices}
-    names = config.keys() - parts - {"verb", "description", "task", "hydra", "experiment", "ablation"}
+    names = (
+        config.keys()
+        - parts
+        - {"verb", "description", "task", "hydra", "experiment", "ablation", "hparams_search", "debug"}
+    )
     if task is not None or verb not in TASKS:
         for setting in names - {"out"}:
             assert re.search(rf"^  {setting}:", text, re.MULTILINE), setting

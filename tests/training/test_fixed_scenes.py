@@ -3,6 +3,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import Mock
 
+import imageio.v2 as imageio
 import pandas
 import pytest
 import torch
@@ -14,6 +15,7 @@ from support import SMALL, compose_config, round_gaussians
 
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
+from completesplat.export.placed_scene import PlacedScene
 from completesplat.gaussians import Gaussians, merge_gaussians
 from completesplat.geometry.cameras import pixel_rays
 from completesplat.metrics.images import PSNR_LIMIT
@@ -130,6 +132,18 @@ def test_the_newest_scenes_take_the_place_of_older_ones_and_read_back_with_their
     broken = replace(gaussians, means=gaussians.means * torch.tensor([1.0, torch.nan])[:, None, None])
     fixed_scenes.write_newest(tmp_path / "newest", 1500, broken, scenes, up)  # training goes on
     assert len(read_newest(tmp_path / "newest")[1]) == 1
+
+
+def test_a_turn_shows_the_back_after_half_of_its_frames(tmp_path):
+    camera = scene_batch().reference.cameras[0]
+    colors = torch.tensor([[1.0, 0, 0], [0, 0, 1.0]])
+    ball = round_gaussians(torch.tensor([[0.0, 0, 2.0], [0, 0, 2.4]]), 0.2, 0.99, colors)
+    scene = PlacedScene(ball, camera, pivot=torch.tensor([0.0, 0, 2.2]))
+    fixed_scenes.write_turn(tmp_path / "turn.mp4", scene, ReferenceRasterizer(), 0.5)
+    frames = imageio.mimread(tmp_path / "turn.mp4", memtest=False)
+    assert len(frames) == fixed_scenes.TURN_FRAMES
+    middle = [frame[frame.shape[0] // 2, frame.shape[1] // 2].argmax() for frame in frames]
+    assert (middle[0], middle[fixed_scenes.TURN_FRAMES // 2]) == (0, 2)
 
 
 def test_newest_scenes_that_are_not_there_are_refused(tmp_path):

@@ -20,12 +20,14 @@ MODES = "hidden modes"
 FIT, TESTED = (STAGE1, STAGE2), (STAGE1, STAGE2, TEST)  # `fit` ends with a test
 # The kind of the values, the runs that log them, and their keys; `*` stands for anything.
 LOGGED = [
-    ("number", FIT, "train/loss val/psnr_novel gaussians/opacity_p* gaussians/log10_scale_p* gaussians/depth_p*"),
+    ("number", FIT, "train/loss val/loss val/psnr_novel"),
+    ("number", FIT, "gaussians/opacity_p* gaussians/log10_scale_p* gaussians/depth_p*"),
     ("number", FIT, "layers/opacity_* layers/behind_*"),
     ("number", FIT, "speed/scenes_per_second speed/data_wait train/bad_steps train/learning_rate train/gradient_norm"),
     ("number", FIT if Path("/proc/self/status").exists() else (), "memory/process_gb"),
     ("number", FIT if torch.cuda.is_available() else (), "memory/gpu_gb"),
     ("image", FIT, "images"),
+    ("video", FIT, "turn"),
     ("number", (STAGE1,), "train/psnr train/mse train/ssim train/kl latent/bits latent/bits_* latent/active_channels"),
     ("number", (STAGE2,), "train/loss_t* samples/psnr samples/psnr_of_mean samples/diversity"),
     ("number", (STAGE2,), "latents/std_* latents/mean_*"),
