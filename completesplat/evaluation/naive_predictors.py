@@ -50,5 +50,7 @@ def _on_plane(views: Views, depth_range: Float[Tensor, "2"]) -> Float[Tensor, "v
     seen = points @ intrinsics[0].T
     places = 2 * seen[..., :2] / seen[..., 2:] / seen.new_tensor([width, height]) - 1
     grid = places.nan_to_num().view(len(poses), height, width, 2)
-    image = views.images[:1].expand(len(poses), -1, -1, -1)
-    return functional.grid_sample(image, grid, padding_mode="border", align_corners=False)
+    image = views.images[:1]
+    others = image.expand(len(poses) - 1, -1, -1, -1)
+    seen_by_others = functional.grid_sample(others, grid[1:], padding_mode="border", align_corners=False)
+    return torch.cat([image, seen_by_others])

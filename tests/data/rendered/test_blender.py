@@ -165,7 +165,7 @@ def test_bad_settings_are_refused_before_anything_is_written(line, program, tmp_
         "light=gone.hdr": "gone.hdr: no such file",
         "floor=gone": "gone: no textures there (.jpg, ",
         f"wall={tmp_path / 'empty'}": f"{tmp_path / 'empty'}: no textures there",
-        "cameras=circle": "cameras=circle: choose turn, hemisphere or the path of a transforms.json",
+        "cameras=circle": "cameras=circle: choose turn, hemisphere, fixed or the path of a transforms.json",
         f"cameras={tmp_path / 'cameras.json'}": f"{tmp_path / 'cameras.json'}: 0 frames; at least 2 are rendered",
         "factory=SofaFactory": "give either meshes=FOLDER or factory=NAME",
         "hidden=front": "hidden=front: ",
