@@ -13,7 +13,6 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from completesplat.commands.trained import open_generator, shown_background
-from completesplat.data.captures.transforms_json import read_photographs
 from completesplat.errors import CompleteSplatError
 from completesplat.export.placed_scene import PlacedScene
 from completesplat.export.prediction import write_prediction
@@ -85,6 +84,8 @@ def refuse_others(config: DictConfig, of_file: bool) -> None:
 
 def views_of_file(config: DictConfig, images: Sequence[Path], model: SceneModel) -> KnownViews:
     """Return the photos with their cameras in a `transforms.json`."""
+    from completesplat.data.captures.transforms_json import read_photographs  # which other predictions do not need
+
     views = read_photographs(images, Path(config.cameras), model.image_size)
     return KnownViews(views, model.up.cpu(), {"cameras": printable(Path(config.cameras).name)})
 
