@@ -1,6 +1,7 @@
 """ShapeNet-SRN: archives of the true layout, cameras, masks, the reference view, and what is refused."""
 
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from srn_trees import DISTANCE, FOCAL, SIZE, SPOT, write_archive
 
 from completesplat.commands.data import prepare
 from completesplat.data.srn.module import SRNDataModule, read_intrinsics
-from completesplat.errors import BadAnnotation, BadCamera, BadImage, MissingFile, TooFewFrames
+from completesplat.errors import BadAnnotation, BadCamera, BadImage, DataError, MissingFile, TooFewFrames
 from completesplat.geometry.cameras import invert_rigid, look_at, project
 
 VIEWS = 6
@@ -107,6 +108,22 @@ def test_prepared_objects_give_the_same_scenes(archive, tmp_path):
     own = data.source("test").read("d")
     assert torch.equal(stored.read(2).image, own.read(2).image)
     torch.testing.assert_close(stored.cameras.world_to_camera, own.cameras.world_to_camera)
+
+
+def test_the_test_objects_alone_are_enough_for_a_test(archive):
+    for split in ("train", "val"):
+        shutil.rmtree(archive / f"cars_{split}")
+    data = module(archive)
+    assert data.source("test").names == ["d", "e"]
+    assert data.mean_image() is None
+    with pytest.raises(DataError, match="no train sequences that can be used"):
+        data.store("train")
+
+
+def test_missing_test_objects_are_named(archive):
+    shutil.rmtree(archive / "cars_test")
+    with pytest.raises(MissingFile, match=r"cars_test: no objects with intrinsics\.txt"):
+        module(archive).source("test")
 
 
 def test_a_missing_split_is_named(tmp_path):
