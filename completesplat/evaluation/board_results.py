@@ -38,7 +38,7 @@ COLUMN_METRICS = {
     "lpips": "completesplat.metrics.images.perceptual_metric",
 }
 PICTURED = 3
-"""Scenes of a picture, the first of the list."""
+"""Number of scenes in a picture: the first ones of the list."""
 PICTURE_SIDE = 96  # pixels of an image in a picture
 QUALITY = 80  # of its JPEG
 MEAN = "mean"
@@ -97,7 +97,7 @@ def digest_of(names: Iterable[str]) -> str:
 
 
 def measured_conditions(described: Mapping[str, Any], names: Collection[str]) -> dict[str, object]:
-    """Return the conditions of a test, from its description (`describe_test`) and the names of its scenes."""
+    """Return the conditions of a test from its description (`describe_test`) and the names of its scored scenes."""
     reference, _, targets = str(described["protocol_views"]).partition("; targets: ")
     return {
         "data_set": str(described["data_set"]).partition("/")[0],
@@ -181,7 +181,7 @@ def refusal(result: BoardResult, conditions: Mapping[str, object], copied: float
 
 
 def prepare_for_board(module: Scorer, evaluation: Mapping[str, Any]) -> None:
-    """Give a module what a protocol of the board needs, if it is one: its background, and the scenes of the picture."""
+    """Set a module's background and the scenes of its picture, if the protocol is on the board."""
     board = evaluation["board"]
     if board is None:
         return
@@ -195,7 +195,7 @@ def prepare_for_board(module: Scorer, evaluation: Mapping[str, Any]) -> None:
 def write_for_board(
     module: Scorer, evaluation: Mapping[str, Any], described: Mapping[str, Any], method: str | None, out: Path
 ) -> None:
-    """Write `result.json`, and `result.jpg` where the data's licence allows it, of a test by such a protocol."""
+    """Write `result.json`, and `result.jpg` where the data's licence allows it, if the protocol is on the board."""
     if evaluation["board"] is None:
         return
     result = board_result(evaluation, described, scores_by_scene(module.evaluation), method)

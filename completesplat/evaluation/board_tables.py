@@ -82,7 +82,7 @@ class BoardSection:
 
 @dataclass(frozen=True)
 class _Row:
-    """Row of a table before it is written. One that does not compete has no marks."""
+    """Row of a table before it is written. A row that does not compete has no marks."""
 
     source: str
     label: str

@@ -81,6 +81,33 @@ def test_white_is_no_object_and_images_stay_as_they_are(archive):
     assert 0 < scene.reference.masks.mean() < 1
 
 
+def test_a_pixel_that_is_nearly_white_is_the_objects(archive):
+    path = archive / "cars_test/d/rgb/000002.png"
+    image = Image.open(path).convert("RGB")
+    image.putpixel((0, 0), (255, 255, 254))
+    image.save(path)
+    mask = module(archive).source("test").read("d").read(2).mask
+    assert mask[0, 0, 0] > 0
+    assert mask[0, 0, 1] == 0
+
+
+@pytest.mark.parametrize("prepared", [False, True])
+def test_a_protocols_list_chooses_the_scenes_of_the_test_alone(archive, tmp_path, prepared):
+    root = archive
+    if prepared:
+        root = tmp_path / "packed"
+        prepare(module(archive), ["train", "test"], root, "bmp", 4, 0, "raise", 0.0)
+    data = module(root)
+    data.tested_names = ["e"]
+    assert data.source("test").names == ["e"]
+    assert data.store("test").names == ["e"]
+    assert data.source("train").names == ["a", "b"]
+    other = module(root)
+    other.tested_names = ["e", "x"]
+    with pytest.raises(MissingFile, match="lacks 1 of the 2 scenes of the protocol's list: x"):
+        other.source("test")
+
+
 def test_the_reference_is_the_chosen_view_and_all_others_are_targets(archive):
     data = module(archive)
     sequence = data.source("test").read("d")

@@ -346,7 +346,7 @@ def test_a_scene_of_the_list_that_is_missing_is_named(command, own_protocol: Pat
     (own_protocol / "mine.txt").write_text("nowhere\n")
     data = ["data=toy_objects", f"data.root={toy_root}", "data.image_size=32"]
     refused = command.refuses("test", "scenes=SPLATS", *data, "evaluation=mine", "out=OUT")
-    assert "1 of the 1 scene of the protocol's list are not there: nowhere" in refused
+    assert "lacks 1 of the 1 scene of the protocol's list: nowhere" in refused
 
 
 def test_other_results_are_left_out_with_the_reason(own_protocol: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -63,7 +63,7 @@ def read_intrinsics(path: Path) -> Cameras:
     """Read `intrinsics.txt`: focal length and principal point in the first line, height and width in the last.
 
     Returns:
-        A camera at the origin (float64). Splatter Image takes the field of view of 51.99 degrees, which this file has.
+        A camera at the origin (float64). Its field of view in the archives is 51.99 degrees, as in Splatter Image.
 
     Raises:
         BadAnnotation: the lines hold other numbers.
@@ -109,8 +109,8 @@ def _numbers(text: str) -> list[float | str]:
 def read_image(path: Path, camera: Cameras, framing: ObjectFraming) -> MaskedImage:
     """Read an image and its mask of all pixels that are not white.
 
-    Put on white by this mask, the image stays as it is. pixelNeRF's masks also leave out objects' pixels of which one
-    channel is 255. An alpha channel is dropped, as pixelNeRF and Splatter Image do.
+    An image that this mask puts on white is unchanged. pixelNeRF's masks also leave out pixels of the object in which
+    one channel is 255. An alpha channel is dropped, as pixelNeRF and Splatter Image do.
 
     Raises:
         BadImage: the image is damaged, or has another size than `intrinsics.txt` says.
