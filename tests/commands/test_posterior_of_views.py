@@ -153,7 +153,10 @@ def test_images_that_cannot_be_taken_together_are_refused(runs, tiny_weights, tm
         (["cameras=[0,left]"], "left"),
         (["cameras=transforms.json", "elevation=10"], "elevation does not go with cameras=FILE"),
         (["elevation=10"], "elevation goes with cameras=[ANGLES] only"),
-        (["cameras=90"], "cameras=90: no such file; give a transforms.json, or a list with the angle of each image"),
+        (
+            ["cameras=nowhere.json"],
+            "cameras=nowhere.json: no such file; give a transforms.json, or a list with the angle",
+        ),
     ],
 )
 def test_angles_that_say_nothing_are_refused(runs, tmp_path, settings, message):
