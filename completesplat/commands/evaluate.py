@@ -17,7 +17,7 @@ from rich.progress import track
 
 from completesplat.commands import quieten
 from completesplat.commands.trained import GivenScenes, RunCheckpoint, trained_model
-from completesplat.evaluation.board_results import RESULT, board_result, prepare_for_board, write_for_board
+from completesplat.evaluation.board_results import board_result, prepare_for_board, write_for_board, write_result
 from completesplat.evaluation.mode_benchmark import (
     HiddenModesEvaluation,
     describe_mode_test,
@@ -69,6 +69,8 @@ def run(
     """
     tested = trained_model(**trained)
     run_config = tested.configuration()
+    if isinstance(tested, GivenScenes) and evaluation["resolution"] is not None:
+        run_config.data.image_size = evaluation["resolution"]  # files are rendered at any size
     quieten()
     seed_everything(tested.seed, verbose=False)
     data = scored_data(run_config, evaluation)
@@ -134,7 +136,7 @@ def run_hidden_modes(
     write_json(out / "protocol.json", described)
     if evaluation["board"] is not None:
         result = board_result(evaluation, described, measured.by_scene(), tested.label)
-        write_json(out / RESULT, result)
+        write_result(result, out)
     results = measured.results(evaluation["samples"])
     scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
     loggers: list[Logger] = built_parts(logger)

@@ -67,6 +67,8 @@ def run(config: DictConfig, out: Path) -> str:
     if config.cameras is not None:
         predict_from_views(config, images, outputs, out)
         return sheet_line(out, images[:1])
+    if config.elevation != 0:
+        raise CompleteSplatError("elevation goes with cameras=[ANGLES] only: leave it out")
     start = time.perf_counter()
     if config.devices == 1:
         results = [predict_share(config, images, outputs, out, 0)]

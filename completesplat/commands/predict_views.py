@@ -24,7 +24,7 @@ from completesplat.scene_model import SceneModel
 from completesplat.settings.checks import REMOVE
 from completesplat.wording import counted, printable, safe_name
 
-OF_OBJECT = 0.1  # difference of a channel from the background of weights, from which a pixel is the object's
+OF_OBJECT = 0.1  # least difference of a channel from the weights' background in a pixel of the object
 
 
 class KnownViews(NamedTuple):
@@ -39,7 +39,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], outputs: Outp
     """Write the files of one scene that all images show, into a folder with the name of the first image.
 
     Raises:
-        CompleteSplatError: one image alone, or settings that do not go with the cameras.
+        CompleteSplatError: one image alone, no such file of cameras, or settings that do not go with the cameras.
         DataError, WeightsError: as `read_photographs`, `CompleteSplat.reconstruct`.
     """
     of_file = isinstance(config.cameras, str)
@@ -47,6 +47,9 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], outputs: Outp
         given = "cameras=FILE" if of_file else "cameras=[0,90]"
         raise CompleteSplatError(f"{given} goes with two images or more: image=[A,B]")
     refuse_others(config, of_file)
+    if of_file and not Path(config.cameras).is_file():
+        wanted = "give a transforms.json, or a list with the angle of each image: cameras=[0,90]"
+        raise CompleteSplatError(f"cameras={printable(config.cameras)}: no such file; {wanted}")
     model = open_generator(config, images)
     known = views_of_file(config, images, model) if of_file else views_by_angles(config, images, model)
     views = replace(known.views, cameras=model.in_model_units(known.views.cameras))
@@ -126,7 +129,7 @@ def numbers(given: Any, count: int, setting: str, what: str) -> list[float]:
 
 
 def object_mask(photograph: Photograph, background: float | None) -> Float[Tensor, "1 size size"] | None:
-    """Return where the object of a photo is: what was cut out, or what differs from the background of the weights."""
+    """Return the mask of a photo's object: what was cut out, or what differs from the background of the weights."""
     if photograph.cut_out is not None or background is None:
         return photograph.cut_out
     different = (photograph.image - background).abs().amax(0, keepdim=True) > OF_OBJECT

@@ -5,12 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from completesplat.errors import CompleteSplatError
+from completesplat.evaluation.board_results import RESULT, FoundResults, read_results
 from completesplat.evaluation.board_tables import board_markdown, board_sections, board_table
 from completesplat.evaluation.paper_tables import published_tables
 from completesplat.evaluation.records import find_results
 from completesplat.evaluation.sweep_summary import write_summary
 from completesplat.evaluation.table_writers import show, write_tables
 from completesplat.files import write_text
+from completesplat.wording import printable
 
 logger = logging.getLogger(__name__)
 
@@ -34,15 +36,24 @@ def board(results: str | None, out: Path) -> None:
     Raises:
         CompleteSplatError: there is no such folder.
     """
-    folder = None if results is None else Path(results)
-    if folder is not None and not folder.is_dir():
-        raise CompleteSplatError(f"results={results}: no such folder")
-    sections = board_sections(folder)
+    found = FoundResults([], [])
+    if results is not None:
+        if not Path(results).is_dir():
+            raise CompleteSplatError(f"results={results}: no such folder")
+        found = read_results(Path(results))
+    sections = board_sections(found.results)
     write_text(out / "board.md", board_markdown(sections, out))
     show(*(board_table(section) for section in sections if section.results), width=200)
-    for section in sections:
-        for reason in section.refused:
-            logger.warning(reason)
+    left_out = [*found.left_out, *(reason for section in sections for reason in section.refused)]
+    names = {section.name for section in sections}
+    for result in found.results:
+        if result.protocol not in names:
+            unknown = f"there is no protocol {printable(result.protocol)} in conf/evaluation here"
+            left_out.append(f"{result.file}: left out, because {unknown}")
+    for line in left_out:
+        logger.warning(line)
+    if results is not None and not found.results and not found.left_out:
+        logger.warning("results=%s: no %s of completesplat test evaluation=PROTOCOL", results, RESULT)
 
 
 def summary(sweeps: Sequence[str], out: Path) -> None:

@@ -11,19 +11,21 @@ import statistics
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from PIL import Image
 
 from completesplat.data.lists import listed_names
 from completesplat.evaluation.protocol import PACKAGE_METRICS
+from completesplat.evaluation.provenance import shell_command
 from completesplat.evaluation.records import MODEL, read_mapping
 from completesplat.evaluation.scene_scores import SceneScores
 from completesplat.evaluation.scorer import PicturedScene, Scorer
 from completesplat.export.images import to_pixels
 from completesplat.files import write_json
 from completesplat.photo.saving import save_image
+from completesplat.wording import SHORT, printable
 
 RESULT = "result.json"
 PICTURE = "result.jpg"
@@ -36,11 +38,17 @@ COLUMN_METRICS = {
     "lpips": "completesplat.metrics.images.perceptual_metric",
 }
 PICTURED = 3
-"""Scenes of a picture, the first of the list."""
+"""Number of scenes in a picture: the first ones of the list."""
 PICTURE_SIDE = 96  # pixels of an image in a picture
 QUALITY = 80  # of its JPEG
 MEAN = "mean"
 ERROR = "standard_error"
+FORM: Mapping[str, type] = {"protocol": str, "method": str, "conditions": dict, "scores": dict, "described": dict}
+"""Entries of a result, each with its type in JSON."""
+FORM_OF_DESCRIPTION: Mapping[str, type] = {"samples": int, "machine": dict}
+"""Entries of `described` that the board's tables need."""
+KINDS = {str: "a text", int: "a whole number", dict: "a mapping"}
+"""These types in words."""
 
 Board = Mapping[str, Any]
 """Entry `board` of a protocol's config."""
@@ -56,8 +64,12 @@ class BoardResult:
     content: Mapping[str, Any]
 
     @property
+    def protocol(self) -> str:
+        return str(self.content["protocol"])
+
+    @property
     def method(self) -> str:
-        return str(self.content["method"])
+        return printable(self.content["method"])
 
     @property
     def picture(self) -> Path | None:
@@ -71,6 +83,13 @@ class BoardResult:
         return score.get(MEAN), score.get(ERROR)
 
 
+class FoundResults(NamedTuple):
+    """Results in the order of their paths, and a line for each file that is left out."""
+
+    results: list[BoardResult]
+    left_out: list[str]
+
+
 def digest_of(names: Iterable[str]) -> str:
     """Return the SHA-256 of a sorted list with one name a line, as are the files in `conf/evaluation/lists`."""
     text = "".join(f"{name}\n" for name in sorted(names))
@@ -78,7 +97,7 @@ def digest_of(names: Iterable[str]) -> str:
 
 
 def measured_conditions(described: Mapping[str, Any], names: Collection[str]) -> dict[str, object]:
-    """Return the conditions of a test, from its description (`describe_test`) and the names of its scenes."""
+    """Return the conditions of a test from its description (`describe_test`) and the names of its scored scenes."""
     reference, _, targets = str(described["protocol_views"]).partition("; targets: ")
     return {
         "data_set": str(described["data_set"]).partition("/")[0],
@@ -143,14 +162,15 @@ def refusal(result: BoardResult, conditions: Mapping[str, object], copied: float
     """Return why a result does not belong into a protocol's table, or None.
 
     Args:
-        conditions: `conditions` of the protocol's `board`.
+        conditions: `conditions` of the protocol's `board`. One that is not among the result's conditions, such as the
+            number of samples, is in its description.
         copied: PSNR of the copy of the input image in other results; None: there are none.
     """
-    measured = result.content["conditions"]
+    measured = result.content["described"] | result.content["conditions"]
     for name, value in conditions.items():
         if measured.get(name) != value:
             return f"{name} is {measured.get(name)}, that of the protocol {value}"
-    metrics = result.content["described"].get("metrics", {})
+    metrics = result.content["described"].get("metrics") or {}
     for name, target in COLUMN_METRICS.items():
         if name in metrics and metrics[name] != PACKAGE_METRICS[target]:
             return f"{name} was measured with {metrics[name]}, by the protocol with {PACKAGE_METRICS[target]}"
@@ -161,11 +181,11 @@ def refusal(result: BoardResult, conditions: Mapping[str, object], copied: float
 
 
 def prepare_for_board(module: Scorer, evaluation: Mapping[str, Any]) -> None:
-    """Give a module what a protocol of the board needs, if it is one: its background, and the scenes of the picture."""
+    """Set a module's background and the scenes of its picture, if the protocol is on the board."""
     board = evaluation["board"]
     if board is None:
         return
-    background = board["conditions"]["background"]
+    background = board["conditions"].get("background")
     if background is not None:
         module.background = background
     if board["pictures"]:
@@ -175,26 +195,76 @@ def prepare_for_board(module: Scorer, evaluation: Mapping[str, Any]) -> None:
 def write_for_board(
     module: Scorer, evaluation: Mapping[str, Any], described: Mapping[str, Any], method: str | None, out: Path
 ) -> None:
-    """Write `result.json`, and `result.jpg` where the data's licence allows it, of a test by such a protocol."""
+    """Write `result.json`, and `result.jpg` where the data's licence allows it, if the protocol is on the board."""
     if evaluation["board"] is None:
         return
     result = board_result(evaluation, described, scores_by_scene(module.evaluation), method)
     result["upper_bound"] = module.upper_bound
-    write_json(out / RESULT, result)
     scenes = {name: scene for name, scene in module.pictured.items() if scene is not None}
     if scenes:
         write_picture(scenes, out / PICTURE)
-    print(f"for the board: {out / RESULT}; completesplat report board results={out} shows its row")
+    write_result(result, out)
 
 
-def read_results(folder: Path) -> list[BoardResult]:
-    """Read all results below a folder, in the order of their paths. Other JSON files are left out."""
-    results = []
+def write_result(result: Mapping[str, object], out: Path) -> None:
+    """Write `result.json`, and print the command that shows its row."""
+    write_json(out / RESULT, result)
+    command = shell_command(["completesplat report board", f"results={out}"])
+    print(f"for the board: {out / RESULT}; {command} shows its row")
+
+
+def read_results(folder: Path) -> FoundResults:
+    """Read all results below a folder. JSON files with other names and other entries are no results."""
+    found = FoundResults([], [])
     for path in sorted(folder.rglob("*.json")):
         content = read_mapping(path)
-        if {"protocol", "method", "conditions", "scores", "described"} <= content.keys():
-            results.append(BoardResult(path, content))
-    return results
+        if path.name != RESULT and not FORM.keys() <= content.keys():
+            continue
+        fault = fault_of(content)
+        if fault is None:
+            found.results.append(BoardResult(path, content))
+        else:
+            found.left_out.append(f"{path}: left out, because {fault}; write it again by completesplat test")
+    return found
+
+
+def fault_of(content: Mapping[str, Any]) -> str | None:
+    """Return how a result's content differs in form from that of `board_result`, or None."""
+    if not content:
+        return "it cannot be read as a mapping in JSON"
+    fault = _fault_of_entries(content, FORM) or _fault_of_entries(content["described"], FORM_OF_DESCRIPTION)
+    if fault is not None:
+        return fault
+    if MODEL not in content["scores"]:
+        return f"it has no scores of the method ({MODEL})"
+    for predictor, scores in content["scores"].items():
+        if not isinstance(scores, dict):
+            return f"the scores of {predictor} are no mapping"
+        for name, score in scores.items():
+            if not _is_score(score):
+                return f"{name} of {predictor} is {printable(score, SHORT)}, not a {MEAN} and a {ERROR}"
+    return None
+
+
+def _fault_of_entries(content: Mapping[str, Any], form: Mapping[str, type]) -> str | None:
+    for name, kind in form.items():
+        if name not in content:
+            return f"it has no {name}"
+        if not isinstance(content[name], kind):
+            return f"{name} is {printable(content[name], SHORT)}, not {KINDS[kind]}"
+    return None
+
+
+def _is_score(score: object) -> bool:
+    """Return whether this is a score: a finite mean, and a finite standard error or null."""
+    if not isinstance(score, dict):
+        return False
+    error = score.get(ERROR)
+    return _is_finite(score.get(MEAN)) and (error is None or _is_finite(error))
+
+
+def _is_finite(number: object) -> bool:
+    return isinstance(number, int | float) and math.isfinite(number)
 
 
 def write_picture(scenes: Mapping[str, PicturedScene], path: Path) -> None:

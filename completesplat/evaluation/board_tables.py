@@ -5,10 +5,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
+from completesplat.errors import CompleteSplatError
 from completesplat.evaluation.board_results import COPY, COPY_SCORE, BoardResult, read_results, refusal
+from completesplat.evaluation.protocol import board_of
 from completesplat.evaluation.records import BEST_OF_K, MODEL
 from completesplat.evaluation.table_writers import as_markdown, markdown
 from completesplat.evaluation.tables import (
@@ -76,7 +82,7 @@ class BoardSection:
 
 @dataclass(frozen=True)
 class _Row:
-    """Row of a table before it is written. One that does not compete has no marks."""
+    """Row of a table before it is written. A row that does not compete has no marks."""
 
     source: str
     label: str
@@ -86,25 +92,32 @@ class _Row:
 
 
 def board_protocols() -> dict[str, Mapping[str, Any]]:
-    """Return `board` of the protocols that have one, by the protocols' names."""
+    """Return `board` of the protocols that have one, by the protocols' names.
+
+    Raises:
+        CompleteSplatError: a user's protocol cannot be read, or an entry of its `board` is missing.
+    """
     protocols = {}
     for name in options("evaluation"):
-        evaluation: Any = OmegaConf.to_container(compose("test", f"evaluation={name}").evaluation)
-        if evaluation.get("board"):
-            protocols[name] = evaluation["board"]
+        try:
+            evaluation: Any = OmegaConf.to_container(compose("test", f"evaluation={name}").evaluation)
+        except (HydraException, OmegaConfBaseException, YAMLError) as error:
+            raise CompleteSplatError(f"evaluation={name}: {error}") from error
+        board = board_of(evaluation)
+        if board is not None:
+            protocols[name] = board
     return protocols
 
 
-def board_sections(given: Path | None) -> list[BoardSection]:
-    """Return all protocols with the results in the package, and those below a user's folder that belong to them."""
-    stored = read_results(BOARD)
-    added = [] if given is None else read_results(given)
+def board_sections(added: Sequence[BoardResult]) -> list[BoardSection]:
+    """Return all protocols with the results in the package, and those of a user that belong to them."""
+    stored = read_results(BOARD).results
     sections = []
     for name, board in board_protocols().items():
         accepted: list[BoardResult] = []
         refused = []
         for result in (*stored, *added):
-            if result.content["protocol"] != name:
+            if result.protocol != name:
                 continue
             reason = refusal(result, board["conditions"], _copied(accepted))
             if reason is None:
@@ -158,8 +171,12 @@ def _methods(section: BoardSection, columns: Columns) -> list[_Row]:
     for result in section.results:
         described = result.content["described"]
         upper_bound = bool(result.content.get("upper_bound"))
-        label = f"{result.method} (has seen the scored views)" if upper_bound else result.method
-        date = described.get("machine", {}).get("date", "")
+        label = result.method
+        if upper_bound:
+            label += " (has seen the scored views)"
+        if described.get("align") == "scale":
+            label += " (scale fitted to true depth)"
+        date = described["machine"].get("date", "")
         commit, _, changed = str(described.get("commit") or described.get("version")).partition("-")
         measured = f"{date}, {commit[:8]}{' and changes' if changed else ''}"
         scores = {name: result.score(MODEL, name) for name in columns}
@@ -193,7 +210,7 @@ def _published(section: BoardSection, columns: Columns) -> list[_Row]:
 
 def write_page() -> None:
     """Write the page of the results in the package, beside them (`make board`)."""
-    write_text(BOARD / "README.md", board_markdown(board_sections(None), BOARD))
+    write_text(BOARD / "README.md", board_markdown(board_sections(()), BOARD))
 
 
 def board_markdown(sections: Sequence[BoardSection], folder: Path) -> str:
@@ -209,7 +226,7 @@ def board_markdown(sections: Sequence[BoardSection], folder: Path) -> str:
             parts += [heading, about, "No results yet."]
         for result in section.results:
             if result.picture is not None:
-                link = os.path.relpath(result.picture, folder)
+                link = quote(Path(os.path.relpath(result.picture, folder)).as_posix())
                 parts.append(f"![Renders of {markdown(result.method)}]({link})")
                 parts.append(f"{markdown(result.method)}: the input, then pairs of a true view and its render.")
     return "\n\n".join(parts) + "\n"

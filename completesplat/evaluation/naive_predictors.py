@@ -1,4 +1,4 @@
-"""Predictions that look at the reference image alone, or at none, which a model must beat to have learned anything."""
+"""Naive predictors, which see the reference image or no image. A model that does not beat them learned nothing."""
 
 import torch
 from jaxtyping import Float
@@ -30,7 +30,7 @@ def flat_reference(scenes: SceneBatch) -> Renders:
     """Return the reference image on a plane that faces its camera at the object's distance, as each view sees it.
 
     The object is where the optical axes come nearest to each other, or else in the middle of the scene's depth range.
-    Beside the image, its border goes on.
+    Beyond the image, its border pixels continue.
     """
     views = scenes.all_views()
     return torch.stack([_on_plane(views[b], scenes.depth_range[b]) for b in range(len(scenes.names))])

@@ -39,6 +39,9 @@ PACKAGE_METRICS: dict[str, dict[str, object]] = {
 }
 """Settings of the package's image metrics, by the `_target_` of their config."""
 
+BOARD_ENTRIES = ("title", "about", "list", "pictures", "conditions", "published")
+"""Entries of a protocol's `board`, which `conf/evaluation/scans.yaml` explains."""
+
 
 def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
     """Return the data of a run's config, with the protocol's changes, which are made in `run_config.data`, too.
@@ -55,7 +58,8 @@ def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
         raise CompleteSplatError(f"{chosen}: fit scores images only; set test=false")
     for key, value in evaluation["data"].items():
         if key not in run_config.data:
-            raise CompleteSplatError(f"{chosen}: the data of this run have no setting {key}")
+            of = "" if evaluation["data_set"] is None else f" is of {evaluation['data_set']}"
+            raise CompleteSplatError(f"{chosen}{of}: the data of this run have no setting {key}")
         if value == "???":
             raise CompleteSplatError(f"{chosen} needs evaluation.data.{key}=FILE (fit: or test=false)")
         run_config.data[key] = value
@@ -80,9 +84,20 @@ def scored_data(run_config: DictConfig, evaluation: Config) -> SceneDataModule:
     return larger
 
 
+def board_of(evaluation: Config) -> Config | None:
+    """Return `board` of a protocol, None if it is not on the board; raise CompleteSplatError if an entry is missing."""
+    board: Config | None = evaluation.get("board")
+    if board is None:
+        return None
+    missing = [name for name in BOARD_ENTRIES if name not in board]
+    if missing:
+        raise CompleteSplatError(f"evaluation={evaluation['name']}: board has no {missing[0]}; see scans.yaml")
+    return board
+
+
 def tested_names(evaluation: Config) -> list[str] | None:
     """Return the names of the scenes that a protocol of the board tests; None: all scenes of the data's test."""
-    board = evaluation["board"]
+    board = board_of(evaluation)
     return None if board is None or board["list"] is None else listed_names(board["list"])
 
 

@@ -23,7 +23,7 @@ def cameras_by_angles(
     """Return cameras [view] that look at one point from around it, in the frame of the first.
 
     Args:
-        angles: in degrees; with a larger one the camera has moved to its right around the point.
+        angles: in degrees around the point; a larger one is farther to the camera's right.
         elevations: in degrees above the horizon.
         distances: from the point.
     """

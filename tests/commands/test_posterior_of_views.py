@@ -152,6 +152,11 @@ def test_images_that_cannot_be_taken_together_are_refused(runs, tiny_weights, tm
         (["cameras=[0,90]", "box=[0,0,1,0.5]"], "box does not go with cameras=[ANGLES]"),
         (["cameras=[0,left]"], "left"),
         (["cameras=transforms.json", "elevation=10"], "elevation does not go with cameras=FILE"),
+        (["elevation=10"], "elevation goes with cameras=[ANGLES] only"),
+        (
+            ["cameras=nowhere.json"],
+            "cameras=nowhere.json: no such file; give a transforms.json, or a list with the angle",
+        ),
     ],
 )
 def test_angles_that_say_nothing_are_refused(runs, tmp_path, settings, message):

@@ -1,6 +1,7 @@
 """ShapeNet-SRN: archives of the true layout, cameras, masks, the reference view, and what is refused."""
 
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from srn_trees import DISTANCE, FOCAL, SIZE, SPOT, write_archive
 
 from completesplat.commands.data import prepare
 from completesplat.data.srn.module import SRNDataModule, read_intrinsics
-from completesplat.errors import BadAnnotation, BadCamera, BadImage, MissingFile, TooFewFrames
+from completesplat.errors import BadAnnotation, BadCamera, BadImage, DataError, MissingFile, TooFewFrames
 from completesplat.geometry.cameras import invert_rigid, look_at, project
 
 VIEWS = 6
@@ -80,6 +81,33 @@ def test_white_is_no_object_and_images_stay_as_they_are(archive):
     assert 0 < scene.reference.masks.mean() < 1
 
 
+def test_a_pixel_that_is_nearly_white_is_the_objects(archive):
+    path = archive / "cars_test/d/rgb/000002.png"
+    image = Image.open(path).convert("RGB")
+    image.putpixel((0, 0), (255, 255, 254))
+    image.save(path)
+    mask = module(archive).source("test").read("d").read(2).mask
+    assert mask[0, 0, 0] > 0
+    assert mask[0, 0, 1] == 0
+
+
+@pytest.mark.parametrize("prepared", [False, True])
+def test_a_protocols_list_chooses_the_scenes_of_the_test_alone(archive, tmp_path, prepared):
+    root = archive
+    if prepared:
+        root = tmp_path / "packed"
+        prepare(module(archive), ["train", "test"], root, "bmp", 4, 0, "raise", 0.0)
+    data = module(root)
+    data.tested_names = ["e"]
+    assert data.source("test").names == ["e"]
+    assert data.store("test").names == ["e"]
+    assert data.source("train").names == ["a", "b"]
+    other = module(root)
+    other.tested_names = ["e", "x"]
+    with pytest.raises(MissingFile, match="lacks 1 of the 2 scenes of the protocol's list: x"):
+        other.source("test")
+
+
 def test_the_reference_is_the_chosen_view_and_all_others_are_targets(archive):
     data = module(archive)
     sequence = data.source("test").read("d")
@@ -107,6 +135,22 @@ def test_prepared_objects_give_the_same_scenes(archive, tmp_path):
     own = data.source("test").read("d")
     assert torch.equal(stored.read(2).image, own.read(2).image)
     torch.testing.assert_close(stored.cameras.world_to_camera, own.cameras.world_to_camera)
+
+
+def test_the_test_objects_alone_are_enough_for_a_test(archive):
+    for split in ("train", "val"):
+        shutil.rmtree(archive / f"cars_{split}")
+    data = module(archive)
+    assert data.source("test").names == ["d", "e"]
+    assert data.mean_image() is None
+    with pytest.raises(DataError, match="no train sequences that can be used"):
+        data.store("train")
+
+
+def test_missing_test_objects_are_named(archive):
+    shutil.rmtree(archive / "cars_test")
+    with pytest.raises(MissingFile, match=r"cars_test: no objects with intrinsics\.txt"):
+        module(archive).source("test")
 
 
 def test_a_missing_split_is_named(tmp_path):

@@ -126,6 +126,67 @@ def test_a_result_with_another_metric_is_refused() -> None:
     assert "psnr was measured with " in str(refusal(other, CONDITIONS, copied=None))
 
 
+def test_results_with_another_number_of_samples_are_refused() -> None:
+    """Scores of hidden modes depend on it, while images are scored by the first sample."""
+    assert PROTOCOLS["toys_hidden"]["conditions"]["samples"] == 32
+    other = result()
+    other.content["described"]["samples"] = 4
+    assert refusal(other, CONDITIONS, copied=None) is None
+    assert refusal(other, CONDITIONS | {"samples": 32}, None) == "samples is 4, that of the protocol 32"
+    other.content["described"]["samples"] = 32
+    assert refusal(other, CONDITIONS | {"samples": 32}, None) is None
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "fault"),
+    [
+        (("method",), None, "method is None, not a text"),
+        (("described",), [1], "described is [1], not a mapping"),
+        (("described", "machine"), None, "machine is None, not a mapping"),
+        (("described", "samples"), "four", "samples is four, not a whole number"),
+        (("scores",), {}, "it has no scores of the method (model)"),
+        (("scores", "model"), 3, "the scores of model are no mapping"),
+        (("scores", "model", "full_novel_psnr"), None, "full_novel_psnr of model is None, not a mean and a"),
+        (("scores", "model", "full_novel_psnr", "mean"), "20", "full_novel_psnr of model is "),
+        (("scores", "copy_reference", "full_novel_psnr", "mean"), float("nan"), "full_novel_psnr of copy_reference"),
+        (("scores", "model", "full_novel_psnr", "standard_error"), float("inf"), "full_novel_psnr of model is "),
+    ],
+)
+def test_a_result_that_was_edited_by_hand_is_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, path: tuple[str, ...], value: object, fault: str
+) -> None:
+    content = json.loads(json.dumps(dict(result().content) | {"protocol": "toys"}))
+    place = content
+    for name in path[:-1]:
+        place = place[name]
+    place[path[-1]] = value
+    (tmp_path / "edited.json").write_text(json.dumps(content))
+    board(str(tmp_path), tmp_path)
+    assert f"edited.json: left out, because {fault}" in caplog.text
+
+
+def test_a_result_without_an_entry_is_named_and_other_files_are_not(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name, text in (("a", "{"), ("b", '{"protocol": "toys"}')):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "result.json").write_text(text)
+    (tmp_path / "metrics.json").write_text("[1]")
+    board(str(tmp_path), tmp_path)
+    assert "a/result.json: left out, because it cannot be read as a mapping in JSON" in caplog.text
+    assert "b/result.json: left out, because it has no method" in caplog.text
+    assert "metrics" not in caplog.text
+
+
+def test_nothing_is_left_out_in_silence(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "empty").mkdir()
+    board(str(tmp_path / "empty"), tmp_path)
+    assert "empty: no result.json of completesplat test evaluation=PROTOCOL" in caplog.text
+    (tmp_path / "theirs.json").write_text(json.dumps(dict(result().content)))
+    board(str(tmp_path), tmp_path)
+    assert "theirs.json: left out, because there is no protocol mine in conf/evaluation here" in caplog.text
+
+
 BOARD_OF_MINE = {
     "title": "Mine",
     "about": "Two things, CC BY.",
@@ -154,6 +215,25 @@ def test_methods_stand_before_naive_predictors_and_published_figures_stand_apart
     assert [row.cells[1].mark for row in table.rows] == ["", "best", "second", "", ""]
 
 
+def test_a_scale_that_was_fitted_to_true_depth_is_stated() -> None:
+    scaled = result()
+    scaled.content["described"]["align"] = "scale"
+    table = board_table(BoardSection("mine", BOARD_OF_MINE, [scaled], []))
+    assert table.rows[0].cells[0].text == "ours (scale fitted to true depth)"
+
+
+def test_a_method_name_stays_in_its_row() -> None:
+    table = board_table(BoardSection("mine", BOARD_OF_MINE, [result("two\nlines")], []))
+    assert table.rows[0].cells[0].text == r"two\nlines"
+
+
+def test_links_to_pictures_have_no_spaces(tmp_path: Path) -> None:
+    Image.new("RGB", (8, 8)).save(tmp_path / "my result (1).jpg")
+    shown = replace(result(), file=tmp_path / "my result (1).json")
+    page = board_markdown([BoardSection("mine", BOARD_OF_MINE, [shown], [])], tmp_path)
+    assert "](my%20result%20%281%29.jpg)" in page
+
+
 def test_the_page_shows_pictures_beside_results(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     Image.new("RGB", (8, 8)).save(tmp_path / "mine/ours.jpg")
@@ -166,9 +246,10 @@ def test_the_page_shows_pictures_beside_results(tmp_path: Path) -> None:
 
 
 def test_results_in_the_package_belong_to_their_protocols_and_are_its_page() -> None:
-    sections = board_sections(None)
+    sections = board_sections(())
     assert [reason for section in sections for reason in section.refused] == []
-    assert sum(len(section.results) for section in sections) == len(read_results(BOARD)) > 4
+    assert sum(len(section.results) for section in sections) == len(read_results(BOARD).results) > 4
+    assert read_results(BOARD).left_out == []
     for section in sections:
         for stored in section.results:
             assert stored.file.parent.name == section.name
@@ -215,7 +296,7 @@ def own_protocol(tmp_path: Path, toy_root: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_files_of_another_program_get_a_row(command, own_protocol: Path, toy_root: Path) -> None:
-    data = ["data=toy_objects", f"data.root={toy_root}", "data.image_size=32"]
+    data = ["data=toy_objects", f"data.root={toy_root}"]
     given = ["scenes=SPLATS", *data, "method=theirs", "evaluation=mine", "trainer.accelerator=cpu", "out=OUT"]
     finished = command.succeeds("test", *given)
     assert "for the board: OUT/result.json" in finished.out.replace(f"{own_protocol}/", "")
@@ -236,11 +317,36 @@ def test_files_of_another_program_get_a_row(command, own_protocol: Path, toy_roo
     assert "](../OUT/result.jpg)" in page
 
 
+def test_files_are_rendered_at_the_size_of_the_protocol(command, own_protocol: Path, toy_root: Path) -> None:
+    data = ["data=toy_objects", f"data.root={toy_root}", "data.image_size=16"]
+    command.succeeds("test", "scenes=SPLATS", *data, "evaluation=mine", "trainer.accelerator=cpu", "out=MY OUT")
+    assert strict_json(own_protocol / "MY OUT/metrics.json")["protocol"]["image_size"] == 32
+
+
+def test_a_protocol_without_an_entry_is_refused(command, own_protocol: Path, toy_root: Path) -> None:
+    path = own_protocol / "conf/evaluation/mine.yaml"
+    config = OmegaConf.load(path)
+    del config.board["published"]
+    OmegaConf.save(config, path)
+    message = "evaluation=mine: board has no published; see scans.yaml"
+    assert message in command.refuses("report", "board", "out=TABLE")
+    data = ["data=toy_objects", f"data.root={toy_root}"]
+    assert message in command.refuses("test", "scenes=SPLATS", *data, "evaluation=mine", "out=OUT")
+    path.write_text("name: [")
+    assert "evaluation=mine: while parsing a flow node" in command.refuses("report", "board", "out=TABLE")
+
+
+def test_a_protocol_of_other_data_says_so(command, own_protocol: Path, toy_root: Path) -> None:
+    given = ["scenes=SPLATS", "data=toy_objects", f"data.root={toy_root}", "evaluation=srn_cars", "out=OUT"]
+    expected = "evaluation=srn_cars is of srn: the data of this run have no setting reference"
+    assert expected in command.refuses("test", *given)
+
+
 def test_a_scene_of_the_list_that_is_missing_is_named(command, own_protocol: Path, toy_root: Path) -> None:
     (own_protocol / "mine.txt").write_text("nowhere\n")
     data = ["data=toy_objects", f"data.root={toy_root}", "data.image_size=32"]
     refused = command.refuses("test", "scenes=SPLATS", *data, "evaluation=mine", "out=OUT")
-    assert "1 of the 1 scene of the protocol's list are not there: nowhere" in refused
+    assert "lacks 1 of the 1 scene of the protocol's list: nowhere" in refused
 
 
 def test_other_results_are_left_out_with_the_reason(own_protocol: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -132,7 +132,7 @@ class SceneDataSet(ABC):
         missing = sorted(set(names).difference(source.names))
         if missing:
             count = f"{len(missing)} of the {counted(len(names), 'scene')} of the protocol's list"
-            raise MissingFile(f"{count} are not there: {first_names(missing)}", str(self.root))
+            raise MissingFile(f"lacks {count}: {first_names(missing)}", str(self.root))
         source.names = sorted(set(names))
 
     def store(self, split: str) -> SceneStore:

@@ -63,7 +63,7 @@ def read_intrinsics(path: Path) -> Cameras:
     """Read `intrinsics.txt`: focal length and principal point in the first line, height and width in the last.
 
     Returns:
-        A camera at the origin (float64). Splatter Image takes the field of view of 51.99 degrees, which this file has.
+        A camera at the origin (float64). Its field of view in the archives is 51.99 degrees, as in Splatter Image.
 
     Raises:
         BadAnnotation: the lines hold other numbers.
@@ -109,8 +109,8 @@ def _numbers(text: str) -> list[float | str]:
 def read_image(path: Path, camera: Cameras, framing: ObjectFraming) -> MaskedImage:
     """Read an image and its mask of all pixels that are not white.
 
-    Put on white by this mask, the image stays as it is. pixelNeRF's masks also leave out objects' pixels of which one
-    channel is 255. An alpha channel is dropped, as pixelNeRF and Splatter Image do.
+    An image that this mask puts on white is unchanged. pixelNeRF's masks also leave out pixels of the object in which
+    one channel is 255. An alpha channel is dropped, as pixelNeRF and Splatter Image do.
 
     Raises:
         BadImage: the image is damaged, or has another size than `intrinsics.txt` says.
@@ -194,16 +194,24 @@ class SRNDataModule(ObjectDataModule):
         return {"category": self.category, **self.framing._asdict()}
 
     def open(self, split: str) -> Mapping[str, SRNSource]:
-        """List the objects of one split, or raise MissingFile if there are none."""
-        folder = self.root / f"{self.category}_{split}"
-        if (folder / DEEPER).is_dir():
-            folder = folder / DEEPER
-        source = SRNSource(folder, self.framing)
-        if not source.names:
+        """List the objects of one split.
+
+        For a test, the folder `CATEGORY_test` alone is enough. The other splits are then empty.
+
+        Raises:
+            MissingFile: there are no test objects, or neither objects of this split nor a folder of test objects.
+        """
+        source = SRNSource(self.folder_of(split), self.framing)
+        if not source.names and (split == "test" or not self.folder_of("test").is_dir()):
             others = ", ".join(f"{self.category}_{other}" for other in SPLITS)
             where = "give the folder of the unpacked srn_cars.zip or srn_chairs.zip"
-            raise MissingFile(f"no objects with {INTRINSICS}; {where}, which has {others}", str(folder))
+            raise MissingFile(f"no objects with {INTRINSICS}; {where}, which has {others}", str(self.folder_of(split)))
         return {split: source}
+
+    def folder_of(self, split: str) -> Path:
+        """Return the folder with the objects of one split."""
+        folder = self.root / f"{self.category}_{split}"
+        return folder / DEEPER if (folder / DEEPER).is_dir() else folder
 
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
         """Return the view `reference` and others as targets; raise TooFewFrames if there is no such view."""
