@@ -20,6 +20,7 @@ from completesplat.quantities import (
     Range,
     Seed,
     Share,
+    Side,
 )
 
 NOT_A_LIST = "must be a list"
@@ -48,6 +49,7 @@ class EvaluationSettings(TypedDict):
     """Settings of a protocol."""
 
     precision: Precision
+    resolution: NotRequired[Side | None]
 
 
 class FitSettings(TypedDict):
