@@ -32,6 +32,8 @@ PATHS = (
     "export",
 )
 """Last parts of the names of settings for files and folders, whose names may look like numbers."""
+TEXTS = ("method", "wandb.notes")
+"""Settings that are free texts: commas, brackets and spaces in them mean nothing."""
 GROUPS_TO_LEAVE_OUT = ("logger", "callbacks", "hparams_search", "debug")
 """Config groups that `group=null` leaves out."""
 SWEEP = ("-m", "--multirun")
@@ -69,7 +71,7 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
         others = others[1:]
     if command in WORDS:
         others = with_words(command, others)
-    return [*flags, *task, *(_path_as_text(_left_out(argument)) for argument in others)]
+    return [*flags, *task, *(_as_text(_left_out(argument)) for argument in others)]
 
 
 def _left_out(argument: str) -> str:
@@ -78,9 +80,11 @@ def _left_out(argument: str) -> str:
     return f"~{group}" if group in GROUPS_TO_LEAVE_OUT and option in ("null", "[]") else argument
 
 
-def _path_as_text(argument: str) -> str:
-    """Quote the value of a setting for a path that Hydra would read as a number or as true (`out=1e3`, `out=NAN`)."""
+def _as_text(argument: str) -> str:
+    """Quote a free text, and a path that Hydra would read as a number or as true (`out=1e3`, `out=NAN`)."""
     key, equals, value = argument.partition("=")
+    if key in TEXTS and value not in ("", "null") and value[0] not in "'\"":
+        return f"{key}={quoted(value)}"
     if not equals or key.lstrip("+").rpartition(".")[2] not in PATHS:
         return argument
     try:

@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
 from completesplat.settings.arguments import FLAGS_WITH_VALUE, HYDRA_FLAGS, SHOWN_CONFIGS, for_hydra
+from completesplat.settings.composition import compose
 
 NAMES = ["a.jpg", "a,b.jpg", "[a].jpg", "{a:1}.jpg", "a=b.jpg", "seed=1.jpg", " (1) .jpg", "it's.jpg", '"a".jpg']
 NAMES += ["a\\.jpg", "a\\", "a\\'.jpg", "é ü 写真.jpg", "a${seed}.jpg", "a\\${b.jpg", "$x.jpg", "new\nline.jpg"]
@@ -76,3 +77,15 @@ def test_the_flags_are_hydras():
     assert all(actions[name].nargs == 0 for name in HYDRA_FLAGS)
     assert all(actions[name].nargs is None for name in FLAGS_WITH_VALUE)
     assert tuple(actions["--cfg"].choices) == SHOWN_CONFIGS
+
+
+@pytest.mark.parametrize("text", ["mine (files), at 3,000 steps", "1e3", "a's [b] ${c}", "true"])
+def test_names_of_methods_and_notes_are_taken_literally(text):
+    config = compose("test", f"method={text}", f"wandb.notes={text}")
+    assert config.method == text
+    assert config.wandb.notes == text
+
+
+def test_a_name_in_quotes_or_null_is_what_hydra_reads():
+    assert compose("test", "method='a b'").method == "a b"
+    assert compose("test", "method=null").method is None
