@@ -38,6 +38,7 @@ BRIEF = {
     "data render": ["views=6", "size=32", "samples=1"],
     "data prepare data=rendered": ["data.image_size=32", "workers=1"],
     "data check data=turntable": ["workers=1"],
+    "plan experiment=toy_var": ["data.targets=3"],
     "plan experiment=rendered_var": ["data.image_size=32"],
     "fit": TOYS,
     "fit -m hparams_search=optuna": [*TOYS, "hydra.sweeper.n_trials=1"],

@@ -170,7 +170,9 @@ def test_hidden_modes_are_scored_from_files(command, pipeline, model_test, tmp_p
 def test_the_lines_of_the_readme_run_as_written(command, tmp_path):
     document = ROOT / "completesplat/evaluation/README.md"
     (lines,) = re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL)
-    making, *commands = [arguments_of(text) for text in block_commands(document) if re.search("HELDOUT|SPLATS", text)]
+    # The board's protocol needs all scenes of HELDOUT, of which a few are made here.
+    named = [text for text in block_commands(document) if re.search("HELDOUT|SPLATS", text)]
+    making, *commands = [arguments_of(text) for text in dict.fromkeys(named) if "evaluation=toys" not in text]
     command.succeeds(*making, "scenes=20", "frames=8")
     exec(lines, {})
     for arguments in commands:
