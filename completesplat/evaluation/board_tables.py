@@ -20,7 +20,6 @@ from completesplat.evaluation.table_writers import as_markdown, markdown
 from completesplat.evaluation.tables import (
     SHARPNESS_NOTE,
     SSIM_NOTE,
-    UNMARKED,
     Cell,
     Heading,
     Table,
@@ -146,20 +145,23 @@ def board_table(section: BoardSection) -> Table:
     headings = [Heading("method", figures=False)]
     headings += [Heading(f"{form.heading} {form.better}".rstrip(), group) for group, form in columns.values()]
     headings.append(Heading("measured", figures=False))
-    competing = [row.competes for row in rows]
-    mark = {name: marks([_mean(row, name) for row in rows], competing, form) for name, (_, form) in columns.items()}
-    table_rows = []
-    for i, row in enumerate(rows):
-        cells = [Cell(row.label)]
-        for name, (_, form) in columns.items():
-            mean, error = row.scores.get(name, (None, None))
-            cells.append(score_cell(form, mean, error, mark[name][i] if row.competes else UNMARKED))
-        table_rows.append(TableRow(row.source, [*cells, Cell(row.measured)]))
-    remarks = [ERRORS_NOTE] if section.results else []
-    if section.results and not modes:
-        remarks += [SSIM_NOTE, SHARPNESS_NOTE]
+    remarks = []
+    if section.results:
+        remarks = [ERRORS_NOTE] if modes else [ERRORS_NOTE, SSIM_NOTE, SHARPNESS_NOTE]
     title = f"{section.board['title']} (evaluation={section.name})"
-    return Table(section.name, title, headings, table_rows, remarks)
+    return Table(section.name, title, headings, _table_rows(rows, columns), remarks)
+
+
+def _table_rows(rows: Sequence[_Row], columns: Columns) -> list[TableRow]:
+    """Return the cells of all rows: label, scores with the marks of the best, and when they were measured."""
+    competing = [row.competes for row in rows]
+    written = [[Cell(row.label)] for row in rows]
+    for name, (_, form) in columns.items():
+        marked = marks([_mean(row, name) for row in rows], competing, form)
+        for row, cells, mark in zip(rows, written, marked, strict=True):
+            mean, error = row.scores.get(name, (None, None))
+            cells.append(score_cell(form, mean, error, mark))
+    return [TableRow(row.source, [*cells, Cell(row.measured)]) for row, cells in zip(rows, written, strict=True)]
 
 
 def _mean(row: _Row, name: str) -> float | None:

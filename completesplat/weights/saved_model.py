@@ -109,23 +109,17 @@ class SavedModel(nn.Module):
             unchanged = self._is(read_model(self.file, trust=True))
         as_stored = unchanged and self.file is not None and self.file.name == WEIGHTS_FILE
         files: dict[str, Path | bytes] = {}
-        pictures: list[Path] = []
+        stored_pictures: list[Path] = []
         if as_stored:
             assert folder is not None
             files[CONFIG_FILE] = folder / CONFIG_FILE
             files[WEIGHTS_FILE] = folder / WEIGHTS_FILE
             files[SUMS_FILE] = sums_of(folder).encode()
-            pictures = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+            stored_pictures = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
         else:
             files.update(self.weight_files())
-        for name in said.get("pictures", ()):
-            picture = _picture(name)
-            if picture.resolve() not in [path.resolve() for path in pictures]:
-                pictures.append(picture)
-        for path in [*_licenses(folder), *pictures]:
-            if path.name in files:
-                raise CompleteSplatError(f"{path}: there are two files of this name; rename one")
-            files[path.name] = path
+        pictures = _with_pictures(stored_pictures, said.get("pictures", ()))
+        _add_files(files, [*_licenses(folder), *pictures])
         if graphs is not None:
             files.update(_graph_files(graphs))
         written = Card(
@@ -186,6 +180,24 @@ class SavedModel(nn.Module):
 
 def _licenses(folder: Path | None) -> list[Path]:
     return [] if folder is None else sorted(path for path in folder.glob(LICENSE_FILES) if path.is_file())
+
+
+def _with_pictures(stored: Sequence[Path], names: Sequence[str]) -> list[Path]:
+    """Return the images beside the weights and those that a user names, each once."""
+    pictures = list(stored)
+    for name in names:
+        picture = _picture(name)
+        if picture.resolve() not in [path.resolve() for path in pictures]:
+            pictures.append(picture)
+    return pictures
+
+
+def _add_files(files: dict[str, Path | bytes], paths: Sequence[Path]) -> None:
+    """Add files under their own names; raise CompleteSplatError if two have one name."""
+    for path in paths:
+        if path.name in files:
+            raise CompleteSplatError(f"{path}: there are two files of this name; rename one")
+        files[path.name] = path
 
 
 def _picture(name: str) -> Path:
